@@ -6,13 +6,14 @@ move. Parts of one camera are not compared with each other: the prescription giv
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from optics.geometry.pose import Pose
 from optics.geometry.solid import Face, Solid, SolidError, face_plane, solid_mesh
 from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
@@ -86,20 +87,82 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
 def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
     """All pairs of bodies that stand in each other or nearer than ``LEAST_GAP``, as designed; deepest first."""
     bodies = convex_bodies(instrument)
-    bounds = {path: (corners.min(axis=0), corners.max(axis=0)) for path, corners in bodies.items()}
-    prisms = {solid.path for solid in instrument.solids}
     found = []
-    for first, second in combinations(bodies, 2):
-        if not prisms & {first, second} and _camera(first) == _camera(second):
-            continue
-        low = np.maximum(bounds[first][0], bounds[second][0])
-        high = np.minimum(bounds[first][1], bounds[second][1])
-        if np.any(low > high + LEAST_GAP):
+    for first, second in _pairs(instrument, bodies):
+        if _between_boxes(bodies[first], bodies[second]) > LEAST_GAP:
             continue
         gap = separation(bodies[first], bodies[second])
         if gap < LEAST_GAP:
             found.append(Overlap(first, second, -gap))
     return tuple(sorted(found, key=lambda overlap: -overlap.depth))
+
+
+def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Those that must not stand in each other; mirrors and board of one camera are its prescription's business."""
+    prisms = {solid.path for solid in instrument.solids}
+    for first, second in combinations(bodies, 2):
+        if prisms & {first, second} or _camera(first) != _camera(second):
+            yield first, second
+
+
+def _between_boxes(first: np.ndarray, second: np.ndarray) -> float:
+    """Largest gap along an axis between the boxes around two sets of points, metres; negative where they overlap."""
+    low = np.maximum(first.min(axis=0), second.min(axis=0))
+    high = np.minimum(first.max(axis=0), second.max(axis=0))
+    return float(np.max(low - high))
+
+
+@dataclass(frozen=True, eq=False)
+class Clearances:
+    """How far bodies may move before they can touch, for many states one after the other.
+
+    Attributes:
+        paths: of the bodies; corners: of each in its own frame, (P, 3), metres; poses: where each stands as designed.
+        pairs: numbers of two bodies each, (Q, 2); gaps: (Q,) metres, no more than there is between them as designed.
+    """
+
+    paths: tuple[str, ...]
+    corners: tuple[np.ndarray, ...]
+    poses: tuple[Pose, ...]
+    pairs: np.ndarray
+    gaps: np.ndarray
+
+    @classmethod
+    def of(cls, instrument: Instrument) -> Clearances:
+        """Those of an instrument as designed."""
+        placed = instrument.assembly.place()
+        bodies = convex_bodies(instrument, placed)
+        paths = tuple(bodies)
+        poses = tuple(placed.pose(path) for path in paths)
+        corners = tuple(pose.inverse().apply(bodies[path]) for path, pose in zip(paths, poses, strict=True))
+        number = {path: k for k, path in enumerate(paths)}
+        named = list(_pairs(instrument, paths))
+        gaps = []
+        for first, second in named:
+            gap = _between_boxes(bodies[first], bodies[second])
+            gaps.append(gap if gap > 0.0 else separation(bodies[first], bodies[second]))
+        pairs = np.array([(number[a], number[b]) for a, b in named], int).reshape(-1, 2)
+        return cls(paths, corners, poses, pairs, np.array(gaps))
+
+    def overlaps(self, placed: PlacedBodies) -> tuple[Overlap, ...]:
+        """Pairs of bodies that stand in each other, deepest first.
+
+        Args:
+            placed: where the bodies stand, in one state; how they have grown is left out.
+        """
+        poses = [placed.pose(path) for path in self.paths]
+        moved = np.array([
+            np.linalg.norm(now.apply(own) - then.apply(own), axis=-1).max()
+            for now, then, own in zip(poses, self.poses, self.corners, strict=True)
+        ])
+        found = []
+        for (i, j), gap in zip(self.pairs, self.gaps, strict=True):
+            if gap <= 0.0 or moved[i] + moved[j] < gap:
+                continue
+            left = separation(poses[i].apply(self.corners[i]), poses[j].apply(self.corners[j]))
+            if left < 0.0:
+                found.append(Overlap(self.paths[i], self.paths[j], -left))
+        return tuple(sorted(found, key=lambda overlap: -overlap.depth))
 
 
 def check_clearance(instrument: Instrument) -> None:

@@ -12,6 +12,7 @@ the motion is the matrix ``nominal`` (column by column) times the turn by k ``ro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, assert_never
 
@@ -23,7 +24,7 @@ from trimesh.visual.material import PBRMaterial
 from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Solid, solid_mesh
-from optics.geometry.tree import AT_REST, PlacedBodies, State
+from optics.geometry.tree import AT_REST, Body, PlacedBodies, State
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
 from scenes.specs.baffle import Plate
@@ -92,17 +93,34 @@ def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[
         placed: its bodies in that state.
     """
     nominal = instrument.assembly.place()
+    bodies = instrument.assembly.tree.bodies
+    rest, moved = (_all_in_parents(bodies, where) for where in (nominal, placed))
+    back = np.swapaxes(rest[:, :3, :3], -1, -2)
+    turn = back @ moved[:, :3, :3]
+    offset = np.einsum("bij,bj->bi", back, moved[:, :3, 3] - rest[:, :3, 3])
+    pivots = np.array([body.pivots[state.get(body.path, AT_REST).pivot] for body in bodies])
+    rotate = Rotation.from_matrix(turn).as_rotvec()
+    shift = np.einsum("bij,bj->bi", turn, pivots) + offset - pivots
     out = {}
-    for body in instrument.assembly.tree.bodies:
-        rest, moved = (_in_parent(body.path, where) for where in (nominal, placed))
-        change = rest.inverse() @ moved
-        pivot = np.array(body.pivots[state.get(body.path, AT_REST).pivot])
-        rotate = Rotation.from_matrix(change.rotation).as_rotvec()
-        shift = change.apply(pivot) - pivot
-        if max(np.abs(rotate).max(), np.abs(shift).max()) > LEAST_MOTION:
-            vectors = {"rotate": rotate, "shift": shift, "pivot": pivot}
-            numbers = {name: [float(number) for number in vector] for name, vector in vectors.items()}
-            out[body.path] = {"nominal": [float(number) for number in _matrix(rest).T.ravel()], **numbers}
+    for k in np.flatnonzero(np.maximum(np.abs(rotate), np.abs(shift)).max(axis=1) > LEAST_MOTION):
+        vectors = {"rotate": rotate[k].tolist(), "shift": shift[k].tolist(), "pivot": pivots[k].tolist()}
+        out[bodies[k].path] = {"nominal": rest[k].T.ravel().tolist(), **vectors}
+    return out
+
+
+def _all_in_parents(bodies: Sequence[Body], placed: PlacedBodies) -> np.ndarray:
+    """Matrices of all bodies relative to their parents, or to the world, (B, 4, 4)."""
+    own = np.array([placed.index[body.path] for body in bodies])
+    matrix = np.zeros((len(own), 4, 4))
+    matrix[:, :3, :3], matrix[:, :3, 3] = placed.rotation[0, own].real, placed.translation[0, own].real
+    matrix[:, 3, 3] = 1.0
+    number = {body.path: k for k, body in enumerate(bodies)}
+    parents = np.array([number.get(body.parent, -1) if body.parent else -1 for body in bodies])
+    carrier = np.where((parents >= 0)[:, None, None], matrix[parents], np.eye(4))
+    back = np.swapaxes(carrier[:, :3, :3], -1, -2)
+    out = matrix.copy()
+    out[:, :3, :3] = back @ matrix[:, :3, :3]
+    out[:, :3, 3] = np.einsum("bij,bj->bi", back, matrix[:, :3, 3] - carrier[:, :3, 3])
     return out
 
 

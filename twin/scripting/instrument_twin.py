@@ -73,6 +73,20 @@ class InstrumentTwin:
     resolved: ResolvedJob
     _bench: _Bench = field(repr=False)
 
+    @classmethod
+    def of(cls, resolved: ResolvedJob, backend: str = "llvm", like: InstrumentTwin | None = None) -> InstrumentTwin:
+        """The twin of a job that has been read.
+
+        Args:
+            resolved: the job.
+            backend: where to trace, ``llvm`` or ``cuda``.
+            like: one of the same instrument, cameras and detector, which is then not built again.
+
+        Raises:
+            BackendUnavailable: this machine does not have it.
+        """
+        return cls(resolved, _Bench(resolved, backend) if like is None else like._bench.stating(resolved))
+
     @property
     def name(self) -> str:
         """Of the instrument."""
@@ -323,10 +337,10 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
         data = read_yaml(what).data if isinstance(what, Path) or "/" in text or text.endswith((".yaml", ".yml")) else {}
         if isinstance(data, dict) and ("job" in data or "instrument" in data):
             resolved = resolve(what)
-            return InstrumentTwin(resolved, _Bench(resolved, backend))
+            return InstrumentTwin.of(resolved, backend)
         text = str(Path(what).resolve()) if data else text
     resolved = resolve_job(validate(JobSpec, YamlFile("", {"instrument": text}, {})))
-    return InstrumentTwin(resolved, _Bench(resolved, backend))
+    return InstrumentTwin.of(resolved, backend)
 
 
 def load_camera(what: str | Path, backend: str = "llvm") -> CameraView:

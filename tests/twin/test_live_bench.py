@@ -1,0 +1,327 @@
+"""The live twin's computing: a state of the knobs is what the main job makes of the same numbers, and nothing else."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import twin
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from twin.live.answers import Answers
+from twin.live.camera_pictures import CameraPictures
+from twin.live.knobs import KINDS, knob_name, perturbation
+from twin.live.live_bench import LiveBench
+from twin.live.messages import AskedState, AskedView, BlindState, packed
+from twin.live.recording import course_text, job_text
+from twin.live.source import read_source
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_job import render_job
+
+M2, PLANE = "base/forward/M2", "base/backward/focal_plane"
+
+
+@pytest.fixture(scope="module")
+def bench() -> LiveBench:
+    return LiveBench(twin.load("scenes/examples/perturb.yaml"))
+
+
+@pytest.fixture(scope="module")
+def first(bench) -> AskedState:
+    return AskedState.at_rest(bench)
+
+
+def changed(state: AskedState, knobs: dict[str, float] | None = None, **other) -> AskedState:
+    return AskedState(**{**state.model_dump(), "knobs": state.knobs if knobs is None else knobs, **other})
+
+
+def test_the_first_state_is_the_main_job(bench, first, backend):
+    """Readings, truth and images of `perturb.yaml`, to the bit."""
+    run = render_job(resolve("scenes/examples/perturb.yaml"), backend)
+    told, after = bench.state(first)
+    assert told["readings"] == stated(run.recovered_dict())
+    assert told["truth"] == run.truth_dict()
+    assert np.array_equal(after, run.after[:, 0])
+    assert np.array_equal(bench.before(first), run.before[:, 0])
+
+
+def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
+    knobs = {f"{M2} shift z": 3.17, f"{M2} figure Z7": -12.5, f"{PLANE} rotate x": 0.1 + 0.2, "base temperature": 0.25}
+    asked = changed(first, knobs, frames=3, seed=20)
+    told, after = bench.state(asked)
+    file = tmp_path / "job.yaml"
+    file.write_text(job_text(bench, asked), encoding="utf-8")
+    run = render_job(resolve(file), backend)
+    assert told["readings"] == stated(run.recovered_dict())
+    assert np.array_equal(after, run.after[:, 0])
+
+
+def test_a_recorded_course_has_the_states_that_were_shown(bench, first, backend, tmp_path):
+    """The truth of every time to rounding; the noise of a course is another draw."""
+    pivots = {PLANE: "rear_node"}
+    steps = [
+        (0.0, changed(first, {}, pivots={})),
+        (0.5004, changed(first, {f"{M2} shift z": 1.0, f"{PLANE} rotate z": 3.0}, pivots=pivots)),
+        (1.25, changed(first, {f"{M2} shift z": 2.5, f"{PLANE} rotate z": 3.0, "base temperature": 0.5}, pivots=pivots)),
+    ]
+    steps[0] = (0.0, changed(steps[0][1], pivots=pivots))
+    file = tmp_path / "course.yaml"
+    file.write_text(course_text(bench, steps), encoding="utf-8")
+    run = render_job(resolve(file), backend, frames=2)
+    assert run.series is not None
+    assert run.series.times.tolist() == [0.0, 0.5, 1.25]
+    for k, (_, asked) in enumerate(steps):
+        told, _ = bench.state(asked)
+        for camera, values in told["truth"]["cameras"].items():
+            series = run.series.truth[camera][:, k] * np.array([180 * 3600 / math.pi] * 3 + [1e6])
+            shown = [values[key] for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")]
+            # a batch of states rounds in another order than one; lines of sight hold 1e-16 of a turn, 2e-11 arcsec each
+            assert series == pytest.approx(shown, abs=1e-9)
+
+
+def test_a_course_refuses_what_it_cannot_hold(bench, first):
+    figure = [(0.0, changed(first, {})), (1.0, changed(first, {f"{M2} figure Z5": 3.0}))]
+    with pytest.raises(ValueError, match="figure"):
+        course_text(bench, figure)
+    with pytest.raises(ValueError, match="at least 2"):
+        course_text(bench, figure[:1])
+    still = [(0.0, first), (1.0, first)]
+    with pytest.raises(ValueError, match="nothing moved"):
+        course_text(bench, still)
+    turned = [(0.0, first), (1.0, changed(first, pivots={M2: "centre"}))]
+    with pytest.raises(ValueError, match="pivot"):
+        course_text(bench, turned)
+
+
+def test_a_long_recording_is_thinned_to_what_a_course_may_have(bench, first):
+    steps = [(0.01 * k, changed(first, {f"{M2} shift z": 0.001 * k})) for k in range(1500)]
+    times = [line for line in course_text(bench, steps).splitlines() if line.strip().startswith("times:")]
+    assert len(times) == 1
+    assert "0.0 s" in times[0]
+
+
+def test_without_noise_readings_are_those_of_the_expected_image(bench, first):
+    """All estimators agree with the noisy reading within its noise, 5 sigma for 60 numbers: false alarm 3e-5."""
+    noisy, _ = bench.state(changed(first, frames=9))
+    clean, image = bench.state(changed(first, noise=False, frames=9))
+    for camera, estimators in clean["readings"]["cameras"].items():
+        for name, values in estimators.items():
+            for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um"):
+                other = noisy["readings"]["cameras"][camera][name]
+                sigma = other[f"{key}_sigma_noise"]
+                assert abs(values[key] - other[key]) < 5.0 * sigma
+                # expected sigma differs from the one estimated in noisy frames by the noise of the flux alone
+                assert values[f"{key}_sigma_noise"] == pytest.approx(sigma, rel=0.05)
+    assert image is not None
+    assert image.dtype == np.uint16
+
+
+def test_the_order_of_states_does_not_matter(bench, first):
+    other = changed(first, {f"{M2} shift x": 4.0})
+    a, image = bench.state(first)
+    bench.state(other)
+    b, again = bench.state(first)
+    assert {k: v for k, v in a.items() if k != "ms"} == {k: v for k, v in b.items() if k != "ms"}
+    assert np.array_equal(image, again)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "cause"),
+    [
+        ({"base/forward/M1 shift x": 90_000.0}, "misses"),
+        ({f"{PLANE} shift x": 2000.0}, "outside its area CCD"),
+        ({"base temperature": -300.0}, "0 K"),
+        ({f"{M2} shift z": 1e9}, "too large"),
+        ({"base/forward/M9 shift z": 1.0}, "no such knob"),
+    ],
+)
+def test_an_impossible_state_says_why_and_the_next_good_one_is_good(bench, first, knobs, cause):
+    before, _ = bench.state(first)
+    told, image = bench.state(changed(first, knobs))
+    assert image is None
+    assert cause in " ".join([told["problem"], *told["causes"]])
+    assert "readings" not in told
+    after, _ = bench.state(first)
+    assert after["readings"] == before["readings"]
+
+
+def test_bodies_in_each_other_are_told(bench, first):
+    """The left 0-degree prism of the forward camera, moved through the central prism's room or another body."""
+    placed = bench.twin.experiment.instrument.assembly.place([{}])
+    assert bench.clearances.overlaps(placed) == ()
+    paths, gaps = bench.clearances.paths, bench.clearances.gaps
+    nearest = int(np.argmin(np.where(gaps > 0.0, gaps, np.inf)))
+    i, j = (int(k) for k in bench.clearances.pairs[nearest])
+    middle = [pose.apply(own).mean(axis=0) for pose, own in zip(bench.clearances.poses, bench.clearances.corners, strict=True)]
+    toward = bench.clearances.poses[i].rotation.T @ (middle[j] - middle[i])
+    from optics.geometry.tree import Motion
+
+    moved = bench.twin.experiment.instrument.assembly.place([{paths[i]: Motion(shift=tuple(toward))}])
+    found = bench.clearances.overlaps(moved)
+    assert {paths[i], paths[j]} in [{one.first, one.second} for one in found]
+
+
+def test_moved_bodies_are_told_as_the_scene_needs_them(bench, first):
+    told, _ = bench.state(changed(first, {f"{M2} shift z": 7.0}, pivots={}))
+    moved = told["motions"]
+    assert set(moved) == {M2}
+    assert moved[M2]["shift"] == pytest.approx([0.0, 0.0, 7e-6], abs=1e-15)
+
+
+def test_what_is_hidden_is_not_told(bench, first):
+    asked = BlindState(**{**changed(first, {}).model_dump(), "blind": 5})
+    told, image = bench.state(asked)
+    assert "truth" not in told
+    assert "motions" not in told
+    other, again = bench.state(BlindState(**{**changed(first, {f"{M2} shift z": 3.0}).model_dump(), "blind": 5}))
+    # the guess changes nothing of what is hidden
+    assert other["readings"] == told["readings"]
+    assert np.array_equal(image, again)
+    assert other["guess"]["spots"] != told["guess"]["spots"]
+    shown = bench.hidden(asked)
+    sigmas = [abs(one["sigmas"]) for one in shown["hidden"]]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert shown["truth"]["cameras"]
+
+
+def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
+    """Each component over its sigma is a unit normal: chi-square of 40 draws, two-sided false alarm 1e-4."""
+    from scipy.stats import chi2
+
+    squares, count = 0.0, 0
+    for seed in range(40):
+        for one in bench.hidden_amounts(BlindState(**{**first.model_dump(), "blind": seed})):
+            squares += one**2
+            count += 1
+    low, high = chi2.ppf([0.5e-4, 1 - 0.5e-4], count)
+    assert low < squares < high
+
+
+def test_every_knob_moves_what_it_names(bench):
+    """One knob of every kind at every body gives a perturbation of this body alone, with the number as typed."""
+    job, nodes = bench.twin.resolved.job, bench.twin.experiment.instrument.nodes
+    seen = set()
+    for name, knob in bench.knobs.items():
+        if (knob.node, knob.kind) in seen:
+            continue
+        seen.add((knob.node, knob.kind))
+        made = bench.twin.perturbed(perturbation({name: 0.123}, {}, bench.knobs, job))
+        own = made.resolved.job.perturb[knob.node]
+        assert own.uses() == (KINDS[knob.kind].key,)
+        assert all(not what.uses() for node, what in made.resolved.job.perturb.items() if node != knob.node)
+    assert {node for node, _ in seen} == {node for node, info in nodes.items() if info.allows - {"deformation"}}
+
+
+def test_knobs_keep_the_units_of_the_job(tmp_path):
+    file = tmp_path / "job.yaml"
+    file.write_text(
+        "instrument: gf7_pair\nperturb:\n"
+        "  base/forward/M2: {shift: [0 mm, 0 mm, 0.003 mm], figure: {Z20: 7 nm}}\n"
+        "  base/forward: {temperature: {change: 0.5 K, gradient: [1 mK/m, 0 mK/m, 0 mK/m]}, scale: 3 ppm}\n",
+        encoding="utf-8",
+    )
+    loaded = twin.load(file)
+    bench = LiveBench(loaded)
+    asked = AskedState.at_rest(bench)
+    assert asked.knobs[f"{M2} figure Z20"] == 7.0
+    assert asked.knobs["base/forward temperature"] == 0.5
+    # to the bit, whatever the unit
+    assert bench.perturbed(asked).state == loaded.state
+
+
+def test_an_unknown_knob_names_the_nearest(bench):
+    with pytest.raises(InputError, match="shift z"):
+        perturbation({f"{M2} shft z": 1.0}, {}, bench.knobs, bench.twin.resolved.job)
+    assert knob_name("base", "temperature", "") == "base temperature"
+
+
+def test_the_greeting_and_every_answer_are_json(bench, first):
+    text = json.dumps(bench.greeting(), allow_nan=False)
+    assert json.loads(text)["judged"] == "posterior"
+    told, image = bench.state(first)
+    message = packed(told, {"after": image})
+    length = int.from_bytes(message[:4], "little")
+    head = json.loads(message[4 : 4 + length])
+    assert head["images"] == {"after": list(image.shape)}
+    pixels = np.frombuffer(message[4 + length :], "<u2").reshape(image.shape)
+    assert np.array_equal(pixels, image)
+
+
+@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus"])
+def test_pictures_of_a_camera(bench, view):
+    pictures = CameraPictures(bench.twin.experiment)
+    assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")
+    with pytest.raises(ValueError, match="no camera"):
+        pictures.draw(view, "sideward", 0.5, {}, 1, 1)
+
+
+@pytest.mark.slow
+def test_the_picture_of_a_knife_edge(bench):
+    pictures = CameraPictures(bench.twin.experiment)
+    assert "Nyquist" not in pictures.draw("target", "forward", 0.0, bench.twin.state, 4, 1)[:100]
+
+
+def test_a_course_is_played_with_the_main_jobs_states(backend):
+    """A time of the job's course: the truth of the main job's series."""
+    bench = LiveBench(twin.load("scenes/examples/orbit.yaml"))
+    course = bench.course
+    assert course is not None
+    from twin.monitor.time_series import series_states
+
+    states = series_states(bench.twin.experiment, bench.twin.resolved.job)
+    asked = AskedState.at_rest(bench)
+    assert asked.time == course.shown
+    for k in (0, 7, 20):
+        assert bench.states(changed(asked, time=k)) == states[k]
+
+
+def test_a_studys_factors_become_knobs():
+    source = read_source("scenes/examples/study_aperture.yaml")
+    factors = {factor.name: factor for factor in source.factors}
+    assert factors["turn"].knobs == {"base/backward/focal_plane rotate z": 1.0}
+    assert factors["aperture"].knobs == {}
+    assert (factors["aperture"].low, factors["aperture"].high) == (20.0, 50.0)
+    half = source.with_factors({"aperture": 25.0})
+    # 50 mm as it is; light grows with the area
+    assert half.instrument.monitor.return_face.aperture == pytest.approx(0.025)
+    whole = source.resolved.instrument.monitor.reticle.photons_per_frame
+    assert half.instrument.monitor.reticle.photons_per_frame == pytest.approx(0.25 * whole)
+    with pytest.raises(InputError, match="aperture"):
+        source.with_factors({"apertur": 25.0})
+
+
+@pytest.mark.parametrize(
+    ("file", "says"),
+    [
+        ("scenes/lab/focus.yaml", "twin.lab"),
+        ("scenes/examples/study_interval.yaml", "render"),
+        ("nowhere.yaml", "nowhere.yaml"),
+    ],
+)
+def test_what_cannot_be_opened(file, says):
+    with pytest.raises(InputError, match=says):
+        read_source(file)
+
+
+@pytest.mark.slow
+def test_other_values_of_a_factor_build_the_instrument_anew():
+    """With half the aperture a quarter of the light comes, and the readings are noisier."""
+    answers = Answers("scenes/examples/study_aperture.yaml", "llvm", lambda part: None)
+    asked = AskedState.at_rest(answers.bench)
+    whole, _ = answers.bench.state(asked)
+    opened = answers.to("factors", {"aperture": 25.0})
+    assert not isinstance(opened, str)
+    half, _ = answers.bench.state(asked)
+    key = "d_alpha_arcsec_sigma_noise"
+    camera = whole["readings"]["cameras"]["forward"]["model"]
+    assert half["readings"]["cameras"]["forward"]["model"][key] > 1.5 * camera[key]
+    assert "aperture" in answers.to("factors", {"aperture": -3.0})
+    view = AskedView(n=1, state=asked, view="spot", camera="forward")
+    assert "svg" in json.loads(answers.to("view", view))
+    told = json.loads(answers.to("course", []))
+    assert "at least" in told["problem"]
+    assert Path("scenes").is_dir()

@@ -1,0 +1,189 @@
+"""Pictures of one camera in a state of the knobs: wavefront, spot, MTF, through focus, a knife edge on its line CCD."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from optics.geometry.tree import State
+from optics.waves.transfer import polychromatic_transfer
+from scenes.models.shadow import imaging_shadows
+from scenes.specs.channel import BASE
+from scenes.specs.job import TargetsSpec
+from scenes.specs.resolved import ResolvedJob, resolve_job, target_band
+from scenes.yaml.errors import InputError
+from twin.camera.camera_view import CameraView
+from twin.camera.view_plots import draw_mtf, draw_spot, draw_wavefront, field_text
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.run.random_streams import stream
+from twin.run.svg import AFTER, BEFORE, GREY, INK, look, to_svg
+from twin.sensors.line_ccd import LineCcd
+from twin.targets.edge_images import DIRECTIONS
+from twin.targets.target_images import TargetCamera
+from twin.targets.target_measurement import read_edge
+from twin.targets.target_path import TargetPath
+from twin.targets.target_result import EdgeReading
+
+SIZE = (7.6, 3.5)
+"""Inches."""
+FOCUS = 150e-6
+"""Defocus to either side of the picture through focus, metres."""
+STEPS = 49
+PLACE = "centre"
+"""Of the line, where the knife edge stands."""
+UM = "\N{MICRO SIGN}m"
+
+
+class CameraPictures:
+    """Pictures of an instrument's cameras beside what they are as designed; what does not change is kept.
+
+    Args:
+        experiment: the instrument.
+    """
+
+    def __init__(self, experiment: MonitorExperiment) -> None:
+        self.experiment = experiment
+        self._benches: dict[str, tuple[TargetCamera, TargetsSpec]] = {}
+
+    def draw(self, view: str, camera: str, field: float, state: State, frames: int, seed: int) -> str:
+        """A picture as SVG.
+
+        Args:
+            view: ``wavefront``, ``spot``, ``mtf``, ``focus`` or ``target``.
+            camera: name.
+            field: along the line, as a share of the half field; of a target the line's middle.
+            state: body -> motion.
+            frames: of the target; seed: of their noise.
+
+        Raises:
+            InputError: no such camera, or one that cannot image targets.
+            ValueError: a state in which its light is lost.
+        """
+        instrument = self.experiment.instrument
+        if camera not in instrument.cameras:
+            raise ValueError(f"no camera {camera!r}")
+        with look(f"live-{view}"):
+            figure = Figure(figsize=SIZE, layout="constrained")
+            if view == "target":
+                self._target(figure, camera, state, frames, seed)
+            else:
+                both = [
+                    CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)
+                ]
+                {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, both, field)
+            return to_svg(figure)
+
+    def _target(self, figure: Figure, camera: str, state: State, frames: int, seed: int) -> None:
+        bench, settings = self._bench(camera)
+        pattern = bench.ccd.pattern(stream(seed, 3, 0))
+        shots: list[tuple[np.ndarray, EdgeReading]] = []
+        for when, one in enumerate(({}, state)):
+            place = bench.views(one)[PLACE]
+            imager = place.edge(DIRECTIONS[0], settings.angle)
+            photons = place.ccd.white_photons(settings.white) * place.pupil.light * place.edge_image(imager)
+            taken = place.ccd.expose(photons, place.column, pattern, frames, stream(seed, 4, when))
+            mean = np.asarray(taken.mean(axis=0))
+            shots.append((mean, read_edge(place, imager.optics.normal, mean, frames)))
+        images = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.5))
+        top = max(float(mean.max()) for mean, _ in shots)
+        curve = images[2]
+        for axes, (mean, reading), name, colour in zip(
+            images, shots, ("before", "after"), (BEFORE, AFTER), strict=False
+        ):
+            axes.imshow(mean, cmap="gray", vmin=0.0, vmax=top, interpolation="nearest")
+            axes.set_xticks([])
+            axes.set_yticks([])
+            axes.set_title(f"knife edge {name}")
+            curve.plot(1e-3 * reading.frequency, reading.true, color=colour, lw=1.2, label=f"{name}, traced")
+            if reading.measured is not None:
+                own = reading.measured
+                pitch = 1e3 * bench.ccd.band.pitch
+                curve.plot(own.frequency / pitch, own.mtf, ".", color=colour, ms=3.0, label=f"{name}, from the image")
+            told = reading.nyquist
+            text = reading.reason if told is None else f"{told[0]:.4f} ± {told[1]:.4f} at Nyquist"
+            axes.set_xlabel(text, fontsize=7.5)
+        curve.axvline(0.5e-3 / bench.ccd.band.pitch, color=GREY, lw=0.8, ls=":")
+        curve.set_xlabel("cycles/mm")
+        curve.set_ylim(0.0, 1.05)
+        curve.set_title("MTF along the line")
+        curve.legend(fontsize=7)
+
+    def _bench(self, camera: str) -> tuple[TargetCamera, TargetsSpec]:
+        if camera not in self._benches:
+            experiment = self.experiment
+            instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)
+            model = instrument.cameras[camera]
+            reference = resolved.instrument.cameras[camera].camera
+            band = target_band(resolved.cameras[reference])
+            assert resolved.line_detectors is not None
+            ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
+            shadows = imaging_shadows(instrument, camera, experiment.backend)
+            path = TargetPath(
+                instrument.assembly, camera, f"{BASE}/{camera}", model, experiment.backend, shadows=shadows
+            )
+            self._benches[camera] = TargetCamera(path, ccd, resolved.targets.region), resolved.targets
+        return self._benches[camera]
+
+
+def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
+    """The job with knife edges among its images, and so with the data sheets of its line CCDs.
+
+    Raises:
+        InputError: its cameras have none.
+    """
+    if resolved.line_detectors is not None:
+        return resolved
+    render = resolved.job.render.model_copy(update={"images": ("spots", "knife_edge")})
+    job = resolved.job.model_copy(update={"render": render})
+    try:
+        return resolve_job(job.with_source(resolved.job.source))
+    except InputError as error:
+        raise ValueError(f"no targets can be imaged: {error}") from error
+
+
+def _wavefront(figure: Figure, both: list[CameraView], field: float) -> None:
+    waves = [one.wavefront((field, 0.0), points=65) for one in both]
+    most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
+    mesh = None
+    for axes, wave, name in zip(figure.subplots(1, 2), waves, ("as designed", "now"), strict=True):
+        mesh = draw_wavefront(axes, wave, most)
+        axes.set_title(f"{name}: {wave.rms:.3g} waves rms, {wave.peak_to_valley:.3g} PV")
+        axes.set_xlabel("x / stop radius")
+    figure.colorbar(mesh, ax=figure.axes, label=f"waves of {1e9 * waves[0].wavelength:.0f} nm", shrink=0.85)
+
+
+def _spot(figure: Figure, both: list[CameraView], field: float) -> None:
+    spots = [one.spot((field, 0.0)) for one in both]
+    half = max(max(1.15 * spot.airy, 1.1 * spot.farthest) for spot in spots)
+    for axes, spot, name in zip(figure.subplots(1, 2), spots, ("as designed", "now"), strict=True):
+        draw_spot(axes, spot, half)
+        axes.set_title(f"{name}: rms radius {1e6 * spot.rms:.3g} {UM}")
+        axes.set_xlabel(f"along the line [{UM}]")
+        axes.set_ylabel(f"along the track [{UM}]")
+
+
+def _mtf(figure: Figure, both: list[CameraView], field: float) -> None:
+    for axes, one, name in zip(figure.subplots(1, 2, sharey=True), both, ("as designed", "now"), strict=True):
+        found = one.mtf((field, 0.0))
+        draw_mtf(axes, found)
+        along, across = found.at(found.nyquist)
+        axes.set_title(f"{name}: {along:.3f} along, {across:.3f} across at Nyquist")
+    figure.axes[0].legend(fontsize=7)
+
+
+def _focus(figure: Figure, both: list[CameraView], field: float) -> None:
+    axes = figure.subplots()
+    shift = np.linspace(-FOCUS, FOCUS, STEPS)
+    for one, name, style in zip(both, ("as designed", "now"), ((0, (3, 2)), "-"), strict=True):
+        pupil = one.pupils([(field, 0.0)])[0]
+        colour = np.array([one.model.spec.wavelength])
+        frequency = one.nyquist * np.eye(2)
+        values = np.abs(polychromatic_transfer(pupil, frequency, colour, np.ones(1), shift))
+        for column, ink, way in ((0, "#0072B2", "along the line"), (1, "#D55E00", "along the track")):
+            axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {way}")
+    axes.axvline(0.0, color=INK, lw=0.6)
+    axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")
+    axes.set_ylabel("MTF at Nyquist")
+    axes.set_title(f"through focus, field {field_text((field, 0.0))}")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize=7)

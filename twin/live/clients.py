@@ -1,0 +1,290 @@
+"""Pages that are connected, and what is to be computed for them: of each only the last state that it asked for.
+
+A slider sends faster than states can be computed, and a slow line takes less than is computed. So there is one place for
+a page's next state and one for its next answer, and what comes later takes the place of what was there. Nothing grows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import secrets
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from twin.live.computer import BeforeKey, Computer, ComputerLost
+from twin.live.messages import (
+    AskedState,
+    AskedView,
+    BadMessage,
+    Blind,
+    BlindState,
+    Factors,
+    LARGEST_SEED,
+    Message,
+    Record,
+    Save,
+    read_message,
+)
+
+MOST_CLIENTS = 8
+RATE, BURST = 400.0, 2000
+"""Messages a second that a page may send, and how many at once: four times what the fastest pointer does."""
+BAD_MESSAGES = 20
+"""Messages that are none, after which a page is sent away."""
+MOST_RECORDED = 20_000
+"""States of a recording; the oldest are forgotten."""
+MOST_LETTERS = 32
+"""Answers beside states and pictures that wait for a slow line."""
+PATIENCE = 20.0
+"""Seconds that a page may take to receive one answer."""
+POLICY_VIOLATION, TOO_BIG, TRY_AGAIN = 1008, 1009, 1013
+"""Codes with which a WebSocket is closed."""
+
+
+class Goodbye(Exception):
+    """A page is sent away.
+
+    Attributes:
+        code: of the WebSocket; reason: for the page.
+    """
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
+        self.code, self.reason = code, reason
+
+
+@dataclass(eq=False)
+class Client:
+    """One page.
+
+    Attributes:
+        state: that it wants next; view: picture that it wants next.
+        shown: last state that was computed for it.
+        before: for which noise, frames and seed it has the images before.
+    """
+
+    state: AskedState | None = None
+    view: AskedView | None = None
+    saves: deque[Save] = field(default_factory=lambda: deque(maxlen=4))
+    factors: Factors | None = None
+    reveal: AskedState | None = None
+    shown: AskedState | None = None
+    before: BeforeKey | None = None
+    blind: int | None = None
+    recorded: deque[tuple[float, AskedState]] | None = None
+    record_began: float = 0.0
+    bad: int = 0
+    _tokens: float = BURST
+    _refilled: float = field(default_factory=time.monotonic)
+    _answer: tuple[bytes, BeforeKey] | None = None
+    _picture: str | None = None
+    _letters: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_LETTERS))
+    _to_send: asyncio.Event = field(default_factory=asyncio.Event)
+
+    @property
+    def busy(self) -> bool:
+        """Whether it waits for something."""
+        return bool(self.state or self.view or self.factors or self.saves or self.reveal)
+
+    def take(self, text: str | bytes) -> None:
+        """Take a message of the page.
+
+        Raises:
+            Goodbye: too many, or too many that are none.
+        """
+        now = time.monotonic()
+        self._tokens = min(BURST, self._tokens + RATE * (now - self._refilled)) - 1.0
+        self._refilled = now
+        if self._tokens < 0.0:
+            raise Goodbye(POLICY_VIOLATION, "too many messages")
+        try:
+            message = read_message(text)
+        except BadMessage as error:
+            self.bad += 1
+            if self.bad > BAD_MESSAGES:
+                raise Goodbye(POLICY_VIOLATION, "too many messages that are none") from None
+            self.tell({"type": "refused", "problem": str(error)})
+            return
+        self._do(message, now)
+
+    def _do(self, message: Message, now: float) -> None:
+        match message:
+            case AskedState():
+                self.state = self._own(message)
+            case AskedView():
+                self.view = message
+            case Factors():
+                self.factors = message
+            case Save():
+                self.saves.append(message)
+            case Blind():
+                if message.on:
+                    self.blind = secrets.randbelow(LARGEST_SEED)
+                elif self.blind is not None:
+                    self.reveal = self._own(self.shown or AskedState(n=0))
+                    self.blind = None
+                self.tell({"type": "blind", "on": self.blind is not None})
+            case Record():
+                if message.on:
+                    self.recorded, self.record_began = deque(maxlen=MOST_RECORDED), now
+                    if self.shown is not None:
+                        self.recorded.append((0.0, self.shown))
+                self.tell({"type": "record", "on": message.on, "states": len(self.recorded or ())})
+                if not message.on:
+                    self.record_began = 0.0
+
+    def _own(self, state: AskedState) -> AskedState:
+        """With what is hidden from the page."""
+        if self.blind is None:
+            return state
+        return BlindState.model_validate({**state.model_dump(), "blind": self.blind})
+
+    def kept(self, state: AskedState) -> None:
+        """A state was computed."""
+        self.shown = state
+        if self.recorded is not None and self.record_began and state.blind is None:
+            self.recorded.append((time.monotonic() - self.record_began, state))
+
+    def answer(self, message: bytes, before: BeforeKey) -> None:
+        """Send a state with the images before for this noise, frames and seed; the last one wins."""
+        self._answer = message, before
+        self._to_send.set()
+
+    def picture(self, message: str) -> None:
+        """Send a picture; the last one wins."""
+        self._picture = message
+        self._to_send.set()
+
+    def letter(self, message: str) -> None:
+        """Send a text, after those that wait."""
+        self._letters.append(message)
+        self._to_send.set()
+
+    def tell(self, told: dict[str, Any]) -> None:
+        """Send plain data, after those that wait."""
+        self.letter(json.dumps(told))
+
+    async def send(self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]) -> None:
+        """Send for ever what there is to send.
+
+        Raises:
+            Goodbye: the page does not take it.
+        """
+        while True:
+            await self._to_send.wait()
+            self._to_send.clear()
+            try:
+                async with asyncio.timeout(PATIENCE):
+                    while self._letters:
+                        await as_text(self._letters.popleft())
+                    if self._answer is not None:
+                        (answer, before), self._answer = self._answer, None
+                        await as_bytes(answer)
+                        self.before = before
+                    if self._picture is not None:
+                        picture, self._picture = self._picture, None
+                        await as_text(picture)
+            except TimeoutError:
+                raise Goodbye(TRY_AGAIN, "the line is too slow") from None
+
+
+class Desk:
+    """Hands the pages' wishes to the computer, one page after the other, states before pictures.
+
+    Args:
+        computer: that computes.
+    """
+
+    def __init__(self, computer: Computer) -> None:
+        self.computer = computer
+        self.clients: list[Client] = []
+        self.states = 0
+        """Number of states computed so far."""
+        self._wake = asyncio.Event()
+
+    def enter(self) -> Client:
+        """A new page.
+
+        Raises:
+            Goodbye: there are too many.
+        """
+        if len(self.clients) >= MOST_CLIENTS:
+            raise Goodbye(TRY_AGAIN, f"{MOST_CLIENTS} pages are open already")
+        client = Client()
+        self.clients.append(client)
+        return client
+
+    def leave(self, client: Client) -> None:
+        """A page is gone."""
+        with contextlib.suppress(ValueError):
+            self.clients.remove(client)
+
+    def wake(self) -> None:
+        """Somebody wants something."""
+        self._wake.set()
+
+    async def work(self) -> None:
+        """Answer for ever."""
+        while True:
+            client = self._next()
+            if client is None:
+                self._wake.clear()
+                await self._wake.wait()
+                continue
+            try:
+                await self._serve(client)
+            except ComputerLost as error:
+                client.tell({"type": "lost", "problem": f"{error}; it was started again"})
+                for one in self.clients:
+                    one.before = None
+
+    def _next(self) -> Client | None:
+        """The next page that wants a state, else anything; a page that was served goes to the end."""
+        for wants in (lambda c: c.factors or c.state, lambda c: c.busy):
+            for client in self.clients:
+                if wants(client):
+                    self.clients.remove(client)
+                    self.clients.append(client)
+                    return client
+        return None
+
+    async def _build(self, client: Client, asked: Factors) -> None:
+        for one in self.clients:
+            one.tell({"type": "building"})
+        found = await self.computer.ask("factors", asked.values)
+        if isinstance(found, str):
+            client.tell({"type": "refused", "problem": found})
+        else:
+            self.computer.opened = found
+            for one in self.clients:
+                one.shown = one.before = one.recorded = None
+        for one in self.clients:
+            one.tell({"type": "hello", **self.computer.opened.greeting})
+
+    async def _serve(self, client: Client) -> None:
+        if client.factors is not None:
+            asked_factors, client.factors = client.factors, None
+            await self._build(client, asked_factors)
+        elif client.state is not None:
+            asked, client.state = client.state, None
+            key = (asked.noise, asked.frames, asked.seed)
+            client.answer(await self.computer.ask("state", (asked, client.before)), key)
+            client.kept(asked)
+            self.states += 1
+        elif client.reveal is not None:
+            asked, client.reveal = client.reveal, None
+            client.letter(await self.computer.ask("hidden", asked))
+        elif client.saves:
+            save = client.saves.popleft()
+            if save.what == "job":
+                client.letter(await self.computer.ask("job", save.state))
+            else:
+                client.letter(await self.computer.ask("course", list(client.recorded or ())))
+        elif client.view is not None:
+            view, client.view = client.view, None
+            client.picture(await self.computer.ask("view", view))

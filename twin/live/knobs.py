@@ -1,0 +1,204 @@
+"""Knobs of the live twin: what of an instrument can be turned by hand, and the perturbation that their values come to.
+
+A knob is called as a script or a course's table calls the motion: ``base/forward/M2 shift z``. Its value is a number in
+the knob's unit, and what it does is what a job's file does that writes this number with this unit, to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from scenes.specs.course import DEFAULT_PIVOT
+from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.units import split_quantity, unit_ratio
+
+AXES = ("x", "y", "z")
+FIGURE_TERMS = tuple(f"Z{j}" for j in range(4, 16))
+"""Noll's terms of a figure that have knobs: defocus to secondary spherical aberration's neighbours. Piston and tilts
+are rigid motions."""
+
+
+@dataclass(frozen=True)
+class KnobKind:
+    """What all knobs of one kind have in common.
+
+    Attributes:
+        key: of the perturbation in a job's file.
+        unit: of the values.
+        reach: largest value of the slider at first, either way.
+        limit: largest value that may be typed.
+    """
+
+    key: str
+    unit: str
+    reach: float
+    limit: float
+
+
+KINDS: Mapping[str, KnobKind] = {
+    "rotate": KnobKind("rotate", "arcsec", 10.0, 18_000.0),
+    "shift": KnobKind("shift", "um", 10.0, 100_000.0),
+    "figure": KnobKind("figure", "nm", 50.0, 100_000.0),
+    "scale": KnobKind("scale", "ppm", 20.0, 10_000.0),
+    "temperature": KnobKind("temperature", "K", 1.0, 1000.0),
+    "gradient": KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
+}
+"""By name. Limits are those of a job's file."""
+
+
+@dataclass(frozen=True)
+class Knob:
+    """One number that can be turned.
+
+    Attributes:
+        name: ``base/forward/M2 shift z``.
+        node: the body.
+        kind: one of ``KINDS``.
+        axis: ``x``, ``Z5``; empty where there is one only.
+        unit: of the values.
+        value: at the start.
+        reach: the slider's ends at the start, either way.
+        limit: largest value that may be typed.
+    """
+
+    name: str
+    node: str
+    kind: str
+    axis: str
+    unit: str
+    value: float
+    reach: float
+    limit: float
+
+    def plain(self) -> dict[str, Any]:
+        """As the page gets it."""
+        return asdict(self)
+
+
+def axes_of(kind: str) -> tuple[str, ...]:
+    """What knobs of a kind are called after it."""
+    if kind in ("rotate", "shift", "gradient"):
+        return AXES
+    return FIGURE_TERMS if kind == "figure" else ("",)
+
+
+def knob_name(node: str, kind: str, axis: str) -> str:
+    """``base/forward/M2 shift z``, ``base/forward temperature``."""
+    return f"{node} {kind} {axis}" if axis else f"{node} {kind}"
+
+
+def knobs_of(nodes: Mapping[str, NodeInfo], job: JobSpec) -> dict[str, Knob]:
+    """All knobs of an instrument by their names, set as a job perturbs it.
+
+    Args:
+        nodes: path -> what may be done to it.
+        job: whose ``perturb`` is where the knobs begin.
+    """
+    out = {}
+    plain = job.plain().get("perturb", {})
+    for node, info in nodes.items():
+        for kind, what in KINDS.items():
+            if what.key not in info.allows:
+                continue
+            given = _given(plain.get(node, {}), kind)
+            unit = _unit(given.values(), what.unit)
+            for axis in dict.fromkeys((*axes_of(kind), *given)):
+                value = _in_unit(given.get(axis), unit)
+                size = 1.0 if what.unit == unit else unit_ratio(what.unit, unit)
+                reach = max(what.reach * size, 2.0 * abs(value))
+                name = knob_name(node, kind, axis)
+                out[name] = Knob(name, node, kind, axis, unit, value, reach, what.limit * size)
+    return out
+
+
+def _given(what: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """Axis -> quantity as the job's plain data have it."""
+    value = what.get(KINDS[kind].key)
+    if value is None:
+        return {}
+    if kind == "temperature":
+        change = value.get("change") if isinstance(value, Mapping) else value
+        return {} if change is None else {"": change}
+    if kind == "gradient":
+        value = value.get("gradient") if isinstance(value, Mapping) else None
+        return {} if value is None else dict(zip(AXES, value, strict=True))
+    if kind == "figure":
+        return dict(value)
+    return {"": value} if kind == "scale" else dict(zip(AXES, value, strict=True))
+
+
+def _unit(quantities: Iterable[Any], usual: str) -> str:
+    """The unit of quantities when all that are not zero have the same one, so that their numbers stay as written."""
+    parts = [split_quantity(q) for q in quantities]
+    units = {part[1] for part in parts if part is not None and part[0] != 0}
+    return units.pop() if len(units) == 1 else usual
+
+
+def _in_unit(quantity: Any, unit: str) -> float:
+    part = None if quantity is None else split_quantity(quantity)
+    if part is None:
+        return 0.0
+    number, own = part
+    # dividing keeps decimal fractions where a product would not
+    return float(number) if own == unit else float(number) / unit_ratio(unit, own)
+
+
+def perturbation(
+    values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], job: JobSpec
+) -> dict[str, dict[str, Any]]:
+    """What knobs come to: ``perturb`` of a job's file, for every body that any of them moves or that the job moves.
+
+    Args:
+        values: name of a knob -> its value; others stand at zero.
+        pivots: body -> name of the point about which it turns and grows; others keep the job's.
+        knobs: all of the instrument's.
+        job: whose deformations by tables of nodes stay.
+
+    Raises:
+        InputError: no such knob, or a value beyond its limit.
+    """
+    plain = job.plain().get("perturb", {})
+    out: dict[str, dict[str, Any]] = {node: _kept(what) for node, what in plain.items()}
+    by_axis: dict[tuple[str, str], dict[str, float]] = {}
+    for name, value in values.items():
+        knob = knobs.get(name)
+        if knob is None:
+            known = names_text(knobs)
+            raise InputError(Issue("no such knob", found=repr(name), allowed=known, suggestion=nearest(name, knobs)))
+        if not abs(value) <= knob.limit:
+            raise InputError(
+                Issue(f"{name} is too large", found=f"{value:g} {knob.unit}", allowed=f"up to {knob.limit:g} {knob.unit}")
+            )
+        if value != 0.0:
+            by_axis.setdefault((knob.node, knob.kind), {})[knob.axis] = value
+    for (node, kind), numbers in by_axis.items():
+        unit = next(knobs[knob_name(node, kind, axis)].unit for axis in numbers)
+        _put(out.setdefault(node, {}), kind, numbers, unit)
+    for node, pivot in pivots.items():
+        if node in out and pivot != DEFAULT_PIVOT and {"rotate", "scale"} & set(out[node]):
+            out[node]["pivot"] = pivot
+    return out
+
+
+def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
+    """What has no knob."""
+    return {key: value for key, value in what.items() if key not in (*ACTIONS, "pivot")}
+
+
+def _put(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:
+    def quantity(axis: str) -> str:
+        return f"{numbers.get(axis, 0.0)!r} {unit}"
+
+    if kind in ("rotate", "shift"):
+        what[kind] = [quantity(axis) for axis in AXES]
+    elif kind == "figure":
+        what[kind] = {axis: quantity(axis) for axis in numbers}
+    elif kind == "scale":
+        what[kind] = quantity("")
+    elif kind == "temperature":
+        what.setdefault("temperature", {})["change"] = quantity("")
+    else:
+        what.setdefault("temperature", {})["gradient"] = [quantity(axis) for axis in AXES]

@@ -1,0 +1,354 @@
+"""What the live twin computes: an instrument that is kept built and calibrated, one state after the other.
+
+A state takes the way of the main job (`twin.main_job.render_job`) with the same seed and the same random streams, so
+that what the page shows is what `python -m twin.render` would write for the knobs' job.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor.recovery import measure_spots, recovery_of
+from analysis.spots.centroid import mean_frames
+from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from optics.geometry.tree import State
+from optics.numerics.threads import one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from scenes.models.clearance import Clearances
+from scenes.models.disturbances import Component, state_of
+from scenes.models.thermal_model import TemperatureError
+from scenes.specs.course import moment
+from scenes.specs.job import check_nodes
+from scenes.yaml.errors import InputError
+from twin.live.knobs import Knob, knobs_of, perturbation
+from twin.live.messages import AskedState, Course
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
+from twin.monitor.crosstalk import crosstalk
+from twin.monitor.truth import trace_truth
+from twin.pictures.scene_file import motions
+from twin.run.random_streams import stream
+from twin.scripting.instrument_twin import InstrumentTwin
+
+SUSPECTS = 3
+"""Bodies that may explain a contradiction, as shown."""
+MIN_LIGHT = 0.5
+"""Share of the nominal light on a CCD below which a channel is warned of."""
+BLIND = 7
+"""Random stream of what is hidden, beside those of the monitor and of targets."""
+LOST = (AimError, BeamMissedError, TemperatureError, SpotError, InputError, ArithmeticError, ValueError)
+"""What says that a state cannot be. All errors of the analysis are ValueErrors."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """What the area CCDs recorded of one state, and what was measured in it.
+
+    Attributes:
+        shown: (C, H, W) uint16, the first frame, or the rounded expected image.
+        spots: measured in the mean of all frames, or in the expected image.
+    """
+
+    shown: np.ndarray
+    spots: SpotPositions
+
+
+class LiveBench:
+    """An instrument on which knobs are turned. It keeps what was worked out, and no state of the knobs.
+
+    Args:
+        twin: the instrument, perturbed as the knobs stand at first.
+    """
+
+    def __init__(self, twin: InstrumentTwin) -> None:
+        self.twin = twin
+        check_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
+        self._before = lru_cache(maxsize=4)(self._measured_before)
+
+    @cached_property
+    def knobs(self) -> dict[str, Knob]:
+        """All knobs by their names."""
+        return knobs_of(self.twin.experiment.instrument.nodes, self.twin.resolved.job)
+
+    @cached_property
+    def clearances(self) -> Clearances:
+        """Which bodies may come into each other."""
+        return Clearances.of(self.twin.experiment.instrument)
+
+    @cached_property
+    def _crosstalk(self) -> Any:
+        return crosstalk(self.twin.experiment, self._noise)
+
+    @property
+    def _noise(self) -> dict[str, np.ndarray]:
+        """Any covariance will do: only what motions do to spots is used of the table."""
+        instrument = self.twin.experiment.instrument
+        return {name: np.eye(len(instrument.coordinates_of(name))) for name in instrument.cameras}
+
+    def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
+        """Work out everything that does not depend on the knobs, and compile every kernel.
+
+        Args:
+            advance: told of each part when it begins.
+        """
+        experiment = self.twin.experiment
+        advance("trace the unperturbed instrument")
+        experiment.nominal_focus  # noqa: B018
+        advance("calibrate its spots")
+        experiment.calibration  # noqa: B018
+        advance("what is stated to move")
+        experiment.disturbances  # noqa: B018
+        self._crosstalk  # noqa: B018
+        self.clearances  # noqa: B018
+        advance("compile")
+        self.state(AskedState.at_rest(self))
+
+    def greeting(self) -> dict[str, Any]:
+        """What a page has to know before it asks for a state."""
+        twin, experiment = self.twin, self.twin.experiment
+        job = twin.resolved.job
+        nodes = {
+            path: {"pivots": list(info.pivots), "pivot": job.perturb[path].pivot if path in job.perturb else "origin"}
+            for path, info in experiment.instrument.nodes.items()
+        }
+        run = self._run(AskedState.at_rest(self), {})[0]
+        stated_motion = experiment.disturbances
+        return {
+            "instrument": twin.name,
+            "cameras": list(twin.cameras),
+            "channels": [{"key": c.key, "camera": c.camera, "side": c.side} for c in experiment.path.channels],
+            "rows": experiment.path.shape[0],
+            "columns": experiment.path.shape[1],
+            "pixel_um": 1e6 * experiment.path.pitch,
+            "white": experiment.detector.max_dn,
+            "offset": float(experiment.expected_frames(np.zeros((1, 1)))[0, 0]),
+            "nodes": nodes,
+            "knobs": [knob.plain() for knob in self.knobs.values()],
+            "frames": twin.resolved.frames,
+            "seed": job.render.seed,
+            "estimators": list(run.estimators),
+            "judged": run.judged,
+            "parameters": [_label(p) for p in PARAMETERS],
+            "angle": _label(ANGLE) if len(twin.cameras) == 2 else None,
+            "ground": [_label(p) for p in GROUND] if experiment.ground is not None else [],
+            "disturbances": "" if stated_motion is None else stated_motion.name,
+            "course": self.course.plain() if self.course is not None else None,
+        }
+
+    @property
+    def course(self) -> Course | None:
+        """Times of the job's course; None without."""
+        course = self.twin.resolved.job.course
+        return None if course is None else Course(tuple(course.times), tuple(map(moment, course.times)), course.shown)
+
+    def perturbed(self, asked: AskedState) -> InstrumentTwin:
+        """The instrument as the knobs stand.
+
+        Raises:
+            InputError: no such knob, or a value that a job's file could not have.
+        """
+        return self.twin.perturbed(perturbation(asked.knobs, asked.pivots, self.knobs, self.twin.resolved.job))
+
+    def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
+        """What a state of the knobs comes to.
+
+        Args:
+            asked: the state.
+
+        Returns:
+            Plain data for the page, and the images after, uint16 (C, H, W); None where there are none. A state that
+            cannot be has ``problem`` in place of readings.
+        """
+        began = time.perf_counter()
+        told: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
+        try:
+            with one_blas_thread():
+                run, after, state = self._run(asked, self._hidden(asked))
+        except LOST as error:
+            return {**told, **self._lost(asked, error), "ms": _ms(began)}, None
+        told |= self._told(run, asked, state)
+        told["ms"] = _ms(began)
+        return told, after
+
+    def before(self, asked: AskedState) -> np.ndarray:
+        """Images before the perturbation, uint16 (C, H, W)."""
+        return self._before(asked.noise, asked.frames, asked.seed).shown
+
+    def _lost(self, asked: AskedState, error: Exception) -> dict[str, Any]:
+        """Why there is no such state, and which bodies are in each other, if that is why."""
+        if isinstance(error, SpotError):
+            channels = self.twin.experiment.path.channels
+            reasons = [f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items()]
+            return {"problem": "a spot cannot be measured", "causes": reasons}
+        lines = [line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip()]
+        return {"problem": "this state cannot be", "causes": lines[:6]}
+
+    def states(self, asked: AskedState) -> State:
+        """Body -> motion of the knobs and of the course's time.
+
+        Raises:
+            InputError: as `perturbed`; TemperatureError: beyond what materials are known for.
+        """
+        perturbed = self.perturbed(asked)
+        job, experiment = perturbed.resolved.job, perturbed.experiment
+        if asked.time is None or job.course is None:
+            return experiment.state(job)
+        fields = job.fields(asked.time)
+        experiment.thermal.check(fields)
+        return experiment.thermal.state(fields, experiment.motions(job, asked.time))
+
+    def _hidden(self, asked: AskedState) -> State:
+        """The motions that are drawn for a blind guess; none without."""
+        experiment = self.twin.experiment
+        if asked.blind is None or experiment.stated is None:
+            return {}
+        return state_of(self._drawn(asked), experiment.stated.components, experiment.thermal)
+
+    @property
+    def _components(self) -> tuple[Component, ...]:
+        stated = self.twin.experiment.stated
+        return () if stated is None else stated.components
+
+    def _drawn(self, asked: AskedState) -> np.ndarray:
+        stated = self.twin.experiment.stated
+        assert stated is not None
+        assert asked.blind is not None
+        return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
+
+    def hidden_amounts(self, asked: AskedState) -> list[float]:
+        """What was drawn for a blind guess, each over its sigma; correlated where that is stated."""
+        parts = self._components
+        return [float(value / part.sigma) for value, part in zip(self._drawn(asked), parts, strict=True) if part.sigma]
+
+    def hidden(self, asked: AskedState) -> dict[str, Any]:
+        """What was drawn for a blind guess, the largest in its sigma first, and what it truly did."""
+        state = self._hidden(asked)
+        if not state:
+            return {}
+        parts, row = self._components, self._drawn(asked)
+        order = sorted(range(len(parts)), key=lambda k: -abs(row[k] / parts[k].sigma) if parts[k].sigma else 0.0)
+        run, _, _ = self._run(asked, state)
+        return {
+            "truth": run.truth_dict(),
+            "hidden": [
+                {
+                    "what": parts[k].name,
+                    "value": float(row[k] / parts[k].unit_size),
+                    "unit": parts[k].unit,
+                    "sigmas": float(row[k] / parts[k].sigma),
+                }
+                for k in order
+                if row[k]
+            ],
+        }
+
+    def _measured_before(self, noise: bool, frames: int, seed: int) -> Exposure:
+        experiment = self.twin.experiment
+        if noise:
+            return self._measured(experiment.frames_before(frames, seed), frames)
+        return self._measured(experiment.expected_frames(experiment.nominal_photons), frames)
+
+    def _measured_after(self, photons: np.ndarray, asked: AskedState) -> Exposure:
+        """Of one state's photons, (1, C, H, W)."""
+        experiment = self.twin.experiment
+        if asked.noise:
+            # at a time of a course from the stream of that time, as the main job does it
+            return self._measured(experiment.frames_after(photons, asked.frames, asked.seed, asked.time or 0)[0], asked.frames)
+        return self._measured(experiment.expected_frames(photons[0]), asked.frames)
+
+    def _measured(self, recorded: np.ndarray, frames: int) -> Exposure:
+        """The spots in frames, (C, N, H, W), or in expected grey values, (C, H, W), whose sigmas are those of frames."""
+        experiment = self.twin.experiment
+        if recorded.ndim == 4:
+            mean, shown = mean_frames(recorded), recorded[:, 0]
+        else:
+            mean, shown = recorded, np.rint(np.clip(recorded, 0, experiment.detector.max_dn)).astype(np.uint16)
+        centroid = self.twin.resolved.job.analysis.centroid
+        return Exposure(shown, measure_spots(mean, frames, experiment.calibration, centroid))
+
+    def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, State]:
+        experiment, resolved = self.twin.experiment, self.twin.resolved
+        # the knobs are a guess of what is hidden, which stands beside it and not on top of it
+        state = hidden or self.states(asked)
+        truth = trace_truth(experiment.instrument, experiment.backend, [state])
+        photons = experiment.path.expected_photons([state], single=False)
+        before = self._before(asked.noise, asked.frames, asked.seed)
+        after = self._measured_after(photons, asked)
+        spread = difference_covariance(before.spots, after.spots, experiment.calibration.noise)
+        recovery = recovery_of(
+            before.spots, after.spots, spread, experiment.calibration, experiment.disturbances
+        )
+        run = RenderRun(
+            resolved=resolved,
+            experiment=experiment,
+            state=state,
+            frames=asked.frames,
+            seed=asked.seed,
+            truth=truth,
+            photons_before=experiment.nominal_photons,
+            photons_after=photons[0],
+            before=before.shown[:, None],
+            after=after.shown[:, None],
+            recovery=recovery,
+            crosstalk=self._crosstalk,
+            warnings=(),
+        )
+        return run, after.shown, state
+
+    def _told(self, run: RenderRun, asked: AskedState, state: State) -> dict[str, Any]:
+        experiment = self.twin.experiment
+        instrument = experiment.instrument
+        placed = instrument.assembly.place([state])
+        told: dict[str, Any] = {"readings": stated(run.recovered_dict())}
+        if asked.blind is None:
+            told["truth"] = run.truth_dict()
+            told["motions"] = motions(instrument, state, placed)
+        else:
+            told["guess"] = self._guess(asked)
+        light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
+        told["light"] = [float(share) for share in light]
+        told["warnings"] = self._warnings(run, light)
+        told["collisions"] = [f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)]
+        return told
+
+    def _guess(self, asked: AskedState) -> dict[str, Any]:
+        """What the knobs, as a guess of what is hidden, would have done: the expected image, and the spots in it."""
+        experiment = self.twin.experiment
+        try:
+            photons = experiment.path.expected_photons([self.states(asked)], single=False)
+            made = self._measured(experiment.expected_frames(photons[0]), asked.frames)
+        except LOST as error:
+            return {"problem": str(error)}
+        return {"spots": made.spots.position.tolist(), "image": made.shown}
+
+    def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
+        detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels
+        out = []
+        saturated = np.ravel(detector.saturated(run.after).pixels)
+        for channel, share, full in zip(channels, light, saturated, strict=True):
+            if full:
+                out.append(f"{channel.key}: saturated pixels; its centroid is biased")
+            if share < MIN_LIGHT:
+                out.append(f"{channel.key}: only {100.0 * share:.0f} % of its light reaches the CCD")
+        return out
+
+
+def _ms(began: float) -> float:
+    return 1e3 * (time.perf_counter() - began)
+
+
+def _label(parameter: Parameter) -> Mapping[str, str]:
+    return {
+        "key": parameter.key,
+        "symbol": parameter.symbol,
+        "unit": parameter.unit,
+        "meaning": parameter.meaning,
+    }

@@ -1,0 +1,223 @@
+"""What page and program say to each other.
+
+The page sends JSON texts, each one of `Message`; nothing in them names a file. The program answers with JSON texts and,
+for a state's images, with one binary message: four bytes (little endian) with the length of a JSON text, the text,
+spaces up to a multiple of eight bytes, and the images that the text lists under ``images``, uint16, little endian.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+if TYPE_CHECKING:
+    from twin.live.live_bench import LiveBench
+
+LARGEST_MESSAGE = 1 << 16
+"""Bytes of a message of the page."""
+MOST_KNOBS = 400
+"""Knobs off zero at once."""
+MOST_FRAMES = 64
+LARGEST_SEED = 2**53 - 1
+"""What a number in JSON holds exactly."""
+
+Text = Annotated[str, Field(max_length=200)]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class _Said(BaseModel):
+    """Nothing else may stand in a message."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class AskedState(_Said):
+    """A state of the knobs.
+
+    Attributes:
+        n: its number, counted by the page.
+        t: the page's clock when it was asked for, which is sent back.
+        knobs: name -> value, of those that are not at zero.
+        pivots: body -> name of the point about which it turns.
+        noise: frames with noise, or the expected image.
+        frames: of each exposure.
+        seed: of the noise.
+        time: number of a time of the job's course; None for the job's single state.
+        blind: what seed the hidden motions are drawn from; set by the program, never by the page.
+    """
+
+    type: Literal["state"] = "state"
+    n: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+    t: Number = 0.0
+    knobs: Annotated[dict[Text, Number], Field(max_length=MOST_KNOBS)] = {}
+    pivots: Annotated[dict[Text, Text], Field(max_length=MOST_KNOBS)] = {}
+    noise: bool = True
+    frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)] = 1
+    seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 1
+    time: Annotated[int, Field(ge=0, le=1000)] | None = None
+    blind: None = None
+
+    @classmethod
+    def at_rest(cls, bench: LiveBench) -> AskedState:
+        """The state in which a bench's knobs begin."""
+        resolved = bench.twin.resolved
+        course = bench.course
+        return cls(
+            n=0,
+            knobs={knob.name: knob.value for knob in bench.knobs.values() if knob.value},
+            pivots={path: what.pivot for path, what in resolved.job.perturb.items() if what.pivot != "origin"},
+            frames=min(resolved.frames, MOST_FRAMES),
+            seed=resolved.job.render.seed,
+            time=None if course is None else course.shown,
+        )
+
+
+class BlindState(AskedState):
+    """The same while something is hidden.
+
+    Attributes:
+        blind: seed of what is drawn.
+    """
+
+    blind: int  # type: ignore[assignment]
+
+
+class AskedView(_Said):
+    """A picture of one camera in the last state.
+
+    Attributes:
+        n: its number.
+        state: of the knobs.
+        view: which picture.
+        camera: of which camera.
+        field: along the line, as a share of the half field.
+        defocus: of the picture, micrometres downstream.
+    """
+
+    type: Literal["view"] = "view"
+    n: Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+    state: AskedState
+    view: Literal["wavefront", "spot", "mtf", "focus", "target"]
+    camera: Text
+    field: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+
+
+class Factors(_Said):
+    """Build the instrument with other values of a study's factors; for all pages.
+
+    Attributes:
+        values: factor -> number in its unit.
+    """
+
+    type: Literal["factors"] = "factors"
+    values: Annotated[dict[Text, Number], Field(max_length=100)]
+
+
+class Blind(_Said):
+    """Hide motions that are drawn, or end it and show them.
+
+    Attributes:
+        on: begin, or reveal.
+    """
+
+    type: Literal["blind"] = "blind"
+    on: bool
+
+
+class Record(_Said):
+    """Begin to keep every state that is shown, or end.
+
+    Attributes:
+        on: begin (what was kept is forgotten), or end.
+    """
+
+    type: Literal["record"] = "record"
+    on: bool
+
+
+class Save(_Said):
+    """A job file of a state, or a job with a course of what was recorded.
+
+    Attributes:
+        what: which.
+        state: of the knobs.
+    """
+
+    type: Literal["save"] = "save"
+    what: Literal["job", "course"]
+    state: AskedState
+
+
+Message = AskedState | AskedView | Factors | Blind | Record | Save
+_MESSAGE: TypeAdapter[Message] = TypeAdapter(Annotated[Message, Field(discriminator="type")])
+
+
+class BadMessage(ValueError):
+    """A message of a page that is none."""
+
+
+def read_message(text: str | bytes) -> Message:
+    """A message of a page.
+
+    Raises:
+        BadMessage: it is none; the text says where.
+    """
+    if len(text) > LARGEST_MESSAGE:
+        raise BadMessage(f"the message has {len(text)} bytes, more than {LARGEST_MESSAGE}")
+    try:
+        return _MESSAGE.validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(str(part) for part in first["loc"])[:200]
+        raise BadMessage(f"not a message: {where or 'the text'}: {first['msg']}"[:400]) from None
+
+
+def packed(told: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
+    """A binary message of the program.
+
+    Args:
+        told: plain data.
+        images: name -> uint16 (C, H, W).
+    """
+    whole = {**told, "images": {name: list(image.shape) for name, image in images.items()}}
+    text = json.dumps(whole, allow_nan=False, separators=(",", ":")).encode()
+    text += b" " * (-(4 + len(text)) % 8)
+    pixels = [np.ascontiguousarray(image, "<u2").tobytes() for image in images.values()]
+    return len(text).to_bytes(4, "little") + text + b"".join(pixels)
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """An instrument that is ready.
+
+    Attributes:
+        greeting: what a page has to know.
+        scene: binary glTF of it as designed.
+    """
+
+    greeting: dict[str, Any]
+    scene: bytes
+
+
+@dataclass(frozen=True)
+class Course:
+    """Times that can be played.
+
+    Attributes:
+        times: seconds.
+        names: as a file writes them.
+        shown: number of the one that the job shows in full.
+    """
+
+    times: tuple[float, ...]
+    names: tuple[str, ...]
+    shown: int
+
+    def plain(self) -> dict[str, Any]:
+        """As the page gets it."""
+        return {"times": list(self.times), "names": list(self.names), "shown": self.shown}
