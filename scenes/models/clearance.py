@@ -151,10 +151,12 @@ class Clearances:
             placed: where the bodies stand, in one state; how they have grown is left out.
         """
         poses = [placed.pose(path) for path in self.paths]
-        moved = np.array([
-            np.linalg.norm(now.apply(own) - then.apply(own), axis=-1).max()
-            for now, then, own in zip(poses, self.poses, self.corners, strict=True)
-        ])
+        moved = np.array(
+            [
+                np.linalg.norm(now.apply(own) - then.apply(own), axis=-1).max()
+                for now, then, own in zip(poses, self.poses, self.corners, strict=True)
+            ]
+        )
         found = []
         for (i, j), gap in zip(self.pairs, self.gaps, strict=True):
             if gap <= 0.0 or moved[i] + moved[j] < gap:

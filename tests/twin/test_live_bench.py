@@ -66,7 +66,10 @@ def test_a_recorded_course_has_the_states_that_were_shown(bench, first, backend,
     steps = [
         (0.0, changed(first, {}, pivots={})),
         (0.5004, changed(first, {f"{M2} shift z": 1.0, f"{PLANE} rotate z": 3.0}, pivots=pivots)),
-        (1.25, changed(first, {f"{M2} shift z": 2.5, f"{PLANE} rotate z": 3.0, "base temperature": 0.5}, pivots=pivots)),
+        (
+            1.25,
+            changed(first, {f"{M2} shift z": 2.5, f"{PLANE} rotate z": 3.0, "base temperature": 0.5}, pivots=pivots),
+        ),
     ]
     steps[0] = (0.0, changed(steps[0][1], pivots=pivots))
     file = tmp_path / "course.yaml"
@@ -156,7 +159,9 @@ def test_bodies_in_each_other_are_told(bench, first):
     paths, gaps = bench.clearances.paths, bench.clearances.gaps
     nearest = int(np.argmin(np.where(gaps > 0.0, gaps, np.inf)))
     i, j = (int(k) for k in bench.clearances.pairs[nearest])
-    middle = [pose.apply(own).mean(axis=0) for pose, own in zip(bench.clearances.poses, bench.clearances.corners, strict=True)]
+    middle = [
+        pose.apply(own).mean(axis=0) for pose, own in zip(bench.clearances.poses, bench.clearances.corners, strict=True)
+    ]
     toward = bench.clearances.poses[i].rotation.T @ (middle[j] - middle[i])
     from optics.geometry.tree import Motion
 

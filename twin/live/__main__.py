@@ -28,17 +28,15 @@ app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exce
 def main(
     what: Annotated[
         str,
-        typer.Argument(help="Instrument of the library or its file, a job's file, a run folder of twin.render, a study."),
+        typer.Argument(
+            help="Instrument of the library or its file, a job's file, a run folder of twin.render, a study."
+        ),
     ],
-    port: Annotated[
-        int, typer.Option(min=0, max=65535, help="To listen on; 0 takes one that is free.")
-    ] = PORT,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="To listen on; 0 takes one that is free.")] = PORT,
     host: Annotated[
         str, typer.Option(help="Address to listen on. Others than this machine can reach it if it is not 127.0.0.1.")
     ] = "127.0.0.1",
-    stay: Annotated[
-        bool, typer.Option("--stay", help="Go on when the last page is closed; end with Ctrl-C.")
-    ] = False,
+    stay: Annotated[bool, typer.Option("--stay", help="Go on when the last page is closed; end with Ctrl-C.")] = False,
     backend: BackendName = "llvm",
     quiet: Quiet = False,
 ) -> None:

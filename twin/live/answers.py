@@ -12,12 +12,11 @@ from typing import Any
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
 from twin.live.live_bench import LOST, LiveBench
-from twin.live.messages import AskedState, AskedView, Opened, packed
+from twin.live.messages import AskedState, AskedView, BlindState, Opened, packed
 from twin.live.recording import course_text, job_text
 from twin.live.source import read_source
 from twin.pictures.scene_file import write_scene
 from twin.scripting.instrument_twin import InstrumentTwin
-
 
 KEPT = 3
 """Instruments of a study that stay built."""
@@ -56,7 +55,9 @@ class Answers:
             bench.warm(advance)
             greeting = {
                 **bench.greeting(),
-                "factors": [{**knob.plain(), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors],
+                "factors": [
+                    {**knob.plain(), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors
+                ],
             }
             with tempfile.TemporaryDirectory() as folder:
                 place = Path(folder) / "scene.glb"
@@ -104,7 +105,7 @@ class Answers:
             told["problem"] = str(error)[:1000]
         return json.dumps(told)
 
-    def _hidden(self, asked: AskedState) -> str:
+    def _hidden(self, asked: BlindState) -> str:
         """What was hidden, and what it truly did."""
         return json.dumps({"type": "revealed", **self.bench.hidden(asked)})
 

@@ -53,7 +53,8 @@ class CameraPictures:
             camera: name.
             field: along the line, as a share of the half field; of a target the line's middle.
             state: body -> motion.
-            frames: of the target; seed: of their noise.
+            frames: of the target.
+            seed: of their noise.
 
         Raises:
             InputError: no such camera, or one that cannot image targets.
@@ -67,9 +68,7 @@ class CameraPictures:
             if view == "target":
                 self._target(figure, camera, state, frames, seed)
             else:
-                both = [
-                    CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)
-                ]
+                both = [CameraView.within(instrument, camera, self.experiment.backend, one) for one in ({}, state)]
                 {"wavefront": _wavefront, "spot": _spot, "mtf": _mtf, "focus": _focus}[view](figure, both, field)
             return to_svg(figure)
 
@@ -134,9 +133,8 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
     if resolved.line_detectors is not None:
         return resolved
     render = resolved.job.render.model_copy(update={"images": ("spots", "knife_edge")})
-    job = resolved.job.model_copy(update={"render": render})
     try:
-        return resolve_job(job.with_source(resolved.job.source))
+        return resolve_job(resolved.job.model_copy(update={"render": render}))
     except InputError as error:
         raise ValueError(f"no targets can be imaged: {error}") from error
 
@@ -144,12 +142,12 @@ def _with_targets(resolved: ResolvedJob) -> ResolvedJob:
 def _wavefront(figure: Figure, both: list[CameraView], field: float) -> None:
     waves = [one.wavefront((field, 0.0), points=65) for one in both]
     most = max(float(np.nanmax(np.abs(wave.map))) for wave in waves)
-    mesh = None
+    meshes = []
     for axes, wave, name in zip(figure.subplots(1, 2), waves, ("as designed", "now"), strict=True):
-        mesh = draw_wavefront(axes, wave, most)
+        meshes.append(draw_wavefront(axes, wave, most))
         axes.set_title(f"{name}: {wave.rms:.3g} waves rms, {wave.peak_to_valley:.3g} PV")
         axes.set_xlabel("x / stop radius")
-    figure.colorbar(mesh, ax=figure.axes, label=f"waves of {1e9 * waves[0].wavelength:.0f} nm", shrink=0.85)
+    figure.colorbar(meshes[0], ax=figure.axes, label=f"waves of {1e9 * waves[0].wavelength:.0f} nm", shrink=0.85)
 
 
 def _spot(figure: Figure, both: list[CameraView], field: float) -> None:

@@ -1,7 +1,8 @@
 """Pages that are connected, and what is to be computed for them: of each only the last state that it asked for.
 
-A slider sends faster than states can be computed, and a slow line takes less than is computed. So there is one place for
-a page's next state and one for its next answer, and what comes later takes the place of what was there. Nothing grows.
+A slider sends faster than states can be computed, and a slow line takes less than is computed. So there is one
+place for a page's next state and one for its next answer, and what comes later takes the place of what was there.
+Nothing grows.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from typing import Any
 
 from twin.live.computer import BeforeKey, Computer, ComputerLost
 from twin.live.messages import (
+    LARGEST_SEED,
     AskedState,
     AskedView,
     BadMessage,
     Blind,
     BlindState,
     Factors,
-    LARGEST_SEED,
     Message,
     Record,
     Save,
@@ -72,7 +73,7 @@ class Client:
     view: AskedView | None = None
     saves: deque[Save] = field(default_factory=lambda: deque(maxlen=4))
     factors: Factors | None = None
-    reveal: AskedState | None = None
+    reveal: BlindState | None = None
     shown: AskedState | None = None
     before: BeforeKey | None = None
     blind: int | None = None
@@ -126,7 +127,7 @@ class Client:
                 if message.on:
                     self.blind = secrets.randbelow(LARGEST_SEED)
                 elif self.blind is not None:
-                    self.reveal = self._own(self.shown or AskedState(n=0))
+                    self.reveal = _hiding(self.shown or AskedState(n=0), self.blind)
                     self.blind = None
                 self.tell({"type": "blind", "on": self.blind is not None})
             case Record():
@@ -140,14 +141,12 @@ class Client:
 
     def _own(self, state: AskedState) -> AskedState:
         """With what is hidden from the page."""
-        if self.blind is None:
-            return state
-        return BlindState.model_validate({**state.model_dump(), "blind": self.blind})
+        return state if self.blind is None else _hiding(state, self.blind)
 
     def kept(self, state: AskedState) -> None:
         """A state was computed."""
         self.shown = state
-        if self.recorded is not None and self.record_began and state.blind is None:
+        if self.recorded is not None and self.record_began and not isinstance(state, BlindState):
             self.recorded.append((time.monotonic() - self.record_began, state))
 
     def answer(self, message: bytes, before: BeforeKey) -> None:
@@ -169,7 +168,9 @@ class Client:
         """Send plain data, after those that wait."""
         self.letter(json.dumps(told))
 
-    async def send(self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]) -> None:
+    async def send(
+        self, as_text: Callable[[str], Awaitable[None]], as_bytes: Callable[[bytes], Awaitable[None]]
+    ) -> None:
         """Send for ever what there is to send.
 
         Raises:
@@ -191,6 +192,10 @@ class Client:
                         await as_text(picture)
             except TimeoutError:
                 raise Goodbye(TRY_AGAIN, "the line is too slow") from None
+
+
+def _hiding(state: AskedState, seed: int) -> BlindState:
+    return BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 
 class Desk:

@@ -170,7 +170,9 @@ def perturbation(
             raise InputError(Issue("no such knob", found=repr(name), allowed=known, suggestion=nearest(name, knobs)))
         if not abs(value) <= knob.limit:
             raise InputError(
-                Issue(f"{name} is too large", found=f"{value:g} {knob.unit}", allowed=f"up to {knob.limit:g} {knob.unit}")
+                Issue(
+                    f"{name} is too large", found=f"{value:g} {knob.unit}", allowed=f"up to {knob.limit:g} {knob.unit}"
+                )
             )
         if value != 0.0:
             by_axis.setdefault((knob.node, knob.kind), {})[knob.axis] = value

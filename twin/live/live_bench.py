@@ -28,7 +28,7 @@ from scenes.specs.course import moment
 from scenes.specs.job import check_nodes
 from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
-from twin.live.messages import AskedState, Course
+from twin.live.messages import AskedState, BlindState, Course
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
@@ -208,7 +208,7 @@ class LiveBench:
     def _hidden(self, asked: AskedState) -> State:
         """The motions that are drawn for a blind guess; none without."""
         experiment = self.twin.experiment
-        if asked.blind is None or experiment.stated is None:
+        if not isinstance(asked, BlindState) or experiment.stated is None:
             return {}
         return state_of(self._drawn(asked), experiment.stated.components, experiment.thermal)
 
@@ -217,18 +217,17 @@ class LiveBench:
         stated = self.twin.experiment.stated
         return () if stated is None else stated.components
 
-    def _drawn(self, asked: AskedState) -> np.ndarray:
+    def _drawn(self, asked: BlindState) -> np.ndarray:
         stated = self.twin.experiment.stated
         assert stated is not None
-        assert asked.blind is not None
         return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
 
-    def hidden_amounts(self, asked: AskedState) -> list[float]:
+    def hidden_amounts(self, asked: BlindState) -> list[float]:
         """What was drawn for a blind guess, each over its sigma; correlated where that is stated."""
         parts = self._components
         return [float(value / part.sigma) for value, part in zip(self._drawn(asked), parts, strict=True) if part.sigma]
 
-    def hidden(self, asked: AskedState) -> dict[str, Any]:
+    def hidden(self, asked: BlindState) -> dict[str, Any]:
         """What was drawn for a blind guess, the largest in its sigma first, and what it truly did."""
         state = self._hidden(asked)
         if not state:
@@ -261,11 +260,13 @@ class LiveBench:
         experiment = self.twin.experiment
         if asked.noise:
             # at a time of a course from the stream of that time, as the main job does it
-            return self._measured(experiment.frames_after(photons, asked.frames, asked.seed, asked.time or 0)[0], asked.frames)
+            return self._measured(
+                experiment.frames_after(photons, asked.frames, asked.seed, asked.time or 0)[0], asked.frames
+            )
         return self._measured(experiment.expected_frames(photons[0]), asked.frames)
 
     def _measured(self, recorded: np.ndarray, frames: int) -> Exposure:
-        """The spots in frames, (C, N, H, W), or in expected grey values, (C, H, W), whose sigmas are those of frames."""
+        """The spots in frames, (C, N, H, W), or in expected grey values, (C, H, W), with the sigmas of frames."""
         experiment = self.twin.experiment
         if recorded.ndim == 4:
             mean, shown = mean_frames(recorded), recorded[:, 0]
@@ -283,9 +284,7 @@ class LiveBench:
         before = self._before(asked.noise, asked.frames, asked.seed)
         after = self._measured_after(photons, asked)
         spread = difference_covariance(before.spots, after.spots, experiment.calibration.noise)
-        recovery = recovery_of(
-            before.spots, after.spots, spread, experiment.calibration, experiment.disturbances
-        )
+        recovery = recovery_of(before.spots, after.spots, spread, experiment.calibration, experiment.disturbances)
         run = RenderRun(
             resolved=resolved,
             experiment=experiment,
@@ -308,7 +307,7 @@ class LiveBench:
         instrument = experiment.instrument
         placed = instrument.assembly.place([state])
         told: dict[str, Any] = {"readings": stated(run.recovered_dict())}
-        if asked.blind is None:
+        if not isinstance(asked, BlindState):
             told["truth"] = run.truth_dict()
             told["motions"] = motions(instrument, state, placed)
         else:
@@ -316,7 +315,9 @@ class LiveBench:
         light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
         told["light"] = [float(share) for share in light]
         told["warnings"] = self._warnings(run, light)
-        told["collisions"] = [f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)]
+        told["collisions"] = [
+            f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)
+        ]
         return told
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:

@@ -48,7 +48,6 @@ class AskedState(_Said):
         frames: of each exposure.
         seed: of the noise.
         time: number of a time of the job's course; None for the job's single state.
-        blind: what seed the hidden motions are drawn from; set by the program, never by the page.
     """
 
     type: Literal["state"] = "state"
@@ -60,7 +59,6 @@ class AskedState(_Said):
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)] = 1
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 1
     time: Annotated[int, Field(ge=0, le=1000)] | None = None
-    blind: None = None
 
     @classmethod
     def at_rest(cls, bench: LiveBench) -> AskedState:
@@ -78,13 +76,13 @@ class AskedState(_Said):
 
 
 class BlindState(AskedState):
-    """The same while something is hidden.
+    """The same while something is hidden; made by the program, never read from a page.
 
     Attributes:
         blind: seed of what is drawn.
     """
 
-    blind: int  # type: ignore[assignment]
+    blind: int
 
 
 class AskedView(_Said):

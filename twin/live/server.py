@@ -7,7 +7,6 @@ import contextlib
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files
-from typing import Any
 
 import uvicorn
 from starlette.applications import Starlette
@@ -25,7 +24,13 @@ from twin.live.messages import LARGEST_MESSAGE
 
 LINGER = 10.0
 """Seconds without any page after which the server ends, so that a page may be loaded again."""
-_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml", "glb": "model/gltf-binary"}
+_TYPES = {
+    "html": "text/html",
+    "css": "text/css",
+    "js": "text/javascript",
+    "svg": "image/svg+xml",
+    "glb": "model/gltf-binary",
+}
 _PAGE = files("twin.live") / "page"
 PARTS = {
     "index.html": _PAGE / "index.html",
@@ -114,7 +119,9 @@ class LiveServer:
 
     async def _session(self, request: Request) -> Response:
         """Whether a page that lost its line may come back."""
-        return JSONResponse({"instrument": self.desk.computer.opened.greeting["instrument"], "states": self.desk.states})
+        return JSONResponse(
+            {"instrument": self.desk.computer.opened.greeting["instrument"], "states": self.desk.states}
+        )
 
     async def _scene(self, request: Request) -> Response:
         return Response(self.desk.computer.opened.scene, media_type=_TYPES["glb"])
@@ -241,6 +248,3 @@ def listen(host: str, port: int) -> socket.socket:
         out.close()
         raise
     return out
-
-
-

@@ -81,7 +81,9 @@ class Source:
         for name in values:
             if name not in known:
                 names = names_text(known)
-                raise InputError(Issue("no such factor", found=repr(name), allowed=names, suggestion=nearest(name, known)))
+                raise InputError(
+                    Issue("no such factor", found=repr(name), allowed=names, suggestion=nearest(name, known))
+                )
         study = self.study.study
         factors = {name: _fixed(study.factors[name], known[name], value) for name, value in values.items()}
         one = study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
@@ -114,7 +116,9 @@ def _of_study(what: str) -> Source:
     setup = resolve_study(what)
     if setup.study.base.command != "render":
         found, allowed = setup.study.base.command, "a study of base: {command: render}"
-        raise setup.error(Problem("this study varies no instrument that could be shown", found, allowed), ("base", "command"))
+        raise setup.error(
+            Problem("this study varies no instrument that could be shown", found, allowed), ("base", "command")
+        )
     resolved = validate(ResolvedJob, YamlFile("", setup.tree, {}))
     turned = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
     return Source(resolved, setup, tuple(factor for factor in turned if factor is not None))

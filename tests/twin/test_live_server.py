@@ -1,0 +1,536 @@
+"""The live twin's server: who may speak to it, what it takes, and that nothing piles up; computing is a stand-in."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import random
+import socket
+import threading
+import time
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+
+pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
+client_of = pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+
+from twin.live.clients import BAD_MESSAGES, BURST, MOST_CLIENTS, Client, Desk, Goodbye  # noqa: E402
+from twin.live.guard import COOKIE, TOKEN, BadToken, Guard, new_token  # noqa: E402
+from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, Opened, packed, read_message  # noqa: E402
+from twin.live.server import PARTS, LiveServer, listen  # noqa: E402
+
+SECRET = "a-secret-of-enough-letters"
+
+
+class StandIn:
+    """Answers with the state's number, after a while, and remembers what it was asked."""
+
+    def __init__(self, seconds: float = 0.0, bytes_each: int = 8) -> None:
+        self.opened = Opened({"instrument": "stand-in", "channels": []}, b"glb")
+        self.seconds, self.bytes_each = seconds, bytes_each
+        self.asked: list[tuple[str, Any]] = []
+
+    async def ask(self, kind: str, question: Any) -> Any:
+        self.asked.append((kind, question))
+        await asyncio.sleep(self.seconds)
+        if kind == "state":
+            return packed({"type": "state", "n": question[0].n, "pad": "x" * self.bytes_each}, {})
+        return json.dumps({"type": kind})
+
+
+@contextmanager
+def serving(computer: StandIn, stay: bool = True):
+    """A server on a free port: its port and itself."""
+    listening = listen("127.0.0.1", 0)
+    port = listening.getsockname()[1]
+    server = LiveServer(computer, Guard.of(SECRET, "127.0.0.1", port), stay)  # type: ignore[arg-type]
+    thread = threading.Thread(target=server.run, args=(listening,), daemon=True)
+    thread.start()
+    for _ in range(200):
+        if server._uvicorn is not None and server._uvicorn.started:
+            break
+        time.sleep(0.02)
+    try:
+        yield port, server
+    finally:
+        server._stop()
+        thread.join(5)
+        assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def running():
+    with serving(StandIn()) as (port, server):
+        yield port, server
+
+
+def ask(
+    port: int, path: str = "/", cookie: str | None = SECRET, method: str = "GET", **headers: str
+) -> tuple[int, dict[str, str], bytes]:
+    line = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    own = {"Host": f"127.0.0.1:{port}", **headers}
+    if cookie is not None:
+        own["Cookie"] = f"{COOKIE}={cookie}"
+    line.request(method, path, headers=own)
+    answer = line.getresponse()
+    out = answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+    line.close()
+    return out
+
+
+def connect(port: int, cookie: str | None = SECRET, origin: str | None = "own", host: str | None = None):
+    headers = {} if cookie is None else {"Cookie": f"{COOKIE}={cookie}"}
+    own = f"http://127.0.0.1:{port}" if origin == "own" else origin
+    name = f"127.0.0.1:{port}" if host is None else host
+    line = socket.create_connection(("127.0.0.1", port), timeout=5)
+    return client_of.connect(
+        f"ws://{name}/live", sock=line, additional_headers=headers, origin=own, max_size=2**24, close_timeout=1
+    )
+
+
+def state(n: int, **other: Any) -> str:
+    return json.dumps({"type": "state", "n": n, **other})
+
+
+def numbered(message: bytes) -> int:
+    return json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])["n"]
+
+
+def alive(port: int) -> bool:
+    with connect(port) as ws:
+        assert json.loads(ws.recv(5))["type"] == "hello"
+        ws.send(state(7))
+        return numbered(ws.recv(5)) == 7
+
+
+# --- who may speak ----------------------------------------------------------------------------------------------------
+def test_the_token_becomes_a_cookie_and_leaves_the_address(running):
+    port, _ = running
+    status, headers, _ = ask(port, f"/?token={SECRET}", cookie=None)
+    assert (status, headers["location"]) == (303, "/")
+    cookie = headers["set-cookie"]
+    assert SECRET in cookie
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    status, headers, body = ask(port)
+    assert status == 200
+    assert b"<title>" in body
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe" not in policy
+    assert "http:" not in policy
+    assert headers["x-content-type-options"] == "nosniff"
+
+
+@pytest.mark.parametrize("path", ["/", "/live.js", "/scene.glb", "/session", "/?token=wrong", "/?token=", "/nothing"])
+def test_without_the_cookie_nothing_is_told(running, path):
+    port, _ = running
+    for cookie in (None, "", "wrong", SECRET[:-1], SECRET + "x"):
+        status, headers, body = ask(port, path, cookie)
+        assert status == 403
+        assert SECRET.encode() not in body
+        assert "set-cookie" not in headers
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "evil.example:80", "127.0.0.1", "127.0.0.1:1", "", "localhost.evil.example"]
+)
+def test_another_host_is_refused(running, host):
+    port, _ = running
+    assert ask(port, Host=host)[0] in (400, 403)
+    assert ask(port, f"/?token={SECRET}", None, Host=host)[0] in (400, 403)
+
+
+def test_names_of_this_machine_are_its_own(running):
+    port, _ = running
+    assert ask(port, Host=f"localhost:{port}")[0] == 200
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "https://127.0.0.1", "http://127.0.0.1:1"])
+def test_another_origin_is_refused(running, origin):
+    port, _ = running
+    assert ask(port, Origin=origin)[0] == 403
+    with pytest.raises(InvalidStatus):
+        connect(port, origin=origin)
+    assert ask(port, **{"Sec-Fetch-Site": "cross-site"})[0] == 403
+
+
+@pytest.mark.parametrize(
+    ("cookie", "origin", "host"),
+    [(None, "own", None), ("wrong", "own", None), (SECRET, None, None), (SECRET, "own", "evil.example")],
+)
+def test_a_socket_is_refused_before_it_is_accepted(running, cookie, origin, host):
+    port, server = running
+    before = len(server.desk.clients)
+    with pytest.raises(InvalidStatus) as refused:
+        connect(port, cookie, origin, host)
+    assert refused.value.response.status_code == 403
+    assert len(server.desk.clients) == before
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd",
+        "/%2e%2e/%2e%2e/etc/passwd",
+        "/..%2fserver.py",
+        "/page/live.js",
+        "//etc/passwd",
+        "/live.js%00",
+        "/live.js/..",
+        "/__init__.py",
+        "/%5c..%5cserver.py",
+        "/live",
+    ],
+)
+def test_no_path_leads_to_a_file(running, path):
+    port, _ = running
+    status, _, body = ask(port, path)
+    assert status in (400, 404)
+    assert b"root:" not in body
+    assert b"import" not in body
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "TRACE"])
+def test_the_server_only_shows(running, method):
+    port, _ = running
+    assert ask(port, method=method)[0] == 405
+
+
+def test_every_part_of_the_page_is_there_and_loads_nothing_from_elsewhere(running):
+    port, _ = running
+    for name in PARTS:
+        status, headers, body = ask(port, f"/{name}")
+        assert status == 200
+        assert headers["content-type"].split(";")[0] in ("text/html", "text/css", "text/javascript", "image/svg+xml")
+        if name != "three.min.js":
+            assert b"https://" not in body
+            assert body.count(b"http://") == body.count(b"http://www.w3.org/2000/svg")
+
+
+def test_a_token_of_the_environment(monkeypatch):
+    monkeypatch.delenv(TOKEN, raising=False)
+    assert new_token() != new_token()
+    assert len(new_token()) >= 32
+    monkeypatch.setenv(TOKEN, SECRET)
+    assert new_token() == SECRET
+    for bad in ("short", "x" * 21, "x" * 30 + ";", "x" * 30 + " ", "ü" * 30):
+        monkeypatch.setenv(TOKEN, bad)
+        with pytest.raises(BadToken):
+            new_token()
+
+
+# --- what it takes ----------------------------------------------------------------------------------------------------
+GOOD = [
+    state(
+        1,
+        t=0.5,
+        knobs={"base/forward/M2 shift z": 1.5},
+        pivots={"base": "origin"},
+        noise=True,
+        frames=3,
+        seed=9,
+        time=None,
+    ),
+    json.dumps(
+        {"type": "view", "n": 1, "state": json.loads(state(2)), "view": "mtf", "camera": "forward", "field": 0.5}
+    ),
+    json.dumps({"type": "factors", "values": {"aperture": 20.0}}),
+    json.dumps({"type": "blind", "on": True}),
+    json.dumps({"type": "record", "on": False}),
+    json.dumps({"type": "save", "what": "job", "state": json.loads(state(3))}),
+]
+NASTY = [
+    "NaN",
+    "1e999",
+    "-1",
+    "null",
+    "[]",
+    "{}",
+    '"' + "x" * 300 + '"',
+    "true",
+    "9" * 400,
+    '"\\u0000"',
+    "[" * 200 + "]" * 200,
+]
+
+
+def mutated(text: str, rng: random.Random) -> str:
+    """The message with one thing wrong with it, or two."""
+    out = list(text)
+    for _ in range(rng.randint(1, 2)):
+        place = rng.randrange(len(out))
+        how = rng.randrange(5)
+        if how == 0:
+            del out[place : place + rng.randint(1, 12)]
+        elif how == 1:
+            out[place] = chr(rng.choice([0, 9, 34, 39, 92, 123, 125, 0x7F, 0x2028, 0xFFFD, 0x1F600]))
+        elif how == 2:
+            out.insert(place, rng.choice(NASTY))
+        elif how == 3:
+            out[place:place] = out[max(0, place - 20) : place]
+        else:
+            joined = "".join(out)
+            words = [w for w in ("1", "true", "null", '"state"', "0.5", '"mtf"', "{}") if w in joined]
+            if words:
+                out = list(joined.replace(rng.choice(words), rng.choice(NASTY), 1))
+        if not out:
+            out = ["x"]
+    return "".join(out)
+
+
+def test_500_mutated_messages_are_read_or_refused():
+    rng = random.Random(7)
+    refused = 0
+    for k in range(500):
+        text = mutated(GOOD[k % len(GOOD)], rng)
+        try:
+            read_message(text)
+        except BadMessage as error:
+            refused += len(str(error)) <= 400
+    assert 300 < refused < 500
+
+
+def sent_away(ws, *messages: str | bytes) -> int | None:
+    """The code with which a page is sent away that says this."""
+    try:
+        for message in messages:
+            ws.send(message)
+        while True:
+            ws.recv(5)
+    except ConnectionClosed as closed:
+        return None if closed.rcvd is None else closed.rcvd.code
+
+
+def test_good_messages_are_read():
+    for text in GOOD:
+        assert read_message(text).type == json.loads(text)["type"]
+
+
+def test_a_page_cannot_say_what_is_hidden():
+    with pytest.raises(BadMessage, match="blind"):
+        read_message(state(1, blind=5))
+    with pytest.raises(BadMessage):
+        read_message(state(1, file="/etc/passwd"))
+
+
+def test_mutated_messages_leave_the_server_alive(running):
+    port, _ = running
+    rng = random.Random(8)
+    for _ in range(8):
+        with connect(port) as ws:
+            try:
+                for k in range(70):
+                    ws.send(mutated(GOOD[k % len(GOOD)], rng))
+            except ConnectionClosed:
+                pass
+    assert alive(port)
+
+
+def test_a_page_that_says_nothing_sensible_is_sent_away(running):
+    port, _ = running
+    with connect(port) as ws:
+        assert sent_away(ws, *["nonsense"] * (BAD_MESSAGES + 5)) == 1008
+    assert alive(port)
+
+
+@pytest.mark.parametrize(("message", "code"), [("x" * (LARGEST_MESSAGE + 1), 1009), (b"\x00\x01", 1008)])
+def test_long_and_binary_messages(running, message, code):
+    port, _ = running
+    with connect(port) as ws:
+        assert sent_away(ws, message) == code
+    assert alive(port)
+
+
+def test_too_many_messages(running):
+    port, _ = running
+    with connect(port) as ws:
+        assert sent_away(ws, *(state(n) for n in range(3 * BURST))) == 1008
+    assert alive(port)
+
+
+def test_too_many_pages(running):
+    port, server = running
+    for _ in range(100):
+        if not server.desk.clients:
+            break
+        time.sleep(0.05)
+    with ExitStack() as stack:
+        for _ in range(MOST_CLIENTS):
+            stack.enter_context(connect(port)).recv(5)
+        with connect(port) as ws, pytest.raises(ConnectionClosed) as closed:
+            ws.recv(5)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1013
+    time.sleep(0.2)
+    assert alive(port)
+
+
+def test_half_a_handshake_and_rubbish_do_no_harm(running):
+    port, _ = running
+    for rubbish in (
+        b"",
+        b"\x00" * 100,
+        b"GET / HTTP/1.1\r\nHost: x\r\n",
+        b"GET /live HTTP/1.1\r\nUpgrade: websocket\r\n\r\n",
+        b"A" * 70000,
+    ):
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as line:
+            line.sendall(rubbish)
+    assert alive(port)
+
+
+# --- nothing piles up -------------------------------------------------------------------------------------------------
+def test_of_1000_fast_states_the_last_is_shown_and_few_are_computed():
+    computer = StandIn(seconds=0.02)
+    with serving(computer) as (port, _), connect(port) as ws:
+        ws.recv(5)
+        for n in range(1, 1001):
+            ws.send(state(n))
+        seen = 0
+        while seen != 1000:
+            seen = numbered(ws.recv(5))
+        with pytest.raises(TimeoutError):
+            ws.recv(0.3)
+    numbers = [question[0].n for kind, question in computer.asked]
+    assert numbers[-1] == 1000
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 100
+
+
+def test_two_pages_take_turns():
+    computer = StandIn(seconds=0.02)
+    with serving(computer) as (port, _), connect(port) as one, connect(port) as two:
+        one.recv(5)
+        two.recv(5)
+        for n in range(1, 301):
+            one.send(state(n))
+        two.send(state(5))
+        began = time.monotonic()
+        assert numbered(two.recv(5)) == 5
+        # one state of the other page may be before it
+        assert time.monotonic() - began < 1.0
+        seen = 0
+        while seen != 300:
+            seen = numbered(one.recv(5))
+
+
+def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
+    """A page that reads nothing: answers of 1 MB do not pile up, and the other page is served."""
+    computer = StandIn(bytes_each=1_000_000)
+    with serving(computer) as (port, server), connect(port) as slow, connect(port) as quick:
+        slow.recv(5)
+        quick.recv(5)
+        for n in range(1, 120):
+            slow.send(state(n))
+            quick.send(state(n))
+            time.sleep(0.002)
+        seen = 0
+        while seen != 119:
+            seen = numbered(quick.recv(5))
+        waiting = [client for client in server.desk.clients if client._answer is not None]
+        assert len(waiting) <= 1
+        # what the system holds for a line that is not read, and then the last state
+        seen = 0
+        while seen != 119:
+            seen = numbered(slow.recv(5))
+
+
+def test_a_page_that_never_reads_is_dropped(monkeypatch):
+    from twin.live import clients
+
+    monkeypatch.setattr(clients, "PATIENCE", 0.5)
+    with serving(StandIn(bytes_each=30_000_000)) as (port, server), connect(port) as slow:
+        slow.recv(5)
+        slow.send(state(1))
+        for _ in range(100):
+            if not server.desk.clients:
+                break
+            time.sleep(0.05)
+        assert not server.desk.clients
+        assert ask(port, "/session")[0] == 200
+
+
+def test_a_recording_is_bounded_and_has_no_hidden_states():
+    client = Client()
+    client.take(json.dumps({"type": "record", "on": True}))
+    assert client.recorded is not None
+    for n in range(5):
+        client.kept(AskedState(n=n))
+    assert len(client.recorded) == 5
+    client.kept(BlindState(n=9, blind=3))
+    assert len(client.recorded) == 5
+    client.take(json.dumps({"type": "record", "on": False}))
+    client.kept(AskedState(n=6))
+    assert len(client.recorded) == 5
+
+
+def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():
+    client = Client()
+    client.take(json.dumps({"type": "blind", "on": True}))
+    client.take(state(1))
+    assert isinstance(client.state, BlindState)
+    hidden = client.state.blind
+    client.take(state(2))
+    assert client.state.blind == hidden
+    client.take(json.dumps({"type": "blind", "on": False}))
+    assert isinstance(client.reveal, BlindState)
+    assert client.reveal.blind == hidden
+    client.take(state(3))
+    assert not isinstance(client.state, BlindState)
+
+
+def test_a_lost_computer_is_told_and_the_desk_goes_on():
+    from twin.live.computer import ComputerLost
+
+    class Fragile(StandIn):
+        async def ask(self, kind: str, question: Any) -> Any:
+            if question[0].n == 1:
+                raise ComputerLost("the process that computes ended (-9)")
+            return await super().ask(kind, question)
+
+    with serving(Fragile()) as (port, _), connect(port) as ws:
+        ws.recv(5)
+        ws.send(state(1))
+        assert json.loads(ws.recv(5))["type"] == "lost"
+        ws.send(state(2))
+        assert numbered(ws.recv(5)) == 2
+
+
+def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):
+    from twin.live import server as module
+
+    monkeypatch.setattr(module, "LINGER", 0.3)
+    with serving(StandIn(), stay=False) as (port, server):
+        with connect(port) as ws:
+            ws.recv(5)
+        with connect(port) as ws:  # loaded again in time
+            ws.recv(5)
+            time.sleep(0.6)
+            assert server._uvicorn is not None
+            assert not server._uvicorn.should_exit
+        time.sleep(1.0)
+        assert server._uvicorn.should_exit
+
+
+def test_an_address_that_is_taken():
+    with listen("127.0.0.1", 0) as one:
+        one.listen()
+        with pytest.raises(OSError, match="in use"):
+            listen("127.0.0.1", one.getsockname()[1])
+
+
+def test_a_desk_sends_too_many_away():
+    async def crowd() -> None:
+        desk = Desk(StandIn())  # type: ignore[arg-type]
+        for _ in range(MOST_CLIENTS):
+            desk.enter()
+        with pytest.raises(Goodbye):
+            desk.enter()
+
+    asyncio.run(crowd())
