@@ -96,7 +96,9 @@ class LiveServer:
             h11_max_incomplete_event_size=1 << 15,
         )
         self._uvicorn = uvicorn.Server(config)
-        self._uvicorn.run(sockets=[listening])
+        # it ends in order and then repeats the signal, which here is no accident
+        with contextlib.suppress(KeyboardInterrupt):
+            self._uvicorn.run(sockets=[listening])
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
@@ -244,6 +246,8 @@ def listen(host: str, port: int) -> socket.socket:
     out.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         out.bind((host, port))
+        # who opens the address before the server is up waits for it
+        out.listen()
     except OSError:
         out.close()
         raise

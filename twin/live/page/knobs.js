@@ -82,7 +82,8 @@ class Row {
 
 export class Knobs {
   constructor(root, changed, settled, build) {
-    Object.assign(this, { root, changed, settled, rebuild: build, knobs: {}, pivots: {}, rows: new Map(), time: null });
+    Object.assign(this, { root, changed, rebuild: build, knobs: {}, pivots: {}, rows: new Map(), time: null });
+    this.settled = () => { this.list(); settled(); };
     byId('filter').addEventListener('input', () => this.filter());
     byId('time').addEventListener('input', () => this.goTo(Number(byId('time').value)));
     byId('play').addEventListener('click', () => this.play());
@@ -100,6 +101,7 @@ export class Knobs {
     for (const [node, select] of this.pivotSelects) select.value = this.pivots[node] ?? 'origin';
     if (time !== null && this.course) this.goTo(time, false);
     this.counts();
+    this.list();
   }
 
   reset() {
@@ -149,6 +151,7 @@ export class Knobs {
     this.movedShown = '';
     if (values) this.set(values);
     this.counts();
+    this.list();
   }
 
   grouped(knobs) {
@@ -186,7 +189,7 @@ export class Knobs {
   }
 
   row(knob, long = false) {
-    const label = long ? knob.name.replace(/^base\//, '') : `${knob.node} ${knob.axis || knob.kind}`;
+    const label = long ? knob.name.replace(/^base\//, '') : `${knob.node} ${knob.axis || { scale: 'growth', temperature: 'change' }[knob.kind]}`;
     const row = new Row(
       { label, unit: knob.unit, value: this.knobs[knob.name] ?? 0, reach: knob.reach, limit: knob.limit, long },
       (value) => this.turn(knob.name, value), () => this.settled());
@@ -209,7 +212,7 @@ export class Knobs {
     return select;
   }
 
-  // how many knobs are off zero, at each body and those it carries; and the list of them
+  // how many knobs are off zero, at each body and those it carries
   counts() {
     const by = new Map();
     for (const name of Object.keys(this.knobs)) {
@@ -221,6 +224,10 @@ export class Knobs {
       }
     }
     for (const [path, box] of this.boxes) box.querySelector('.count').textContent = by.get(path) ? `(${by.get(path)})` : '';
+  }
+
+  // the list of those that are off zero; not while one is dragged, or it would move away under the pointer
+  list() {
     const names = Object.keys(this.knobs).slice(0, 12);
     const shown = names.join();
     if (shown === this.movedShown || this.root.querySelector('#moved .list')?.contains(document.activeElement)) return;

@@ -124,7 +124,7 @@ export class Spots {
     const across = whole ? columns : CROP;
     const left = middle[1] - (across - 1) / 2;
     const top = middle[0] - (across - 1) / 2;
-    const image = figure.image.getContext('2d');
+    const image = figure.image.getContext('2d', { willReadFrequently: true });
     const side = whole ? columns : CROP;
     if (figure.image.width !== side) { figure.image.width = side; figure.image.height = whole ? rows : CROP; }
     image.putImageData(figure.pixels, whole ? 0 : -Math.ceil(left), whole ? 0 : -Math.ceil(top));
