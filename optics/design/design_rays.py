@@ -16,7 +16,8 @@ from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.derivatives import jvp
-from optics.raytrace.system import FrameNumbers, assemble
+from optics.raytrace.element_numbers import FrameNumbers
+from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.imaging import aim_collimated
 

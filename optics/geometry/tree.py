@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -173,40 +174,73 @@ class RigidTree:
         Raises:
             KeyError: a state names an unknown body or pivot.
         """
-        known = set(self.paths)
+        known = self.index
         for state in states:
             for path in state:
                 if path not in known:
                     raise KeyError(path)
-        count = len(states)
+        if step is not None:
+            return self._placed(states, step, self.bodies)
+        moved = {path for state in states for path in state}
+        if not moved and len(states) == 1:
+            return self._nominal
+        affected = []
+        for body in self.bodies:
+            if body.path in moved or body.parent in moved:
+                moved.add(body.path)
+                affected.append(body)
+        return self._placed(states, None, affected)
+
+    @cached_property
+    def index(self) -> Mapping[str, int]:
+        """Body path -> its place among the bodies."""
+        return FrozenMap({path: i for i, path in enumerate(self.paths)})
+
+    @cached_property
+    def _nominal(self) -> PlacedBodies:
+        """The bodies without any perturbation; for everybody, so that nobody may write to it."""
+        placed = self._placed(({},), None, self.bodies)
+        for array in (placed.rotation, placed.translation, placed.scale):
+            array.setflags(write=False)
+        return placed
+
+    def _placed(
+        self, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, affected: Sequence[Body]
+    ) -> PlacedBodies:
+        """As ``place``; bodies that are not ``affected``, of which each body with its children is, stay as designed."""
+        count, index = len(states), self.index
         dtype: Any = np.complex128 if step is not None else np.float64
-        index = {path: i for i, path in enumerate(self.paths)}
         rotation = np.empty((count, len(index), 3, 3), dtype)
         translation = np.empty((count, len(index), 3), dtype)
         scale = np.ones((count, len(index)), dtype)
         passed_on = np.ones((count, len(index)), dtype)
-        for i, body in enumerate(self.bodies):
-            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
+        if len(affected) < len(self.bodies):
+            rotation[:], translation[:] = self._nominal.rotation, self._nominal.translation
+        unit, still = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3)), np.ones(count, dtype)
+        for body in affected:
+            i = index[body.path]
             position = body.pose.translation
             if body.parent:
                 p = index[body.parent]
                 base_rotation, base_translation = rotation[:, p], translation[:, p]
                 inherited, distances = passed_on[:, p], scale[:, p]
             else:
-                base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
-                base_translation = np.zeros((count, 3), dtype)
-                inherited = distances = np.ones(count, dtype)
+                base_rotation, base_translation = unit, np.zeros((count, 3), dtype)
+                inherited = distances = still
             here = product(base_rotation, body.pose.rotation)
-            inner = inherited if body.scales else np.ones(count, dtype)
+            inner = inherited if body.scales else still
+            origin = np.einsum("sij,sj->si", base_rotation, distances[:, None] * position) + base_translation
+            if step is None and not any(body.path in state for state in states):
+                # carried along: what a motion of nothing would be multiplied and added here
+                rotation[:, i], translation[:, i] = here, origin
+                passed_on[:, i] = scale[:, i] = inner
+                continue
+            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
             rotation[:, i] = product(here, motion)
-            translation[:, i] = (
-                np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
-                + base_translation
-                + np.einsum("sij,sj->si", here, offset)
-            )
+            translation[:, i] = origin + np.einsum("sij,sj->si", here, offset)
             passed_on[:, i] = inner * growth
             scale[:, i] = inner * growth * stretch
-        return PlacedBodies(FrozenMap(index), rotation, translation, scale)
+        return PlacedBodies(index, rotation, translation, scale)
 
 
 FIGURE = "figure"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -133,6 +135,11 @@ class Assembly:
         object.__setattr__(self, "elements", FrozenMap(self.elements))
         object.__setattr__(self, "media", FrozenMap(self.media))
         object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
+
+    @cached_property
+    def known_numbers(self) -> dict[Any, Any]:
+        """What `optics.raytrace.system` has worked out of elements as designed; it depends on nothing but this."""
+        return {}
 
     def sequence(self, name: str) -> tuple[Element, ...]:
         """The elements of a named sequence.

@@ -12,96 +12,25 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from optics.geometry import zernike
-from optics.geometry.aperture import ApertureNumbers
-from optics.geometry.sag_terms import SagTerm, grown, kinds_of, of_kinds
-from optics.geometry.surface import (
-    Figure,
-    FigureNumbers,
-    GridFigure,
-    GridNumbers,
-    SummedFigure,
-    SurfaceNumbers,
-    ZernikeFigure,
-)
-from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, PlacedBodies, State
+from optics.geometry.tree import COMPLEX_STEP, PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
-from optics.raytrace.assembly import Assembly, Element, Interaction
+from optics.raytrace.assembly import Assembly
+from optics.raytrace.element_numbers import (
+    ElementNumbers,
+    FrameNumbers,
+    Structure,
+    bodies_of,
+    grid_numbers,
+    media_along,
+    nominal_numbers,
+    numbers_of,
+    structure_of,
+    touched_bodies,
+    world_frame,
+)
 
-Numbers = TypeVar("Numbers", "ElementNumbers", "FrameNumbers")
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What decides the code of the kernel (as against the numbers that it works on), for one element."""
-
-    interaction: Interaction
-    plane: bool
-    even: int
-    terms: tuple[type[SagTerm], ...]  # kinds of further terms of the sag
-    figure_order: int  # radial order of the Zernike figure, -1 for none
-    grid: bool
-    aperture: type[ApertureNumbers] | None
-    graded: tuple[bool, bool] = (False, False)  # whether the medium before and the one after has an index gradient
-
-
-@dataclass(frozen=True, eq=False)
-class CoordinateNumbers:
-    """One coordinate of a rigid transform: ``shift`` + ``turn`` . p, metres."""
-
-    shift: Any
-    turn: tuple[Any, Any, Any]
-
-
-@dataclass(frozen=True, eq=False)
-class FrameNumbers:
-    """A rigid transform of points, coordinate by coordinate."""
-
-    x: CoordinateNumbers
-    y: CoordinateNumbers
-    z: CoordinateNumbers
-
-    @classmethod
-    def of(cls, rotation: np.ndarray, translation: np.ndarray) -> FrameNumbers:
-        """From arrays (S, 3, 3) and (S, 3)."""
-        rows = ((rotation[:, a, 0], rotation[:, a, 1], rotation[:, a, 2]) for a in range(3))
-        return cls(*(CoordinateNumbers(translation[:, a], row) for a, row in enumerate(rows)))
-
-    @property
-    def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
-        """Of x, y and z."""
-        return self.x, self.y, self.z
-
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (B, 3, 3) and translation (B, 3), NumPy."""
-        rotation = np.array([c.turn for c in self.coordinates])
-        return np.moveaxis(rotation, -1, 0), np.stack([c.shift for c in self.coordinates], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class IndexNumbers:
-    """Refractive index of a medium: ``index`` + ``gradient`` . p at p in the element's frame; no gradient: None."""
-
-    index: Any
-    gradient: tuple[Any, Any, Any] | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class ElementNumbers:
-    """All that the trace reads of one element.
-
-    Attributes:
-        frame: from the frame of the element before (the world for the first) into this element's.
-        surface: its shape; aperture: its clear aperture, None for an unlimited one.
-        before, after: refractive index on the side that light comes from and on the one that it goes to.
-    """
-
-    frame: FrameNumbers
-    surface: SurfaceNumbers
-    aperture: ApertureNumbers | None
-    before: IndexNumbers
-    after: IndexNumbers
+Numbers = TypeVar("Numbers", ElementNumbers, FrameNumbers)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +61,14 @@ class SystemBatch:
 
     def upload(self, backend: Backend) -> UploadedSystems:
         """Copy to the backend's memory as kernel inputs; derivatives, if any, become forward-mode gradients."""
+        if self.tangents is None:
+            tables = (self.values, self.world[-1])
+            parts: list[np.ndarray] = []
+            map_leaves(parts.append, tables)
+            uploaded = iter(backend.opaque_each(parts))
+            values, world = map_leaves(lambda value: next(uploaded), tables)
+            grids = tuple(None if g is None else backend.opaque(g) for g in self.grids)
+            return UploadedSystems(self.structure, values, world, grids, self.count, False)
         import drjit as dr
 
         def copied(value: np.ndarray, tangent: np.ndarray | None = None) -> Any:
@@ -223,24 +160,32 @@ def assemble(
             any(m[i].solid in graded for m in media),
             any(m[i + 1].solid in graded for m in media),
         )
-        structures.append(_structures([chain[i] for chain in chains], states, gradients))
-    poses = [[_world(element, placed) for element in chain] for chain in chains]
+        structures.append(structure_of([chain[i] for chain in chains], states, gradients))
+    poses = [[world_frame(element, placed) for element in chain] for chain in chains]
+    touched = None if step is not None or np.iscomplexobj(placed.rotation) else touched_bodies(assembly, states, placed)
     numbers = [
-        [_numbers(assembly, chain, i, along, structures[i], states, placed, step) for i in range(len(chain))]
+        [
+            numbers_of(assembly, chain, i, along, structures[i], states, placed, step)
+            if touched is None or not touched.isdisjoint(bodies_of(chain, i, along))
+            else nominal_numbers(assembly, chain, i, along, structures[i], len(states))
+            for i in range(len(chain))
+        ]
         for chain, along in zip(chains, media, strict=True)
     ]
     values = [_joined([chain[i] for chain in numbers]) for i in range(len(chains[0]))]
     tables: list[np.ndarray | None] = [None] * len(values)
     for i, structure in enumerate(structures):
         if structure.grid:
-            grid, tables[i] = _grids([chain[i] for chain in chains], states)
+            grid, tables[i] = grid_numbers([chain[i] for chain in chains], states)
             values[i] = replace(values[i], surface=replace(values[i].surface, grid=grid))
     world = [_joined([chain[i] for chain in poses]) for i in range(len(chains[0]))]
+    real = step is None and not np.iscomplexobj(placed.rotation)
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
     return SystemBatch(
         tuple(structures),
-        tuple(map_leaves(_real, value) for value in values),
-        tuple(map_leaves(_real, pose) for pose in world),
+        # joined arrays are contiguous
+        tuple(values) if real else tuple(map_leaves(_real, value) for value in values),
+        tuple(world) if real else tuple(map_leaves(_real, pose) for pose in world),
         tuple(map_leaves(_tangent, value) for value in values) if step is not None else None,
         tuple(map_leaves(_tangent, pose) for pose in world) if step is not None else None,
         size,
@@ -261,200 +206,3 @@ def _real(value: np.ndarray) -> np.ndarray:
 
 def _tangent(value: np.ndarray) -> np.ndarray | None:
     return value.imag / COMPLEX_STEP if np.iscomplexobj(value) else None
-
-
-@dataclass(frozen=True)
-class Medium:
-    """What light travels in: a glass body of the assembly, or something homogeneous of a given index."""
-
-    solid: str | None = None
-    index: float = 1.0
-
-
-def media_along(chain: Sequence[Element]) -> list[Medium]:
-    """The medium before the first element, between the elements and after the last one."""
-    out = [Medium()]
-    for element in chain:
-        before = out[-1]
-        if element.interaction is Interaction.REFRACT and element.solid is not None:
-            out.append(Medium() if before.solid == element.solid else Medium(element.solid))
-        elif element.solid is not None or before.solid is not None:
-            out.append(before)
-        else:
-            out.append(Medium(None, element.index_after))
-    return out
-
-
-def _index_numbers(
-    assembly: Assembly,
-    element: Element,
-    medium: Medium,
-    graded: bool,
-    states: Sequence[State],
-    placed: PlacedBodies,
-) -> IndexNumbers:
-    """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
-    here = placed.index[element.body]
-    turn, origin = placed.rotation[:, here], placed.translation[:, here]
-    if medium.solid is None:
-        index = np.full(len(states), medium.index)
-        gradient = np.zeros((len(states), 3))
-    else:
-        motions = [state.get(medium.solid, AT_REST) for state in states]
-        index = assembly.media[medium.solid] + np.array([m.index for m in motions])
-        glass = placed.index[medium.solid]
-        own = np.array([m.index_gradient for m in motions])
-        world = np.einsum("sij,sj->si", placed.rotation[:, glass], own)
-        gradient = np.einsum("sji,sj->si", turn, world)
-        if graded:
-            index = index + np.einsum("si,si->s", world, origin - placed.translation[:, glass])
-    return IndexNumbers(index, (gradient[:, 0], gradient[:, 1], gradient[:, 2]) if graded else None)
-
-
-def _structures(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
-    """Common structure of the i-th elements of all chains."""
-    grid = any(_has_grid(e, states) for e in elements)
-    kinds = {
-        (
-            e.interaction,
-            e.surface.is_plane,
-            None if e.aperture is None else type(e.aperture.numbers()),
-        )
-        for e in elements
-    }
-    if len(kinds) != 1:
-        raise ValueError(
-            f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}"
-        )
-    interaction, is_plane, aperture = kinds.pop()
-    # a plane may have terms that are zero, and the terms that a surface lacks are
-    terms = kinds_of([term for e in elements for term in e.surface.terms])
-    even = 0 if is_plane else max(len(e.surface.even) for e in elements)
-    order = -1
-    for e in elements:
-        if e.surface.zernike_figure is not None:
-            order = max(order, zernike.order_of(e.surface.zernike_figure.terms))
-        for state in states:
-            motion = state.get(e.body)
-            if motion is not None and motion.figure:
-                order = max(order, zernike.order_of(motion.figure))
-    return Structure(interaction, is_plane, even, terms, order, grid, aperture, graded)
-
-
-def _known_figure(element: Element) -> Figure | None:
-    """The figure of an element's surface; ValueError for one that the trace would leave out."""
-    match element.surface.figure:
-        case None | ZernikeFigure() | GridFigure() | SummedFigure() as figure:
-            return figure
-        case other:
-            raise ValueError(f"element {element.name!r}: the trace knows no figure of type {type(other).__name__}")
-
-
-def _has_grid(element: Element, states: Sequence[State]) -> bool:
-    """Whether a surface has a figure on a grid, of its own or in some state."""
-    _known_figure(element)
-    own = element.surface.grid_figure is not None
-    return own or any(state.get(element.body, AT_REST).grid is not None for state in states)
-
-
-_NO_GRID = GridFigure(np.zeros((4, 4)), (-1.0, 1.0, -1.0, 1.0))
-"""What a system without a grid reads where others of its batch have one."""
-
-
-def _grids(elements: Sequence[Element], states: Sequence[State]) -> tuple[GridNumbers, np.ndarray]:
-    """Numbers of the grids of the i-th elements of all chains in all states, (chains * states,) each, and one table of
-    the coefficients of all.
-    """
-    first: dict[int, int] = {}
-    figures, numbers, tables, length = [], [], [], 0
-    for element in elements:
-        own: dict[int, GridFigure] = {}  # a grid that many states share is added to the element's and stored once
-        for state in states:
-            motion = state.get(element.body, AT_REST)
-            if id(motion.grid) not in own:
-                own[id(motion.grid)] = element.grid_in(motion) or _NO_GRID
-            figure = own[id(motion.grid)]
-            if id(figure) not in first:
-                first[id(figure)] = length
-                figures.append(figure)  # so that its id remains its own
-                tables.append(figure.spline.ravel())
-                length += tables[-1].size
-            numbers.append(replace(figure.numbers, first=float(first[id(figure)])))
-    return map_leaves(lambda *values: np.array(values), numbers[0], *numbers[1:]), np.concatenate(tables)
-
-
-def _world(element: Element, placed: PlacedBodies) -> FrameNumbers:
-    """Pose of an element in the world, (S,) each, complex when a derivative is carried."""
-    body = placed.index[element.body]
-    return FrameNumbers.of(placed.rotation[:, body], placed.translation[:, body])
-
-
-def _numbers(
-    assembly: Assembly,
-    chain: Sequence[Element],
-    i: int,
-    media: Sequence[Medium],
-    structure: Structure,
-    states: Sequence[State],
-    placed: PlacedBodies,
-    step: Sequence[tuple[str, str, int]] | None,
-) -> ElementNumbers:
-    """Numbers of element i of a chain, each of shape (S,), complex when a derivative is carried."""
-    element = chain[i]
-    body = placed.index[element.body]
-    rotation, translation = placed.rotation[:, body], placed.translation[:, body]
-    if i == 0:
-        relative = np.swapaxes(rotation, -1, -2)
-        offset = -np.einsum("sij,si->sj", rotation, translation)
-    else:
-        before = placed.index[chain[i - 1].body]
-        relative = np.einsum("ski,skj->sij", rotation, placed.rotation[:, before])
-        offset = np.einsum("ski,sk->si", rotation, placed.translation[:, before] - translation)
-    scale = placed.scale[:, body]
-    sides = zip(media[i : i + 2], structure.graded, strict=True)
-    outer, inner = (_index_numbers(assembly, element, medium, graded, states, placed) for medium, graded in sides)
-    return ElementNumbers(
-        FrameNumbers.of(relative, offset),
-        _surface_numbers(element, structure, scale, states, step),
-        # an edge has no derivative: it lets a ray pass or stops it
-        None if element.aperture is None else element.aperture.numbers(scale.real),
-        outer,
-        inner,
-    )
-
-
-def _surface_numbers(
-    element: Element,
-    structure: Structure,
-    scale: np.ndarray,
-    states: Sequence[State],
-    step: Sequence[tuple[str, str, int]] | None,
-) -> SurfaceNumbers:
-    surface, count = element.surface, len(states)
-    curvature, conic, even = None, None, []
-    if not structure.plane:
-        curvature, conic = surface.curvature / scale, np.full(count, surface.conic)
-        for n in range(structure.even):
-            term = surface.even[n] if n < len(surface.even) else 0.0
-            even.append(term / scale ** (2 * n + 3))
-    terms = tuple(grown(term, scale) for term in of_kinds(surface.terms, structure.terms))
-    figure = _figure_numbers(element, structure.figure_order, states, step) if structure.figure_order >= 0 else None
-    return SurfaceNumbers(curvature, conic, tuple(even), terms, figure)
-
-
-def _figure_numbers(
-    element: Element, order: int, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None
-) -> FigureNumbers:
-    """Monomial coefficients of the Zernike figure of each state."""
-    figure = element.figure_disk
-    kind = np.float64 if step is None else np.complex128
-    table = np.empty((len(states), zernike.triangle_size(order)), kind)
-    for s, state in enumerate(states):
-        terms: dict[int, Any] = dict(figure.terms)
-        for j, amplitude in state.get(element.body, AT_REST).figure.items():
-            terms[j] = terms.get(j, 0.0) + amplitude
-        if step is not None and step[s][:2] == (element.body, FIGURE):
-            terms[step[s][2]] = terms.get(step[s][2], 0.0) + 1j * COMPLEX_STEP
-        table[s] = zernike.monomials(terms, order, figure.radius)
-    x, y = (np.full(len(states), c) for c in figure.centre)
-    return FigureNumbers(x, y, tuple(table[:, m] for m in range(table.shape[1])))

@@ -12,15 +12,9 @@ from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
 from optics.raytrace.assembly import Interaction
+from optics.raytrace.element_numbers import CoordinateNumbers, ElementNumbers, FrameNumbers, IndexNumbers
 from optics.raytrace.graded_ray import GradedRay
-from optics.raytrace.system import (
-    CoordinateNumbers,
-    ElementNumbers,
-    FrameNumbers,
-    IndexNumbers,
-    SystemBatch,
-    UploadedSystems,
-)
+from optics.raytrace.system import SystemBatch, UploadedSystems
 
 NEWTON_STEPS = 3
 """Newton steps from the conic to the asphere. The departure of a mirror from its conic is below 1e-4 m and its slope

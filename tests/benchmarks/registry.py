@@ -10,6 +10,7 @@ from tests.benchmarks import (
     jacobian_speed,
     large_speed,
     layout_speed,
+    live_speed,
     monitor_speed,
     path_speed,
     psf_speed,
@@ -52,6 +53,7 @@ BENCHMARKS = (
     Benchmark("pushbroom", "images of the ground", pushbroom_speed.measure, 60, 15),
     Benchmark("quality", "image quality with shadows and without", quality_speed.measure, 20, 5),
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
+    Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),
     Benchmark(
         "start",

@@ -124,7 +124,7 @@ class Page:
     def unfold(self, *paths: str) -> None:
         """Open bodies of the tree."""
         for path in paths:
-            self.page.evaluate("path => { document.querySelector(`details[data-path=\"${path}\"]`).open = true }", path)
+            self.page.evaluate('path => { document.querySelector(`details[data-path="${path}"]`).open = true }', path)
 
     def slider(self, knob: str) -> Any:
         """The slider of a knob in the tree."""

@@ -32,7 +32,7 @@ def bench() -> LiveBench:
 
 @pytest.fixture(scope="module")
 def first(bench) -> AskedState:
-    return AskedState.at_rest(bench)
+    return bench.at_rest
 
 
 def changed(state: AskedState, knobs: dict[str, float] | None = None, **other) -> AskedState:
@@ -231,7 +231,7 @@ def test_knobs_keep_the_units_of_the_job(tmp_path):
     )
     loaded = twin.load(file)
     bench = LiveBench(loaded)
-    asked = AskedState.at_rest(bench)
+    asked = bench.at_rest
     assert asked.knobs[f"{M2} figure Z20"] == 7.0
     assert asked.knobs["base/forward temperature"] == 0.5
     # to the bit, whatever the unit
@@ -278,7 +278,7 @@ def test_a_course_is_played_with_the_main_jobs_states(backend):
     from twin.monitor.time_series import series_states
 
     states = series_states(bench.twin.experiment, bench.twin.resolved.job)
-    asked = AskedState.at_rest(bench)
+    asked = bench.at_rest
     assert asked.time == course.shown
     for k in (0, 7, 20):
         assert bench.states(changed(asked, time=k)) == states[k]
@@ -316,7 +316,7 @@ def test_what_cannot_be_opened(file, says):
 def test_other_values_of_a_factor_build_the_instrument_anew():
     """With half the aperture a quarter of the light comes, and the readings are noisier."""
     answers = Answers("scenes/examples/study_aperture.yaml", "llvm", lambda part: None)
-    asked = AskedState.at_rest(answers.bench)
+    asked = answers.bench.at_rest
     whole, _ = answers.bench.state(asked)
     opened = answers.to("factors", {"aperture": 25.0})
     assert not isinstance(opened, str)

@@ -63,8 +63,10 @@ def job_of(page: Page, tmp_path, button: str = "#save-job"):
 def canvas(page: Page, channel: str) -> np.ndarray:
     """Grey levels of a spot's canvas."""
     text = page.page.evaluate(
-        """(channel) => { const c = document.querySelector(`canvas[data-channel="${channel}"]`);
-        return Array.from(c.getContext('2d').getImageData(0, 0, c.width, c.height).data.filter((_, k) => k % 4 === 0)); }""",
+        """(channel) => {
+        const c = document.querySelector(`canvas[data-channel="${channel}"]`);
+        const all = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        return Array.from(all.filter((_, k) => k % 4 === 0)); }""",
         channel,
     )
     side = int(len(text) ** 0.5)

@@ -24,11 +24,11 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
 from scenes.models.thermal_model import TemperatureError
-from scenes.specs.course import moment
+from scenes.specs.course import DEFAULT_PIVOT, moment
 from scenes.specs.job import check_nodes
 from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
-from twin.live.messages import AskedState, BlindState, Course
+from twin.live.messages import MOST_FRAMES, AskedState, BlindState, Course
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
@@ -93,6 +93,19 @@ class LiveBench:
         instrument = self.twin.experiment.instrument
         return {name: np.eye(len(instrument.coordinates_of(name))) for name in instrument.cameras}
 
+    @cached_property
+    def at_rest(self) -> AskedState:
+        """The state in which the knobs begin."""
+        job, course = self.twin.resolved.job, self.course
+        return AskedState(
+            n=0,
+            knobs={knob.name: knob.value for knob in self.knobs.values() if knob.value},
+            pivots={path: what.pivot for path, what in job.perturb.items() if what.pivot != DEFAULT_PIVOT},
+            frames=min(self.twin.resolved.frames, MOST_FRAMES),
+            seed=job.render.seed,
+            time=None if course is None else course.shown,
+        )
+
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
         """Work out everything that does not depend on the knobs, and compile every kernel.
 
@@ -109,17 +122,20 @@ class LiveBench:
         self._crosstalk  # noqa: B018
         self.clearances  # noqa: B018
         advance("compile")
-        self.state(AskedState.at_rest(self))
+        self.state(self.at_rest)
 
     def greeting(self) -> dict[str, Any]:
         """What a page has to know before it asks for a state."""
         twin, experiment = self.twin, self.twin.experiment
         job = twin.resolved.job
         nodes = {
-            path: {"pivots": list(info.pivots), "pivot": job.perturb[path].pivot if path in job.perturb else "origin"}
+            path: {
+                "pivots": list(info.pivots),
+                "pivot": job.perturb[path].pivot if path in job.perturb else DEFAULT_PIVOT,
+            }
             for path, info in experiment.instrument.nodes.items()
         }
-        run = self._run(AskedState.at_rest(self), {})[0]
+        run = self._run(self.at_rest, {})[0]
         stated_motion = experiment.disturbances
         return {
             "instrument": twin.name,

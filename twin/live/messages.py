@@ -10,13 +10,10 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-
-if TYPE_CHECKING:
-    from twin.live.live_bench import LiveBench
 
 LARGEST_MESSAGE = 1 << 16
 """Bytes of a message of the page."""
@@ -59,20 +56,6 @@ class AskedState(_Said):
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)] = 1
     seed: Annotated[int, Field(ge=0, le=LARGEST_SEED)] = 1
     time: Annotated[int, Field(ge=0, le=1000)] | None = None
-
-    @classmethod
-    def at_rest(cls, bench: LiveBench) -> AskedState:
-        """The state in which a bench's knobs begin."""
-        resolved = bench.twin.resolved
-        course = bench.course
-        return cls(
-            n=0,
-            knobs={knob.name: knob.value for knob in bench.knobs.values() if knob.value},
-            pivots={path: what.pivot for path, what in resolved.job.perturb.items() if what.pivot != "origin"},
-            frames=min(resolved.frames, MOST_FRAMES),
-            seed=resolved.job.render.seed,
-            time=None if course is None else course.shown,
-        )
 
 
 class BlindState(AskedState):

@@ -1,0 +1,85 @@
+"""The live twin: from the touch of a slider to painted spots and readings, in a browser beside it on the same cores."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tests.benchmarks.number import Limit, Number, Speed
+from tests.benchmarks.workbench import Workbench
+from tests.twin.live_page import CHROMIUM, FLAGS, Page, running
+
+MEDIAN_MS, SLOW_MS, NOISY_MS, RATE = 60.0, 120.0, 150.0, 12.0
+"""Wanted: median and 95th percentile of the expected image, median with nine noisy frames, updates a second."""
+KNOB = "base/forward/M2 shift z"
+MOVE = """async ([count, knob]) => {
+  const slider = document.querySelector(`#tree .knob[data-knob="${knob}"] input[type=range]`);
+  const from = liveTwin.latencies.length;
+  for (let k = 0; k < count; k += 1) {
+    slider.value = 3 * Math.sin(k / 5);
+    slider.dispatchEvent(new Event('input', { bubbles: true }));
+    const done = performance.now() + 5000;
+    while ((liveTwin.dirty || liveTwin.waiting.size || liveTwin.shown !== liveTwin.n) && performance.now() < done) {
+      await new Promise((next) => setTimeout(next, 1));
+    }
+  }
+  return liveTwin.latencies.slice(from);
+}"""
+DRAG = """async ([seconds, knob]) => {
+  const slider = document.querySelector(`#tree .knob[data-knob="${knob}"] input[type=range]`);
+  const end = performance.now() + 1000 * seconds;
+  const from = liveTwin.latencies.length;
+  for (let k = 0; performance.now() < end; k += 1) {
+    slider.value = 3 * Math.sin(k / 20);
+    slider.dispatchEvent(new Event('input', { bubbles: true }));
+    await new Promise((next) => setTimeout(next, 16));
+  }
+  return liveTwin.latencies.length - from;
+}"""
+
+
+def measure(bench: Workbench, quick: bool) -> Speed:
+    """Milliseconds in the page's own clock, from the input event to the task after the frame that shows the answer."""
+    if CHROMIUM is None:
+        return Speed((), ("Chromium is not installed: the live twin was not measured",))
+    from playwright.sync_api import sync_playwright
+
+    moves, seconds = (40, 2.0) if quick else (300, 8.0)
+    with running("gf7_pair", "--port", "0") as command, sync_playwright() as made:
+        browser = made.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        page = Page(browser, command.address)
+        page.ready()
+        page.unfold("base/forward", "base/forward/M2")
+        page.page.uncheck("#noise")
+        page.still()
+        clean = _percentiles(page, moves)
+        rate = page.page.evaluate(DRAG, [seconds, KNOB]) / seconds
+        page.still()
+        page.page.check("#noise")
+        page.still()
+        noisy = _percentiles(page, moves)
+        frames = page.page.evaluate("liveTwin.last.readings.frames")
+        page.close()
+        browser.close()
+    of = f"of {moves} moves of a slider"
+    return Speed(
+        (
+            Number(
+                "median_ms",
+                clean[0],
+                f"slider to spots and readings, expected image: median {of}",
+                "ms",
+                Limit(MEDIAN_MS),
+            ),
+            Number("slow_ms", clean[1], "the same: 95th percentile", "ms", Limit(SLOW_MS)),
+            Number("noisy_ms", noisy[0], f"with {frames} noisy frames, all estimators: median", "ms", Limit(NOISY_MS)),
+            Number("noisy_slow_ms", noisy[1], "the same: 95th percentile", "ms"),
+            Number("rate", rate, "updates while a slider is dragged", "1/s", Limit(RATE, least=True)),
+        )
+    )
+
+
+def _percentiles(page: Any, moves: int) -> tuple[float, float]:
+    took = np.array(page.page.evaluate(MOVE, [moves, KNOB]))
+    return float(np.median(took)), float(np.percentile(took, 95.0))
