@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COLD_S, WARM_S, START_S = 25.0, 8.0, 2.0
 PROGRAMS = (
     *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.compare"),
-    *("twin.doctor", "twin.recover", "scenes.schema", "analysis.mtf"),
+    *("twin.doctor", "twin.live", "twin.recover", "scenes.schema", "analysis.mtf"),
 )
 READ = (("twin.render",), ("twin.study",), ("twin.design",), ("twin.lab", "focus"), ("twin.orbit", "angle"))
 BAD = "instrument: gf7_pair\nperturb: {base/forward/M2: {shift: [0 um, 0 um, 3 arcsec]}}\nno_such_key: 1\n"

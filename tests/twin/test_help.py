@@ -14,6 +14,7 @@ from twin.validation.registry import GROUPS, select
 
 PROGRAMS = (
     "twin.render",
+    "twin.live",
     "twin.recover",
     "twin.lab",
     "twin.orbit",

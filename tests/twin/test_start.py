@@ -19,6 +19,7 @@ HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "tr
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
 READ = (
     ("twin.render",),
+    ("twin.live",),
     ("twin.recover",),
     ("twin.camera",),
     ("twin.uncertainty",),
@@ -30,7 +31,7 @@ READ = (
 """Commands that read a YAML file; all tests of a program do it in the same way."""
 PROGRAMS = (
     *("twin.render", "twin.camera", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate"),
-    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.recover"),
+    *("twin.compare", "twin.doctor", "twin.uncertainty", "twin.live", "twin.recover"),
     *("scenes.lens", "scenes.schema", "analysis.mtf"),
 )
 BAD = "seed: 1\nno_such_key: [2 arcsec, 3 um, 20 degC]\n"

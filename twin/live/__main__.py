@@ -18,7 +18,7 @@ from twin.run.cli import BackendName, InputErrorText, Quiet, check_backend, expl
 PORT = 8790
 EXTRA = (
     "the live twin needs starlette, uvicorn and websockets, which are not installed; install them with "
-    "`.venv/bin/python -m pip install -e '.[live]'`"
+    "`bash setup.sh --live`"
 )
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
@@ -43,20 +43,20 @@ def main(
     """Open an instrument as a page in the browser: sliders for every body, the spots as the CCDs see them, the readings
     of all estimators beside the truth, a strip chart, and the instrument in three dimensions.
 
-    Every state takes the way of the main job: what the page shows is what `python -m twin.render` writes for the same
-    knobs, seed and frames; the page saves that job, and what was recorded as a course.
+    Every state takes the way of the main job: what the page shows is what twin.render writes for the same knobs, seed
+    and frames; the page saves that job, and what was recorded as a course.
 
-        python -m twin.live gf7_pair
+    Example: `python -m twin.live gf7_pair`
 
-        python -m twin.live scenes/examples/orbit.yaml     (its course can be played)
-
-        python -m twin.live runs/perturb-001               (a run folder, to look at)
+    Of a job with a course the course can be played: `python -m twin.live scenes/examples/orbit.yaml`. A study's factors
+    become knobs: `python -m twin.live scenes/examples/study_aperture.yaml`. A run folder of twin.render is opened in
+    the state that it shows.
 
     The command prints an address; open it in a browser on this machine. The address holds a token: whoever has it can
     turn the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays when the command is started again.
     The command ends ten seconds after the last page is closed, or with Ctrl-C.
 
-    It needs what the extra `live` installs: `.venv/bin/python -m pip install -e '.[live]'`.
+    It needs what the extra `live` installs: bash setup.sh --live
 
     Exit codes: 0 ended, 2 bad input, 1 anything else.
     """

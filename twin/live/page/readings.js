@@ -130,10 +130,13 @@ export class Readings {
     pen.font = '11px system-ui, sans-serif';
     pen.fillStyle = colour('--soft');
     pen.strokeStyle = colour('--line');
-    const places = decimals((high - low) / 40);
+    // round numbers, three to six of them
+    const rough = (high - low) / 4;
+    const power = 10 ** Math.floor(Math.log10(rough));
+    const step = power * [1, 2, 5, 10].find((times) => times * power >= rough);
+    const places = Math.max(0, Math.min(9, -Math.floor(Math.log10(step) + 1e-9)));
     pen.textAlign = 'right';
-    for (let tick = 0; tick <= 4; tick += 1) {
-      const value = low + ((high - low) * tick) / 4;
+    for (let value = step * Math.ceil(low / step); value <= high; value += step) {
       pen.beginPath();
       pen.moveTo(left, y(value));
       pen.lineTo(width - 6, y(value));
