@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -173,19 +174,25 @@ class RigidTree:
         Raises:
             KeyError: a state names an unknown body or pivot.
         """
-        known = set(self.paths)
-        for state in states:
-            for path in state:
-                if path not in known:
-                    raise KeyError(path)
+        index, nominal = self._index, self._nominal if step is None else self._nominal_complex
+        moved = {path for state in states for path in state}
+        for path in moved:
+            if path not in index:
+                raise KeyError(path)
+        if step is not None:
+            moved |= {path for path, *_ in step}
         count = len(states)
         dtype: Any = np.complex128 if step is not None else np.float64
-        index = {path: i for i, path in enumerate(self.paths)}
         rotation = np.empty((count, len(index), 3, 3), dtype)
         translation = np.empty((count, len(index), 3), dtype)
+        rotation[:], translation[:] = nominal
         scale = np.ones((count, len(index)), dtype)
         passed_on = np.ones((count, len(index)), dtype)
         for i, body in enumerate(self.bodies):
+            if body.parent in moved:
+                moved.add(body.path)  # it is carried along
+            elif body.path not in moved:
+                continue
             motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
             position = body.pose.translation
             if body.parent:
@@ -206,7 +213,34 @@ class RigidTree:
             )
             passed_on[:, i] = inner * growth
             scale[:, i] = inner * growth * stretch
-        return PlacedBodies(FrozenMap(index), rotation, translation, scale)
+        return PlacedBodies(index, rotation, translation, scale)
+
+    @cached_property
+    def _index(self) -> FrozenMap[str, int]:
+        """Path -> number of a body."""
+        return FrozenMap({path: i for i, path in enumerate(self.paths)})
+
+    @cached_property
+    def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (bodies, 3, 3) and translations (bodies, 3) of bodies that nothing moves."""
+        return self._at_rest(np.float64)
+
+    @cached_property
+    def _nominal_complex(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same as complex sums round it."""
+        return self._at_rest(np.complex128)
+
+    def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+        rotation, translation = np.empty((len(self.bodies), 3, 3), dtype), np.empty((len(self.bodies), 3), dtype)
+        for i, body in enumerate(self.bodies):
+            rotation[i], translation[i] = body.pose.rotation, body.pose.translation
+            if body.parent:
+                p = self._index[body.parent]
+                # one state, in the order in which many are summed
+                rotation[i] = product(rotation[None, p], body.pose.rotation)[0]
+                carried = np.einsum("sij,sj->si", rotation[None, p], body.pose.translation[None].astype(dtype))[0]
+                translation[i] = carried + translation[p]
+        return rotation, translation
 
 
 FIGURE = "figure"

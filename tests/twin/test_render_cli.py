@@ -25,9 +25,8 @@ import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
-from twin.main_job.render_drawings import APART, LIMITS
+from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings
 from twin.main_job.render_job import render_job
-from twin.run.report import Section
 
 run = partial(invoke, command.app)
 """The command inside this process."""
@@ -118,8 +117,11 @@ def ready(repeated, monkeypatch):
     """
     _, _, _, kept = repeated
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
-    drawn = {**dict.fromkeys(APART, bytes), LIMITS: lambda: Section("limits")}
-    monkeypatch.setattr(twin.main_job.render_command, "drawings", lambda *_: drawn)
+
+    def few(*given):
+        return {SCENE: bytes, SUMMARY: bytes, **{name: drawings(*given)[name] for name in (LIMITS, IRRADIANCE)}}
+
+    monkeypatch.setattr(twin.main_job.render_command, "drawings", few)
     monkeypatch.setattr(twin.main_job.render_command, "render_report", lambda *_: "")
 
 
