@@ -128,7 +128,7 @@ def test_numbers_of_a_motion_by_name() -> None:
 
 @pytest.mark.parametrize("derivative", [False, True])
 def test_a_body_at_rest_is_where_it_is_when_it_is_moved_by_nothing(tree: RigidTree, derivative: bool) -> None:
-    """Bodies that nothing moves are not worked out anew: to the bit what a motion of zero gives, alone or with others."""
+    """What nothing moves is not worked out anew: to the bit what a motion of zero gives, alone or among others."""
     still = {path: Motion() for path in tree.paths}
     turned: State = {"a/plate": Motion(rotate=(1e-3, 0.0, 2e-3), shift=(0.0, 1e-4, 0.0), scale=1e-3)}
     for count in (1, 2, 9):
