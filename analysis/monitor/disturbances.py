@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+
+from analysis.chi_square import chance_beyond, density, limit_of
 
 __all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "consistency"]
 
@@ -199,12 +200,12 @@ class Consistency:
     @property
     def chance(self) -> float:
         """Probability of so large a chi-square by shifts that are as stated."""
-        return float(chi2.sf(self.chi_square, self.degrees))
+        return float(chance_beyond(self.chi_square, self.degrees))
 
     @property
     def chance_sigma_noise(self) -> float:
         """By how much the noise of the images moves ``chance``, one standard deviation, to first order."""
-        return float(chi2.pdf(self.chi_square, self.degrees)) * self.sigma_noise
+        return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod
     def power(times: float, degrees: int) -> float:
@@ -214,7 +215,7 @@ class Consistency:
             times: larger standard deviations.
             degrees: number of spot coordinates.
         """
-        return float(chi2.sf(chi2.isf(FALSE_ALARM, degrees) / times**2, degrees))
+        return float(chance_beyond(limit_of(FALSE_ALARM, degrees) / times**2, degrees))
 
 
 def consistency(
@@ -239,7 +240,7 @@ def consistency(
     root = np.linalg.cholesky(spread)
     white = np.linalg.solve(root, shift)
     square, count = float(white @ white), len(shift)
-    limit = float(chi2.isf(false_alarm, count))
+    limit = float(limit_of(false_alarm, count))
     slope = np.linalg.solve(root.T, white)
     moved = 2.0 * float(np.sqrt(slope @ noise @ slope))
     if square <= limit:

@@ -28,8 +28,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.stats import chi2
 
+from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
 
 __all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
@@ -141,7 +141,7 @@ def smooth(
         for k in range(0, len(mine), _AT_ONCE):
             part.estimate(wanted, mine[k : k + _AT_ONCE], found["filtered"], found["smoothed"])
     degrees = shifts.size
-    whole = Consistency(float(squares.sum()), degrees, float(chi2.isf(FALSE_ALARM, degrees)))
+    whole = Consistency(float(squares.sum()), degrees, float(limit_of(FALSE_ALARM, degrees)))
     return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole)
 
 

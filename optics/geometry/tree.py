@@ -174,73 +174,84 @@ class RigidTree:
         Raises:
             KeyError: a state names an unknown body or pivot.
         """
-        known = self.index
-        for state in states:
-            for path in state:
-                if path not in known:
-                    raise KeyError(path)
-        if step is not None:
-            return self._placed(states, step, self.bodies)
+        index, nominal = self._index, self._nominal if step is None else self._nominal_complex
         moved = {path for state in states for path in state}
-        if not moved and len(states) == 1:
-            return self._nominal
-        affected = []
-        for body in self.bodies:
-            if body.path in moved or body.parent in moved:
-                moved.add(body.path)
-                affected.append(body)
-        return self._placed(states, None, affected)
-
-    @cached_property
-    def index(self) -> Mapping[str, int]:
-        """Body path -> its place among the bodies."""
-        return FrozenMap({path: i for i, path in enumerate(self.paths)})
-
-    @cached_property
-    def _nominal(self) -> PlacedBodies:
-        """The bodies without any perturbation; for everybody, so that nobody may write to it."""
-        placed = self._placed(({},), None, self.bodies)
-        for array in (placed.rotation, placed.translation, placed.scale):
-            array.setflags(write=False)
-        return placed
-
-    def _placed(
-        self, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, affected: Sequence[Body]
-    ) -> PlacedBodies:
-        """As ``place``; bodies that are not ``affected``, of which each body with its children is, stay as designed."""
-        count, index = len(states), self.index
+        for path in moved:
+            if path not in index:
+                raise KeyError(path)
+        if step is not None:
+            moved |= {path for path, *_ in step}
+        elif not moved and len(states) == 1:
+            return self._designed
+        count = len(states)
         dtype: Any = np.complex128 if step is not None else np.float64
         rotation = np.empty((count, len(index), 3, 3), dtype)
         translation = np.empty((count, len(index), 3), dtype)
+        rotation[:], translation[:] = nominal
         scale = np.ones((count, len(index)), dtype)
         passed_on = np.ones((count, len(index)), dtype)
-        if len(affected) < len(self.bodies):
-            rotation[:], translation[:] = self._nominal.rotation, self._nominal.translation
-        unit, still = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3)), np.ones(count, dtype)
-        for body in affected:
-            i = index[body.path]
+        for i, body in enumerate(self.bodies):
+            if body.parent in moved:
+                moved.add(body.path)  # it is carried along
+            elif body.path not in moved:
+                continue
+            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
             position = body.pose.translation
             if body.parent:
                 p = index[body.parent]
                 base_rotation, base_translation = rotation[:, p], translation[:, p]
                 inherited, distances = passed_on[:, p], scale[:, p]
             else:
-                base_rotation, base_translation = unit, np.zeros((count, 3), dtype)
-                inherited = distances = still
+                base_rotation = np.broadcast_to(np.eye(3, dtype=dtype), (count, 3, 3))
+                base_translation = np.zeros((count, 3), dtype)
+                inherited = distances = np.ones(count, dtype)
             here = product(base_rotation, body.pose.rotation)
-            inner = inherited if body.scales else still
-            origin = np.einsum("sij,sj->si", base_rotation, distances[:, None] * position) + base_translation
-            if step is None and not any(body.path in state for state in states):
-                # carried along: what a motion of nothing would be multiplied and added here
-                rotation[:, i], translation[:, i] = here, origin
-                passed_on[:, i] = scale[:, i] = inner
-                continue
-            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
+            inner = inherited if body.scales else np.ones(count, dtype)
             rotation[:, i] = product(here, motion)
-            translation[:, i] = origin + np.einsum("sij,sj->si", here, offset)
+            translation[:, i] = (
+                np.einsum("sij,sj->si", base_rotation, distances[:, None] * position)
+                + base_translation
+                + np.einsum("sij,sj->si", here, offset)
+            )
             passed_on[:, i] = inner * growth
             scale[:, i] = inner * growth * stretch
         return PlacedBodies(index, rotation, translation, scale)
+
+    @cached_property
+    def _index(self) -> FrozenMap[str, int]:
+        """Path -> number of a body."""
+        return FrozenMap({path: i for i, path in enumerate(self.paths)})
+
+    @cached_property
+    def _designed(self) -> PlacedBodies:
+        """One state that nothing moves; everybody's, so that nobody may write to it."""
+        rotation, translation = (array[None].copy() for array in self._nominal)
+        scale = np.ones(rotation.shape[:2])
+        for array in (rotation, translation, scale):
+            array.setflags(write=False)
+        return PlacedBodies(self._index, rotation, translation, scale)
+
+    @cached_property
+    def _nominal(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (bodies, 3, 3) and translations (bodies, 3) of bodies that nothing moves."""
+        return self._at_rest(np.float64)
+
+    @cached_property
+    def _nominal_complex(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same as complex sums round it."""
+        return self._at_rest(np.complex128)
+
+    def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+        rotation, translation = np.empty((len(self.bodies), 3, 3), dtype), np.empty((len(self.bodies), 3), dtype)
+        for i, body in enumerate(self.bodies):
+            rotation[i], translation[i] = body.pose.rotation, body.pose.translation
+            if body.parent:
+                p = self._index[body.parent]
+                # one state, in the order in which many are summed
+                rotation[i] = product(rotation[None, p], body.pose.rotation)[0]
+                carried = np.einsum("sij,sj->si", rotation[None, p], body.pose.translation[None].astype(dtype))[0]
+                translation[i] = carried + translation[p]
+        return rotation, translation
 
 
 FIGURE = "figure"

@@ -49,21 +49,35 @@ def map_leaves(function: Callable[..., Any], tree: Tree, *others: Any) -> Tree:
 def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) -> Any:
     if tree is None:
         return None
+    if not others:
+        return _mapped_alone(function, tree)
     if isinstance(tree, tuple):
-        if not others:
-            return tuple([_mapped(function, branch, ()) for branch in tree])
         along = [_all(other, len(tree)) for other in others]
         return tuple([_mapped(function, branch, tuple(parts)) for branch, *parts in zip(tree, *along, strict=True)])
     names = _names(tree.__class__)
     if names is None:
         return function(tree, *others)
-    if not others:
-        return type(tree)(*[_mapped(function, getattr(tree, name), ()) for name in names])
     branches = [
         _mapped(function, getattr(tree, name), tuple([getattr(other, name, None) for other in others]))
         for name in names
     ]
     return type(tree)(*branches)
+
+
+def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
+    """Of one tree. Every trace does this to hundreds of numbers, most of which stand beside one another."""
+    whole, names = isinstance(tree, tuple), _names(tree.__class__)
+    if not whole and names is None:
+        return function(tree)
+    out: list[Any] = []
+    for branch in tree if whole else [getattr(tree, name) for name in names or ()]:
+        if branch is None:
+            out.append(None)
+        elif isinstance(branch, tuple) or _names(branch.__class__) is not None:
+            out.append(_mapped_alone(function, branch))
+        else:
+            out.append(function(branch))
+    return tuple(out) if whole else type(tree)(*out)
 
 
 def _all(branches: tuple[Any, ...] | None, count: int) -> tuple[Any, ...]:

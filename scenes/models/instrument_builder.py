@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import combinations, permutations
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +16,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
@@ -122,7 +122,7 @@ def _build(
     spread = max(x for x, _ in farthest), max(y for _, y in farthest)
     solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
     index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
-    cameras = MappingProxyType({name: derived[site.camera] for name, site in spec.cameras.items()})
+    cameras = FrozenMap({name: derived[site.camera] for name, site in spec.cameras.items()})
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
     _check_alike(spec, assembly)
     assembly = square_facets(assembly, channels, cameras, backend)
@@ -133,9 +133,9 @@ def _build(
         assembly,
         cameras,
         tuple(channels),
-        MappingProxyType(nodes),
+        FrozenMap(nodes),
         solids,
-        MappingProxyType(lengths),
+        FrozenMap(lengths),
         _baffles(spec, assembly.tree),
     )
     if free_bodies:

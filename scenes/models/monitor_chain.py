@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +23,7 @@ from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
 from optics.numerics.array_math import inner, norm, turned
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import Mount, Reflector, ReflectorParts
@@ -265,7 +265,7 @@ def monitor_chain(
         (*first.bodies, *second.bodies, facet),
         (*first.elements, *second.elements, face),
         (*first.solids, *second.solids),
-        MappingProxyType({PRISM_180: first.path_length, PRISM_0: second.path_length}),
+        FrozenMap({PRISM_180: first.path_length, PRISM_0: second.path_length}),
     )
 
 

@@ -22,8 +22,10 @@ import xarray as xr
 
 import twin.main_job.render_command
 import twin.render as command
+from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
+from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings
 from twin.main_job.render_job import render_job
 
 run = partial(invoke, command.app)
@@ -94,7 +96,9 @@ def stored(tmp_path_factory):
     def repeat(config: Path):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(twin.main_job.render_command, "render_job", keep)
+            patch.setenv(LIMIT, "1")  # without a second process
             again = run(config, "--out", place / "again", "--quiet")
+            patch.delenv(LIMIT)
             other = run(EXAMPLE, "--out", place / "other", "--frames", FRAMES, "--seed", 6)
         return place, again, other, kept
 
@@ -113,10 +117,12 @@ def ready(repeated, monkeypatch):
     """
     _, _, _, kept = repeated
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
-    for writer in ("write_report", "write_scene", "write_summary"):
-        monkeypatch.setattr(
-            twin.main_job.render_command, writer, lambda *drawn: next(d for d in drawn if isinstance(d, Path)).touch()
-        )
+
+    def few(*given):
+        return {SCENE: bytes, SUMMARY: bytes, **{name: drawings(*given)[name] for name in (LIMITS, IRRADIANCE)}}
+
+    monkeypatch.setattr(twin.main_job.render_command, "drawings", few)
+    monkeypatch.setattr(twin.main_job.render_command, "render_report", lambda *_: "")
 
 
 # --- a run that works -------------------------------------------------------------------------------------------------
@@ -225,6 +231,17 @@ def test_config_repeats_the_run_bit_for_bit(first, repeated):
     one, two = frames_of(folder), frames_of(place / "again")
     for image in one:
         assert np.array_equal(one[image], two[image])
+
+
+def test_what_is_drawn_does_not_depend_on_who_draws_it(first, repeated):
+    """The first run has a second process where there are two cores, the other never. All else is compared above."""
+    folder, place = first[0], repeated[0] / "again"
+    files = sorted(p.relative_to(folder) for p in folder.rglob("*") if p.is_file())
+    drawn = [name for name in files if name.suffix in (".svg", ".png", ".glb", ".nc", ".csv")]
+    assert len(drawn) > 10
+    for name in drawn:
+        assert (place / name).read_bytes() == (folder / name).read_bytes(), name
+    assert (place / "report.html").read_text() == (folder / "report.html").read_text()
 
 
 def test_quiet_says_nothing(repeated):

@@ -22,7 +22,7 @@ from twin.main_job.render_results import RenderRun
 from twin.main_job.report_content import goodness
 from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.report_tables import report_tables
-from twin.main_job.summary_plot import write_summary
+from twin.main_job.summary_plot import summary_png
 from twin.main_job.systematics import systematics
 from twin.main_job.verdict import judge
 from twin.pictures.scene_file import write_scene
@@ -320,7 +320,7 @@ def test_nothing_perturbed(backend, tmp_path):
 
 def test_summary_picture(run, tmp_path):
     place = tmp_path / "summary.png"
-    write_summary(run, place)
+    place.write_bytes(summary_png(run))
     image = cv2.imread(str(place))
     assert image.shape[1] == 1400
     assert 600 < image.shape[0] < 1600

@@ -9,30 +9,30 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from optics.numerics.threads import one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed
-from twin.main_job.deformation_section import deformation_section
-from twin.main_job.render_files import write_data
+from twin.main_job.deformation_results import faces_of
+from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings, load_drawing
+from twin.main_job.render_files import write_results
 from twin.main_job.render_job import render_job
-from twin.main_job.render_report import PICTURES, write_report
+from twin.main_job.render_report import PICTURES, render_report
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
-from twin.main_job.summary_plot import write_summary
 from twin.main_job.verdict import judge, recovered_numbers
-from twin.pictures.picture import write_pictures
-from twin.pictures.picture_light import PictureError
-from twin.pictures.scene_file import write_scene
+from twin.pictures.light_paths import trace_light_paths
 from twin.run.cli import print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings
 from twin.run.further_sections import further_sections
 from twin.run.page import write_artefacts
 from twin.run.reference_frames import described
+from twin.run.report import Section
 from twin.run.run_folder import write_manifest
+from twin.run.second_process import SecondProcess
 from twin.targets.edge_images import DIRECTIONS
 from twin.targets.target_images import PLACES
 from twin.targets.target_result import EdgeReading, TargetRun
-from twin.uncertainty.uncertainty_report import limits_section
 
 DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
 DECIMALS |= dict.fromkeys((p.key for p in GROUND), 3)
@@ -59,44 +59,70 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     Raises:
         InputError: the job cannot be: its perturbation, its targets.
     """
-    run = render_job(resolved, session.backend, frames, seed, session.advance)
-    problem = write_run(run, session, picture)
+    # a second thread of linear algebra would wait for a core that the second process has
+    with SecondProcess(load_drawing) as beside, one_blas_thread():
+        run = render_job(resolved, session.backend, frames, seed, session.advance)
+        problem = write_run(run, session, picture, beside)
     return Result(_numbers(run), lambda console: _print_result(run, console), problem)
 
 
-def write_run(run: RenderRun, session: Session, picture: bool = False) -> str:
+def write_run(run: RenderRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:
     """Write all files of a run: its data, then what they look like.
 
     Args:
         run: what was computed.
         session: with the open run folder.
         picture: also render pictures of the instrument.
+        beside: the process that helps with the drawing; None for one that begins now.
 
     Returns:
         Why the pictures are not complete, empty when they are or nobody asked for them.
     """
+    if beside is None:
+        with SecondProcess(load_drawing) as helper:
+            return write_run(run, session, picture, helper)
     seconds, folder = session.seconds, session.folder
     session.advance(WRITE, 0, 1)
-    write_data(run, folder)
-    folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
-    deformed = deformation_section(run)
-    sections = (*((deformed,) if deformed else ()), limits_section(run.limits), *further_sections("render", run))
+    beside.start(drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state)))
+    write_results(run, folder)
+    deformed = _deformed(run)
+    further = further_sections("render", run)
+    drawn = beside.results()
+    for name, file in ((IRRADIANCE, "irradiance.nc"), (SCENE, "scene.glb"), (SUMMARY, "summary.png")):
+        folder.write_bytes(file, drawn[name])
+    sections = (*((deformed,) if deformed else ()), drawn[LIMITS], *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
-    folder.write_with("summary.png", lambda file: write_summary(run, file))
     problem = ""
     if picture:
-        instrument, write = run.experiment.instrument, folder.write_with
-        try:
-            write_pictures(instrument, session.backend, run.state, write, run.seed, session.advance)
-        except PictureError as error:  # what took minutes to compute is not thrown away for a picture
-            problem = f"the pictures are not complete: {error}"
-    scene = (folder.path / "scene.glb").read_bytes()
+        problem = _pictures(run, session)
     pictures = [place for name in PICTURES if (place := folder.path / name).exists()]
-    folder.write_with("report.html", lambda file: write_report(run, file, sections, scene, pictures))
+    folder.write_text("report.html", render_report(run, sections, drawn[SCENE], pictures, drawn))
     warnings = list(judge(run).warnings)
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
     write_manifest(folder, PROGRAM, session.started, seconds, **entries)
     return problem
+
+
+def _deformed(run: RenderRun) -> Section | None:
+    """The section on bodies that tables of displaced nodes deform, if there are any."""
+    if not faces_of(run):
+        return None
+    from twin.main_job.deformation_section import deformation_section
+
+    return deformation_section(run)
+
+
+def _pictures(run: RenderRun, session: Session) -> str:
+    """Render them; why they are not complete, else nothing."""
+    from twin.pictures.picture import write_pictures
+    from twin.pictures.picture_light import PictureError
+
+    write = session.folder.write_with
+    try:
+        write_pictures(run.experiment.instrument, session.backend, run.state, write, run.seed, session.advance)
+    except PictureError as error:  # what took minutes to compute is not thrown away for a picture
+        return f"the pictures are not complete: {error}"
+    return ""
 
 
 def _numbers(run: RenderRun) -> dict[str, Any]:

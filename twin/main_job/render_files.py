@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from scenes.specs.channel import Channel
 from twin.main_job.deformation_results import config_text, deformation_numbers, faces_of, table_names
@@ -21,9 +20,23 @@ from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
 from twin.uncertainty.uncertainty_numbers import limits_numbers
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 
 def write_data(run: RenderRun, folder: RunFolder) -> None:
     """Write everything that a run computed: what it is of, numbers, frames and expected images.
+
+    Args:
+        run: what to write.
+        folder: an open run folder.
+    """
+    write_results(run, folder)
+    folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
+
+
+def write_results(run: RenderRun, folder: RunFolder) -> None:
+    """The same without irradiance.nc.
 
     Args:
         run: what to write.
@@ -49,7 +62,6 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
                 facts = replace(facts, times=(float(run.series.times[run.series.shown]),) * len(frames))
             for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames, facts):
                 folder.write_bytes(file, content)
-    folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
     if run.stray is not None:
         _write_numbers(folder, "stray", run.stray.to_dict())
     if run.series is not None:
@@ -107,6 +119,8 @@ def irradiance(run: RenderRun) -> xr.Dataset:
 
 def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np.ndarray) -> xr.Dataset:
     """Expected images (N, C, rows, columns) with the coordinate of their first axis."""
+    import xarray as xr
+
     path = run.experiment.path
     return xr.Dataset(
         {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,9 @@ from markupsafe import Markup
 
 from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.deformation_results import config_text
-from twin.main_job.light_path_plots import footprints_svg, side_view_svg
-from twin.main_job.motion_map import motion_map_svg
+from twin.main_job.render_drawings import APART, drawings
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_tables import report_tables, setup_tables
-from twin.main_job.series_plots import parameters_svg, smoothed_svg, temperatures_svg
-from twin.main_job.spot_plots import residuals_svg, spots_svg
-from twin.main_job.target_plots import curves_svg, images_svg, pupils_svg
 from twin.main_job.verdict import judge
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.viewer import viewer_markup, viewer_scripts
@@ -27,7 +23,7 @@ from twin.run.page import artefact_content, environment, reproduce, section_cont
 from twin.run.report import Section
 from twin.run.versions import versions
 
-__all__ = ["render_report", "write_report"]
+__all__ = ["render_report"]
 
 TEMPLATE = "report.html.j2"
 PICTURES = {
@@ -39,56 +35,34 @@ PICTURES = {
 JPEG_QUALITY = 88
 
 
-def write_report(
-    run: RenderRun,
-    place: Path,
-    sections: Sequence[Section] = (),
-    scene: bytes | None = None,
-    pictures: Sequence[Path] = (),
-) -> None:
-    """Write the report of a run.
-
-    Args:
-        run: the run.
-        place: the HTML file.
-        sections: beside the report's own.
-        scene: contents of scene.glb, for the view that can be turned; None leaves it out.
-        pictures: files in PICTURES that were rendered.
-    """
-    place.write_text(render_report(run, sections, scene, pictures), encoding="utf-8")
-
-
 def render_report(
     run: RenderRun,
     sections: Sequence[Section] = (),
     scene: bytes | None = None,
     pictures: Sequence[Path] = (),
+    drawn: Mapping[str, Any] | None = None,
 ) -> str:
-    """The page as text."""
+    """The page as text.
+
+    Args:
+        run: the run.
+        sections: beside the report's own.
+        scene: contents of scene.glb, for the view that can be turned; None leaves it out.
+        pictures: files in PICTURES that were rendered.
+        drawn: name -> <svg> element of every figure of ``twin.main_job.render_drawings``; None draws them.
+    """
     experiment, backend = run.experiment, run.experiment.backend.name
-    paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
+    if drawn is None:
+        paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
+        drawn = {name: draw() for name, draw in drawings(run, paths).items() if name not in APART}
     tables = report_content.results(run)
-    names = list(experiment.instrument.cameras)
-    titles = {name: estimator.title for name, estimator in run.estimators.items()}
-    figures = {
-        "spots": {name: Markup(spots_svg(run, name)) for name in names},
-        "residuals": Markup(residuals_svg(report_content.residual_panels(tables), titles)),
-        "motions": Markup(motion_map_svg(run)),
-        "side": Markup(side_view_svg(experiment.instrument, paths)),
-        "footprints": Markup(footprints_svg(experiment.instrument, paths)),
-    }
-    if run.series is not None:
-        figures["temperatures"] = Markup(temperatures_svg(run.series))
-        figures["course"] = Markup(parameters_svg(run.series, titles))
-        if run.series.smoothed is not None:
-            figures["smoothed"] = Markup(smoothed_svg(run.series))
-    if run.targets is not None:
-        cameras = run.targets.cameras
-        figures["targets"] = {name: Markup(images_svg(name, camera)) for name, camera in cameras.items()}
-        if run.targets.has_edges:
-            figures["mtf"] = {name: Markup(curves_svg(name, camera)) for name, camera in cameras.items()}
-    if run.quality is not None and run.quality.obstruction:
-        figures["pupils"] = Markup(pupils_svg(run.quality))
+    figures: dict[str, Any] = {}
+    for name, svg in drawn.items():
+        group, _, camera = name.partition(" ")
+        if camera:
+            figures.setdefault(group, {})[camera] = Markup(svg)
+        elif isinstance(svg, str):
+            figures[name] = Markup(svg)
     template = environment(__package__).get_template(TEMPLATE)
     told, setup = judge(run), report_content.setup(run)
     csvs = {name: artefact_content(table, None) for name, table in (report_tables(run) | setup_tables(setup)).items()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -24,15 +23,10 @@ REACH = 2.2
 """Half-width of the pictures in Airy radii around both centres."""
 
 
-def write_summary(run: RenderRun, place: Path) -> None:
-    """Write the picture.
-
-    Args:
-        run: the run.
-        place: the PNG file.
-    """
+def summary_png(run: RenderRun) -> bytes:
+    """The picture as PNG."""
     with look("summary"):
-        place.write_bytes(to_png(_draw(run), DPI))
+        return to_png(_draw(run), DPI)
 
 
 def _draw(run: RenderRun) -> Figure:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from optics.geometry.aperture import Circle
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
@@ -212,10 +212,10 @@ def image_quality(
             nyquist=bench.nyquist,
             wavelengths=light,
             reasons=tuple(reasons),
-            bodies=MappingProxyType(bench.bodies(len(states))),
+            bodies=FrozenMap(bench.bodies(len(states))),
             pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
         )
-    return ImageQuality(tuple(fields), wavelength, MappingProxyType(cameras), obstruction)
+    return ImageQuality(tuple(fields), wavelength, FrozenMap(cameras), obstruction)
 
 
 def quality_dicts(

@@ -59,6 +59,7 @@ class MonitorExperiment:
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
+        self._patterns: dict[int, FixedPattern] = {}
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
         """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
@@ -232,7 +233,12 @@ class MonitorExperiment:
 
     def pattern(self, seed: int) -> FixedPattern:
         """PRNU and DSNU of all area CCDs; the same before and after."""
-        return self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
+        found = self._patterns.get(seed)
+        if found is None:
+            found = self.detector.fixed_pattern((len(self.path.channels), *self.path.shape), stream(seed, 0))
+            # kept for one seed at a time: states that are exposed one by one would each draw it anew
+            self._patterns = {seed: found}
+        return found
 
     def frames_before(self, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> np.ndarray:
         """Frames of the nominal state with the given stray photons, uint16 (C, frames, rows, columns)."""

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.signal import fftconvolve
 
 from optics.geometry.tree import State
 from optics.waves.diffraction import Grid, image
@@ -106,6 +105,8 @@ def stray_light(
     Raises:
         NominalPathLost: too few paths, or the perturbation moves a beam off.
     """
+    from scipy.signal import fftconvolve  # takes long, and most jobs trace no stray light
+
     traced = trace_stray(experiment.instrument, experiment.backend, state, paths, seed, progress=progress)
     spots = diffraction_spots(experiment)
     raw = np.stack([traced.photons[f"{c.key}/area_ccd"] for c in experiment.path.channels])

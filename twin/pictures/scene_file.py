@@ -79,9 +79,20 @@ def write_scene(experiment: MonitorExperiment, state: State, place: Path) -> Non
         place: the file, ``scene.glb``.
     """
     paths = trace_light_paths(experiment.instrument, experiment.backend, state)
-    scene = build_scene(experiment.instrument, paths)
-    scene.metadata["motions"] = motions(experiment.instrument, state, paths.placed)
-    place.write_bytes(scene.export(file_type="glb"))
+    place.write_bytes(scene_bytes(experiment.instrument, state, paths))
+
+
+def scene_bytes(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
+    """The file's content.
+
+    Args:
+        instrument: the instrument.
+        state: what is perturbed.
+        paths: its light in that state.
+    """
+    scene = build_scene(instrument, paths)
+    scene.metadata["motions"] = motions(instrument, state, paths.placed)
+    return bytes(scene.export(file_type="glb"))
 
 
 def motions(instrument: Instrument, state: State, placed: PlacedBodies) -> dict[str, dict[str, Any]]:

@@ -9,9 +9,8 @@ The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, 
 
 PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. Further
 noise is what a data sheet lists beyond the model (``twin.sensors.noise_terms``). The
-Poisson numbers come from `numpy.random.Generator.poisson` (exact at every mean: multiplication below 10, Hoermann's
-PTRS rejection above); no normal approximation is made anywhere. Pixel coordinates are (row, column); arrays are (...,
-H, W).
+Poisson numbers are exact at every mean (``twin.sensors.poisson_numbers``); no normal approximation is made anywhere.
+Pixel coordinates are (row, column); arrays are (..., H, W).
 """
 
 from __future__ import annotations
@@ -33,12 +32,13 @@ from scenes.specs.detector import DetectorSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from twin.run.random_streams import stream
 from twin.sensors.noise_terms import NOISE_TERMS, FixedOffsets, NoiseTerm, ReadNoise
+from twin.sensors.poisson_numbers import poisson_numbers
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
 Seed = int | np.random.SeedSequence
 
-# Beyond this the input is certainly in the wrong unit; the Poisson generator itself works up to 9e18.
+# Beyond this the input is certainly in the wrong unit; NumPy's generator, which draws the largest, works up to 9e18.
 _MAX_PHOTONS = 1e12
 # A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
 # after the well is clipped: half of all full wells would otherwise read below "full".
@@ -248,17 +248,17 @@ class EmvaDetector:
             mean_e = light[index] * gain[index]
             mean_e *= self.quantum_efficiency
             mean_e += dark_e
-            size = (int(frames), height, width)
-            electrons = rng.poisson(mean_e, size=size)
-            level = np.minimum(electrons, self.full_well_e, dtype=np.float64)
+            shift = offset_e[index] * scale
+            shift += self.offset_dn
+            level = poisson_numbers(mean_e, int(frames), rng)
+            np.minimum(level, self.full_well_e, out=level)
             collected = level.copy() if self.noise else level
             for term in (ReadNoise(self.dark_noise_e), *self.noise):
                 added = term.temporal_e(collected, rng)
                 if added is not None:
                     level += added
-            level += offset_e[index]
             level *= scale
-            level += self.offset_dn
+            level += shift
             np.rint(level, out=level)
             np.clip(level, 0, self.max_dn, out=level)
             out[index] = level

@@ -55,7 +55,11 @@ class ReadNoise:
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
         """Drawn for every pixel of every frame; no number is drawn for a sigma of zero."""
-        return rng.standard_normal(electrons.shape) * self.sigma_e if self.sigma_e > 0 else None
+        if self.sigma_e <= 0:
+            return None
+        out = rng.standard_normal(electrons.shape)
+        out *= self.sigma_e
+        return out
 
 
 @dataclass(frozen=True)

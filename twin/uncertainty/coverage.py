@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom, chi2, norm
+from scipy.special import gammaincinv, ndtr
 
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.estimators import Shifts, applicable
@@ -27,7 +27,7 @@ from twin.run.random_streams import stream
 
 LEVELS = (0.68, 0.95)
 """Of the intervals whose coverage is counted."""
-HALF_WIDTHS = tuple(float(np.sqrt(chi2.ppf(level, 1))) for level in LEVELS)
+HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in LEVELS)
 """The same in standard deviations of a normal error."""
 FALSE = 1e-2
 """Chance that any of all counts falls out of its limits though every sigma is right."""
@@ -100,12 +100,16 @@ class Coverage:
             estimator: its name.
             level: number in ``LEVELS``.
         """
+        from scipy.stats import binom  # takes long, and only a report of random states needs it
+
         tail = 0.5 * FALSE / self.counts
         return np.stack([binom.ppf(end, self.measured, self.expected[estimator][level]) for end in (tail, 1.0 - tail)])
 
     @property
     def alarm_limit(self) -> int:
         """Largest number of alarms that agrees with their false-alarm rate, at a chance of ``FALSE``."""
+        from scipy.stats import binom
+
         return int(binom.ppf(1.0 - FALSE, self.measured, FALSE_ALARM))
 
     @property
@@ -252,9 +256,7 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
     for name, estimator in applicable(experiment.cameras, stated).items():
         gain = estimator.gain(shifts)
         off, sigma = np.einsum("qi,nid,nd->nq", rows, gain - best, found.shift), spread(gain)
-        out[name] = np.stack(
-            [norm.cdf((w * sigma - off) / left) - norm.cdf((-w * sigma - off) / left) for w in HALF_WIDTHS]
-        )
+        out[name] = np.stack([ndtr((w * sigma - off) / left) - ndtr((-w * sigma - off) / left) for w in HALF_WIDTHS])
     return out
 
 

@@ -1,0 +1,194 @@
+"""The second process of a command: the same results with it and without, whatever becomes of it."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+import twin.run.second_process as module
+from twin.run.second_process import MOST_TASKS, SecondProcess
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(autouse=True)
+def two_cores(monkeypatch) -> None:
+    monkeypatch.setattr(module, "cores", lambda: 2)
+
+
+def nothing() -> None:
+    pass
+
+
+def square(number: int, seconds: float = 0.0) -> tuple[int, int]:
+    time.sleep(seconds)
+    return number**2, os.getpid()
+
+
+def large(number: int) -> np.ndarray:
+    return np.full(200_000, float(number))
+
+
+def refuse() -> None:
+    raise ValueError("not this one")
+
+
+def end_itself(first: int) -> int:
+    if os.getpid() != first:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 5
+
+
+def run(tasks: dict[str, Callable[[], object]], wanted: bool) -> dict[str, object]:
+    with SecondProcess(nothing, wanted) as beside:
+        beside.start(tasks)
+        return beside.results()
+
+
+def interrupted() -> None:
+    with SecondProcess(nothing) as beside:
+        beside.start({str(k): partial(time.sleep, 600.0) for k in range(9)})
+        raise KeyboardInterrupt
+
+
+def open_files() -> int:
+    return len(os.listdir("/proc/self/fd"))
+
+
+def children() -> list[int]:
+    """Processes below this one that have not been waited for."""
+    return [child.pid for child in psutil.Process().children()]
+
+
+def test_both_processes_take_their_part() -> None:
+    with SecondProcess(nothing) as beside:
+        beside.start({str(k): partial(square, k, 0.02) for k in range(20)})
+        found = beside.results()
+    assert [found[str(k)][0] for k in range(20)] == [k**2 for k in range(20)]
+    assert list(found) == [str(k) for k in range(20)]
+    assert len({pid for _, pid in found.values()}) == 2
+
+
+def test_results_larger_than_a_pipe() -> None:
+    """8 MB each way, while the first process does something else."""
+    table = np.arange(1_000_000.0)
+    with SecondProcess(nothing) as beside:
+        beside.start({"sum": partial(np.sum, table), "a": partial(large, 1), "b": partial(large, 2)})
+        time.sleep(0.2)
+        found = beside.results()
+    assert found["sum"] == table.sum()
+    assert (found["a"][-1], found["b"][-1]) == (1.0, 2.0)
+
+
+def test_it_prepares_while_the_first_computes(tmp_path) -> None:
+    with SecondProcess((tmp_path / "there").touch) as beside:
+        last = time.monotonic() + 20.0
+        while not (tmp_path / "there").exists():
+            assert time.monotonic() < last
+            time.sleep(0.01)
+        beside.start({})
+        assert beside.results() == {}
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_what_a_task_raises_comes_out(wanted) -> None:
+    with pytest.raises(ValueError, match="not this one"):
+        run({"good": partial(square, 2), "bad": refuse}, wanted)
+    assert not children()
+
+
+def test_a_process_that_dies_loses_nothing() -> None:
+    with SecondProcess(nothing) as beside:
+        beside.start({str(k): partial(end_itself, os.getpid()) for k in range(6)})
+        time.sleep(0.3)  # it takes the first one and ends
+        found = beside.results()
+    assert found == {str(k): 5 for k in range(6)}
+
+
+def test_a_process_that_cannot_prepare_loses_nothing() -> None:
+    with SecondProcess(refuse) as beside:
+        time.sleep(0.3)
+        beside.start({"a": partial(square, 3), "b": partial(large, 2)})
+        found = beside.results()
+    assert found["a"] == (9, os.getpid())
+
+
+def test_a_process_that_hangs_is_ended(monkeypatch) -> None:
+    monkeypatch.setattr(module, "PATIENCE", 0.3)
+    own = os.getpid()
+    with SecondProcess(nothing) as beside:
+        beside.start({"a": partial(_stuck_elsewhere, own), "b": partial(_stuck_elsewhere, own)})
+        time.sleep(0.3)
+        assert beside.results() == {"a": own, "b": own}
+    assert not children()
+
+
+def _stuck_elsewhere(first: int) -> int:
+    if os.getpid() != first:
+        time.sleep(600.0)
+    return first
+
+
+def test_tasks_that_cannot_be_sent_are_done_here() -> None:
+    with SecondProcess(nothing) as beside:
+        beside.start({"a": lambda: 1, "b": lambda: 2})
+        assert beside.results() == {"a": 1, "b": 2}
+
+
+def test_no_second_process_on_one_core_or_beside_other_threads(monkeypatch) -> None:
+    found: list[int] = []
+
+    def use() -> None:
+        with SecondProcess(nothing) as beside:
+            beside.start({"a": partial(square, 1)})
+            found.append(beside.results()["a"][1])
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    thread.join()
+    monkeypatch.setattr(module, "cores", lambda: 1)
+    use()
+    assert found == [os.getpid()] * 2
+
+
+def test_nothing_is_left_behind() -> None:
+    before = open_files()
+    for stop in (False, True):
+        with SecondProcess(nothing) as beside:
+            if not stop:
+                beside.start({"a": partial(square, 1)})
+                beside.results()
+        with pytest.raises(KeyboardInterrupt):
+            interrupted()
+    assert open_files() == before
+    assert not children()
+    with SecondProcess(nothing) as beside, pytest.raises(ValueError, match="more than 256"):
+        beside.start({str(k): nothing for k in range(MOST_TASKS + 1)})
+
+
+def test_it_ends_with_a_command_that_is_killed() -> None:
+    """Also its copy of what the command had open, so that a reader of the output sees the end and a lock is free."""
+    code = (
+        "import os, time; import twin.run.second_process as m; m.cores = lambda: 2\n"
+        "with m.SecondProcess(lambda: None) as beside:\n"
+        "    print(beside._child, flush=True)\n"
+        "    time.sleep(600)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True) as command:
+        assert command.stdout is not None
+        child = int(command.stdout.readline())
+        command.kill()
+        assert command.stdout.read() == ""
+    last = time.monotonic() + 20.0
+    while Path(f"/proc/{child}/stat").exists() and " Z " not in Path(f"/proc/{child}/stat").read_text():
+        assert time.monotonic() < last
+        time.sleep(0.01)

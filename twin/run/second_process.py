@@ -1,0 +1,171 @@
+"""A second process of a command for what can be done apart: it imports what draws while the first one still computes,
+and then both take piece after piece of the drawing.
+
+It is a fork of the command, made before anything was computed, and does nothing but what it is sent: it touches no
+device, writes into no run folder and ends with the command. What it fails to give the command does itself, and that
+raises the errors; so a result is never lost, and is the same with the second process as without it.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import pickle
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import IO, Any
+
+from optics.numerics.threads import cores
+
+__all__ = ["SecondProcess"]
+
+MOST_TASKS = 256
+PATIENCE = 120.0
+"""Seconds for which one task may keep the command waiting that has nothing else to do; then it is done here, too."""
+
+
+class SecondProcess:
+    """Use as a context: from its beginning on the process is there, if the machine has a core for it.
+
+    Args:
+        prepare: done in it at once, imports most of all.
+        wanted: False for none: everything is done here.
+    """
+
+    def __init__(self, prepare: Callable[[], object], wanted: bool = True) -> None:
+        self._prepare, self._wanted = prepare, wanted
+        self._child = 0
+        self._tasks: Mapping[str, Callable[[], Any]] = {}
+
+    def __enter__(self) -> SecondProcess:
+        alone = threading.current_thread() is threading.main_thread()
+        if self._wanted and hasattr(os, "fork") and alone and cores() > 1:
+            self._begin()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._child:
+            self._ended(0.0)
+            self._from_child.close()
+
+    def start(self, tasks: Mapping[str, Callable[[], Any]]) -> None:
+        """Let it begin. Tasks that cannot be pickled, because of what a user has added, are left to this process.
+
+        Args:
+            tasks: name -> what is to be done; the longest first, at most ``MOST_TASKS``. They see the values that they
+                hold as they are now.
+        """
+        if len(tasks) > MOST_TASKS:
+            raise ValueError(f"more than {MOST_TASKS} tasks: {len(tasks)}")
+        self._tasks = tasks
+        if not self._child:
+            return
+        try:
+            content = pickle.dumps(list(tasks.values()), pickle.HIGHEST_PROTOCOL)
+        except (pickle.PicklingError, TypeError, AttributeError):
+            content = b""
+        try:
+            os.write(self._turns[1], bytes(range(len(tasks))))
+            sent = 0
+            while sent < len(content):
+                sent += os.write(self._to_child, content[sent:])
+        except BrokenPipeError:
+            pass  # it is gone
+        finally:
+            self._nothing_more()
+
+    def results(self) -> dict[str, Any]:
+        """Name -> result of every task. Raises whatever a task does."""
+        names, found = list(self._tasks), {}
+        if self._child:
+            for number in _turns(self._turns[0]):
+                found[names[number]] = self._tasks[names[number]]()
+            self._ended(PATIENCE)
+            for number, result in _stored(self._from_child):
+                found[names[number]] = result
+        return {name: found[name] if name in found else task() for name, task in self._tasks.items()}
+
+    def _begin(self) -> None:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        # whoever reads a byte has the task of that number; a pipe gives each to one reader alone
+        self._turns, given = os.pipe(), os.pipe()
+        self._from_child: IO[bytes] = tempfile.TemporaryFile()
+        child = os.fork()
+        if child == 0:
+            try:
+                os.close(given[1])
+                os.close(self._turns[1])
+                self._work(given[0])
+            finally:
+                os._exit(0)  # nothing of the command is closed, written or told twice
+        os.close(given[0])
+        self._to_child = given[1]
+        self._child, self._sending = child, True
+
+    def _work(self, given: int) -> None:
+        """All that the second process does."""
+        gc.disable()  # what the first process computes with is left alone
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first one ends it
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(nowhere, stream)
+        # a lock on a run folder ends with the process that holds it, and is held by every copy of its file
+        first = 3
+        for kept in sorted((given, self._turns[0], self._from_child.fileno())):
+            os.closerange(first, kept)
+            first = kept + 1
+        os.closerange(first, os.sysconf("SC_OPEN_MAX"))
+        self._prepare()
+        with os.fdopen(given, "rb") as file:
+            content = file.read()
+        tasks = pickle.loads(content) if content else []
+        for number in _turns(self._turns[0]) if tasks else ():
+            pickle.dump((number, tasks[number]()), self._from_child)
+            self._from_child.flush()
+
+    def _nothing_more(self) -> None:
+        """There are no further tasks: who waits for one is told so."""
+        if self._sending:
+            self._sending = False
+            os.close(self._turns[1])
+            os.close(self._to_child)
+
+    def _ended(self, patience: float) -> None:
+        """Wait for its end, and bring it about when it takes too long."""
+        self._nothing_more()
+        last = time.monotonic() + patience
+        while os.waitpid(self._child, os.WNOHANG) == (0, 0):
+            if time.monotonic() > last:
+                os.kill(self._child, signal.SIGKILL)
+                os.waitpid(self._child, 0)
+                break
+            time.sleep(0.002)
+        self._child = 0
+        os.close(self._turns[0])
+
+
+def _turns(pipe: int) -> Any:
+    """Numbers of tasks that nobody else has, until there are no more."""
+    while number := os.read(pipe, 1):
+        yield number[0]
+
+
+def _stored(file: IO[bytes]) -> Any:
+    """All whole results in a file."""
+    with file:
+        file.seek(0)
+        while True:
+            try:
+                yield pickle.load(file)
+            except (EOFError, pickle.UnpicklingError):  # nothing more, or it was killed while it wrote
+                return
