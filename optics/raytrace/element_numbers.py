@@ -183,18 +183,6 @@ def bodies_of(chain: Sequence[Element], i: int, media: Sequence[Medium]) -> set[
     return bodies | {chain[i - 1].body} if i else bodies
 
 
-def nominal_numbers(
-    assembly: Assembly, chain: Sequence[Element], i: int, media: Sequence[Medium], structure: Structure, count: int
-) -> ElementNumbers:
-    """Numbers of an element that no state touches, worked out once for each structure, as ``_numbers``."""
-    key = (i, tuple(element.name for element in chain[: i + 2]), structure)
-    known = assembly.known_numbers
-    if key not in known:
-        known[key] = numbers_of(assembly, chain, i, media, structure, ({},), assembly.place(), None)
-    numbers: ElementNumbers = known[key]
-    return numbers if count == 1 else map_leaves(lambda value: np.repeat(value, count), numbers)
-
-
 def numbers_of(
     assembly: Assembly,
     chain: Sequence[Element],

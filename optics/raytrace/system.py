@@ -23,7 +23,6 @@ from optics.raytrace.element_numbers import (
     bodies_of,
     grid_numbers,
     media_along,
-    nominal_numbers,
     numbers_of,
     structure_of,
     touched_bodies,
@@ -161,25 +160,31 @@ def assemble(
             any(m[i + 1].solid in graded for m in media),
         )
         structures.append(structure_of([chain[i] for chain in chains], states, gradients))
-    poses = [[world_frame(element, placed) for element in chain] for chain in chains]
-    touched = None if step is not None or np.iscomplexobj(placed.rotation) else touched_bodies(assembly, states, placed)
-    numbers = [
-        [
-            numbers_of(assembly, chain, i, along, structures[i], states, placed, step)
-            if touched is None or not touched.isdisjoint(bodies_of(chain, i, along))
-            else nominal_numbers(assembly, chain, i, along, structures[i], len(states))
-            for i in range(len(chain))
-        ]
-        for chain, along in zip(chains, media, strict=True)
-    ]
-    values = [_joined([chain[i] for chain in numbers]) for i in range(len(chains[0]))]
+    real = step is None and not np.iscomplexobj(placed.rotation)
+    touched = touched_bodies(assembly, states, placed) if real else None
+
+    def joined(i: int) -> ElementNumbers:
+        """The numbers of the i-th elements of all chains; of those that no state touches as they are kept."""
+        parts = list(zip(chains, media, strict=True))
+        if touched is None or any(not touched.isdisjoint(bodies_of(chain, i, along)) for chain, along in parts):
+            return _joined([numbers_of(assembly, c, i, m, structures[i], states, placed, step) for c, m in parts])
+        key = (i, tuple(tuple(element.name for element in chain[: i + 2]) for chain in chains), structures[i])
+        known = assembly.known_numbers
+        if key not in known:
+            nominal = assembly.place()
+            own = [numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
+            known[key] = _joined(own)
+        kept: ElementNumbers = known[key]
+        # each system's number for all its states
+        return kept if len(states) == 1 else map_leaves(lambda value: np.repeat(value, len(states)), kept)
+
+    values = [joined(i) for i in range(len(chains[0]))]
     tables: list[np.ndarray | None] = [None] * len(values)
     for i, structure in enumerate(structures):
         if structure.grid:
             grid, tables[i] = grid_numbers([chain[i] for chain in chains], states)
             values[i] = replace(values[i], surface=replace(values[i].surface, grid=grid))
-    world = [_joined([chain[i] for chain in poses]) for i in range(len(chains[0]))]
-    real = step is None and not np.iscomplexobj(placed.rotation)
+    world = [_joined([world_frame(chain[i], placed) for chain in chains]) for i in range(len(chains[0]))]
     size = np.concatenate([placed.size(chain[-1].body) for chain in chains])
     return SystemBatch(
         tuple(structures),
