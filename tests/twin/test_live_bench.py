@@ -226,12 +226,20 @@ def test_knobs_keep_the_units_of_the_job(tmp_path):
     file.write_text(
         "instrument: gf7_pair\nperturb:\n"
         "  base/forward/M2: {shift: [0 mm, 0 mm, 0.003 mm], figure: {Z20: 7 nm}}\n"
+        "  base/backward/M2: {shift: [1 um, 2 mm, 0 um]}\n"
+        "  base/backward/M3: {shift: [2500 um, 0 um, 0 um]}\n"
         "  base/forward: {temperature: {change: 0.5 K, gradient: [1 mK/m, 0 mK/m, 0 mK/m]}, scale: 3 ppm}\n",
         encoding="utf-8",
     )
     loaded = twin.load(file)
     bench = LiveBench(loaded)
     asked = bench.at_rest
+    assert asked.knobs[f"{M2} shift z"] == 3.0
+    # of several units the usual one; of one the file's
+    assert asked.knobs["base/backward/M2 shift y"] == 2000.0
+    assert bench.knobs["base/backward/M2 shift y"].reach == 4000.0
+    knob = bench.knobs["base/backward/M3 shift x"]
+    assert (knob.unit, knob.value, knob.reach, knob.limit) == ("mm", 2.5, 5.0, 100.0)
     assert asked.knobs[f"{M2} figure Z20"] == 7.0
     assert asked.knobs["base/forward temperature"] == 0.5
     # to the bit, whatever the unit
