@@ -1,4 +1,4 @@
-"""A batch of states of the pair's monitor: 2 cameras, 4 spots, 9 frames, centroids and all estimators."""
+"""States of the pair's monitor: 2 cameras, 4 spots, 9 frames, centroids and all estimators; a batch, and one alone."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from scenes.specs.channel import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from twin.monitor.state_reading import StateReader
+from twin.sensors.poisson_numbers import poisson_numbers
 
 STATES, QUICK_STATES = 200, 25
 FRAMES = 9
 ROUNDS, MOST_ROUNDS = 3, 10
-LIMIT_MS = 20.0
+LIMIT_MS = 12.0
 """Wall time on two cores."""
+LIMIT_ONE_MS, LIMIT_FRAMES_MS = 45.0, 60.0
+"""Wall time of one state alone: from expected images, and with nine noisy frames."""
+LIMIT_POISSON_NS = 20.0
 
 
 def random_states(count: int, seed: int) -> list[State]:
@@ -49,10 +54,30 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     spent = in_turns({"batch": Work(batch)}, rounds, most, quiet)["batch"]
     assert sum(len(recovery.after) for _, recovery in spent.result) == count
     wall, cpu = 1e3 * spent.wall_s / count, 1e3 * spent.cpu_s / count
+    reader = StateReader(setup, FRAMES, 1)
+
+    def one(noise: bool) -> Work:
+        return Work(lambda state: reader.read(state, noise), lambda: random_states(1, 3)[0], 1 if quick else 10)
+
+    def quick_enough(best: Mapping[str, Spent]) -> bool:
+        return 1e3 * best["one"].wall_s <= LIMIT_ONE_MS and 1e3 * best["frames"].wall_s <= LIMIT_FRAMES_MS
+
+    for noise in (True, False):
+        reader.read(states[0], noise)
+    alone = in_turns({"one": one(False), "frames": one(True)}, rounds, most, quick_enough)
+    light = setup.nominal_photons * setup.detector.quantum_efficiency
+    rng = np.random.Generator(np.random.SFC64(1))
+    drawn = in_turns({"numbers": Work(lambda _: [poisson_numbers(one, FRAMES, rng) for one in light])}, rounds)
+    numbers = 1e9 * drawn["numbers"].cpu_s / (FRAMES * light.size)
     return Speed(
         (
             Number("states_per_s", 1e3 / wall, f"monitor states, batch of {count}", "states/s"),
             Number("ms_per_state", wall, "  wall time of a state", "ms", Limit(LIMIT_MS)),
             Number("cpu_ms_per_state", cpu, "  processor time of a state", "ms"),
+            Number("one_ms", 1e3 * alone["one"].wall_s, "  one alone, expected images", "ms", Limit(LIMIT_ONE_MS)),
+            Number(
+                "frames_ms", 1e3 * alone["frames"].wall_s, "  one alone, noisy frames", "ms", Limit(LIMIT_FRAMES_MS)
+            ),
+            Number("poisson_ns", numbers, "  a Poisson number, processor time", "ns", Limit(LIMIT_POISSON_NS)),
         )
     )

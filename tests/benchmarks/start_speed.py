@@ -16,7 +16,7 @@ from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 
 ROOT = Path(__file__).resolve().parents[2]
-COLD_S, WARM_S, START_S = 25.0, 8.0, 2.0
+COLD_S, WARM_S, START_S = 12.0, 4.0, 2.0
 PROGRAMS = (
     *("twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.compare"),
     *("twin.doctor", "twin.live", "twin.recover", "scenes.schema", "analysis.mtf"),

@@ -163,3 +163,10 @@ def test_a_mean_that_hardly_changes_changes_hardly_a_number() -> None:
     assert changed.max() <= 1.0
     assert stats.poisson(10.0).cdf(changed.sum()) > FALSE_ALARM
     assert stats.poisson(10.0).sf(changed.sum() - 1) > FALSE_ALARM
+
+
+@pytest.mark.parametrize("kind", [np.random.SFC64, np.random.PCG64, np.random.MT19937, np.random.Philox])
+def test_any_generator_will_do(kind) -> None:
+    """Also one whose own words have 32 bits."""
+    number = poisson_numbers(np.full(100_000, 6.0), 2, np.random.Generator(kind(5)))
+    assert chi_square(number.ravel(), 6.0) > FALSE_ALARM

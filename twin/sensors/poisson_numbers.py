@@ -44,6 +44,7 @@ _SHIFT = np.uint64(64 - _BITS)
 _MOST = 120
 """Numbers in the table: beyond it lies 1e-31 of the largest mean's distribution, less than the last cell of u."""
 _UNDECIDED = 255
+_LAST = 2**64 - 1
 _INTERPOLATED = 1.01 * (1.0 / _CELLS_PER_UNIT) ** 2 / 8.0
 """Largest error of a linear interpolation of F between two means of the table: dF/dm = -p(n), the second derivative is
 p(n) - p(n - 1) and so nowhere larger than 1."""
@@ -102,7 +103,8 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
     step = max(1, _ROOM // max(flat.size, 1))
     for start in range(0, count, step):
         piece = out[start : start + step]
-        plan.fill(piece, rng.bit_generator.random_raw(piece.size).reshape(piece.shape))
+        # not the raw words, which some bit generators have of 32 bits
+        plan.fill(piece, rng.integers(0, _LAST, piece.shape, dtype=np.uint64, endpoint=True))
     huge = np.flatnonzero(flat >= SERIES_END)
     if huge.size:
         out[:, huge] = rng.poisson(flat[huge], (count, huge.size))

@@ -1,0 +1,93 @@
+"""One state of an instrument at a time, without what does not change from state to state: for programs that answer a
+hand.
+
+The numbers are those of ``python -m twin.render`` for the same state, frames and seed, to the bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from analysis.monitor.recovery import Recovery, measure_spots, recovery_of
+from analysis.spots.centroid import mean_frames
+from analysis.spots.spot_positions import SpotPositions, difference_covariance
+from optics.geometry.tree import State
+from optics.numerics.threads import one_blas_thread
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth, trace_truth
+
+__all__ = ["StateReader", "StateReading"]
+
+
+@dataclass(frozen=True, eq=False)
+class StateReading:
+    """What one state does and what its images say.
+
+    Attributes:
+        truth: of this one state.
+        photons: expected photons per pixel and frame, (C, rows, columns).
+        frames: uint16 (C, frames, rows, columns); None without noise.
+        recovery: of this one state; without noise its sigmas are those that the noise of the frames would give.
+    """
+
+    truth: Truth
+    photons: np.ndarray
+    frames: np.ndarray | None
+    recovery: Recovery
+
+
+class StateReader:
+    """Reads states of an instrument that is built and calibrated once.
+
+    Args:
+        experiment: the instrument, with its job's stated disturbances.
+        frames: of each exposure.
+        seed: of all noise.
+        centroid: as of ``analysis.monitor.recovery.recover``.
+    """
+
+    def __init__(self, experiment: MonitorExperiment, frames: int, seed: int, centroid: str = "ml") -> None:
+        self.experiment, self.frames, self.seed, self.centroid = experiment, frames, seed, centroid
+
+    @cached_property
+    def before(self) -> np.ndarray:
+        """Frames of the unperturbed instrument, uint16 (C, frames, rows, columns)."""
+        return self.experiment.frames_before(self.frames, self.seed)
+
+    @cached_property
+    def _spots_before(self) -> SpotPositions:
+        return self._spots(mean_frames(self.before))
+
+    @cached_property
+    def _clean_before(self) -> SpotPositions:
+        return self._spots(self.experiment.expected_frames(self.experiment.nominal_photons))
+
+    def read(self, state: State, noise: bool = True) -> StateReading:
+        """Trace, render and recover a state.
+
+        Args:
+            state: body -> motion, as of ``MonitorExperiment.state``.
+            noise: expose frames; else the expected images are measured.
+
+        Raises:
+            BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD; where, is in the message.
+            SpotError: a spot cannot be measured.
+        """
+        experiment = self.experiment
+        with one_blas_thread():
+            truth = trace_truth(experiment.instrument, experiment.backend, [state])
+            photons = experiment.path.expected_photons([state], single=False)
+            frames = experiment.frames_after(photons, self.frames, self.seed)[0] if noise else None
+            mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
+            first, second = self._clean_before if frames is None else self._spots_before, self._spots(mean)
+            calibration, stated = experiment.calibration, experiment.disturbances
+            spread = difference_covariance(first, second, calibration.noise)
+            recovery = recovery_of(first, second, spread, calibration, stated)
+        return StateReading(truth, photons[0], frames, recovery)
+
+    def _spots(self, mean: np.ndarray) -> SpotPositions:
+        """Of mean frames or expected images (C, rows, columns), grey values."""
+        return measure_spots(mean, self.frames, self.experiment.calibration, self.centroid)
