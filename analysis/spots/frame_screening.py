@@ -247,12 +247,16 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     light, level, sigmas = np.empty((3, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     z = np.empty_like(values)
+    # of a median the same for all frames that have not moved
+    still = _basis(reference[0]) if count > 2 else None
     for k, frame in enumerate(values):
         weight = usable[k] / (excess * noise.temporal_variance_dn2(reference[k], 1))
         place = np.zeros(2)
         for _ in range(_MOST_MOVES):
-            shifted = ndimage.shift(reference[k], place, order=3, mode="nearest") if np.any(place) else reference[k]
-            basis = _basis(shifted)
+            if np.any(place):
+                basis = _basis(ndimage.shift(reference[k], place, order=3, mode="nearest"))
+            else:
+                basis = _basis(reference[k]) if still is None else still
             solution, inverse = _robust(basis, frame, weight)
             # of frames without light nothing can be said
             share = max(abs(float(solution[0])), _LEAST_SHARE)

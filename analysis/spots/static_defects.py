@@ -117,30 +117,31 @@ def examine(
         SpotError: no spot, or it cannot be measured.
     """
     mean = screened.mean
-    start = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
-    good = start
+    rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
+    good = screened.good & ~rough
     smeared = (vibration or bool(np.any(screened.jitter))) and not own
     terms = FitTerms()
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
-    dirty = not screened.clean or not np.array_equal(good, screened.good)
+    dirty = not screened.clean
     fit = _fitted(screened, good, noise, template, terms)
     # what is gross first, lest it is taken for smear or for another spot
-    for rough in (True, False):
-        if not rough and smeared:
+    for gross in (True, False):
+        if not gross and smeared:
             terms = replace(terms, smear=True)
             fit = _fitted(screened, good, noise, template, terms, fit)
         for _ in range(_ROUNDS if searched else 0):
             before = good, terms
-            least = (_GROSS if smeared else 1.0) * limit if rough else CLOSER if dirty else limit
-            # found anew every time: an earlier fit may have been wrong
+            least = (_GROSS if smeared else 1.0) * limit if gross else CLOSER if dirty else limit
+            # found anew every time: an earlier fit may have been wrong, and so may the coarse look before there was one
+            start = screened.good & ~(rough & (np.abs(mean - fit.level) > least * np.sqrt(fit.variance)))
             found = _outliers(mean, fit, start, least)
             lines = _lines(mean, fit, start & ~found, screened.good & (~start | found))
             good = start & ~found & ~lines & ~edges
-            dirty = dirty or bool(np.any(found | lines))
+            dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
                 fit = _fitted(screened, good, noise, template, terms, fit)
-            if not own and not rough:
+            if not own and not gross:
                 terms, fit = _uneven(screened, good, noise, template, terms, fit)
                 terms, fit, edge = _others(screened, good, noise, template, terms, fit)
                 edges, good = edges | edge, good & ~edge
@@ -214,7 +215,8 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     filled = spot_image.filled(mean, screened.good)
     smooth = ndimage.median_filter(filled, 5)
     sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
-    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    # wide enough to reach from a dark ring into the bright ones beside it
+    steep = ndimage.maximum_filter(smooth, 7) - ndimage.minimum_filter(smooth, 7)
     out = np.abs(mean - smooth) > _ROUGH_SIGMAS * sigma + steep
     top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
     row, column = np.indices(mean.shape)
@@ -261,7 +263,7 @@ def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
         z = np.moveaxis((mean - fit.level) / sigma, axis, 0)[far]
         used = np.moveaxis(good, axis, 0)[far]
         count = np.count_nonzero(used, axis=0)
-        middle = np.array([np.median(z[used[:, k], k]) if count[k] else 0.0 for k in range(lines)])
+        middle = _medians(z, used, count)
         spread = np.sqrt(math.pi / 2.0 / np.maximum(count, 1))
         limit = float(norm.isf(FALSE_ALARM / (2.0 * lines)))
         use = count > 0.25 * len(z)
@@ -280,6 +282,17 @@ def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
             off[worst] = True
         out |= np.expand_dims(off, axis)
     return np.asarray(out & good)
+
+
+def _medians(values: Array, used: Mask, count: NDArray[np.intp]) -> Array:
+    """Median of the used values of every column; 0 where there are none."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=0)
+    low, high = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
+    column = np.arange(values.shape[1])
+    middle = np.zeros(values.shape[1])
+    some = count > 0
+    middle[some] = 0.5 * (ordered[low, column] + ordered[high, column])[some]
+    return middle
 
 
 def _uneven(
