@@ -27,7 +27,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "one_shape"]
+__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -74,6 +74,8 @@ class ScreenedFit:
         cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
             stood still, minus 1.
         missing: the same without what movement between frames does.
+        theta: (K,) all parameters: row, column, flux, level, then those of what else is fitted; px, DN, px^2.
+        inverse: (K, K) inverse of their information.
     """
 
     positions: SpotPositions
@@ -88,6 +90,8 @@ class ScreenedFit:
     core: tuple[float, int]
     cost: float
     missing: float
+    theta: Array
+    inverse: Array
 
     def residual(self, mean: Array) -> Array:
         """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
@@ -163,6 +167,23 @@ def fit_screened(
         raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
 
 
+def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
+    """Of the fitted image: its derivatives (K, P) by all parameters, what of it is neither the spot nor its level (P,)
+    DN, and the derivatives (K, P) of that.
+
+    Args:
+        fit: of a spot.
+        template: the spot's one shape.
+    """
+    model = _Model(template, fit.terms, *fit.level.shape)
+    design, _ = model.design(fit.theta)
+    alone = fit.theta.copy()
+    alone[2:4] = 0.0
+    beside, extra = model.design(alone)
+    beside[:4] = 0.0
+    return design, extra, beside
+
+
 def _fit(
     mean: Array,
     counts: Array,
@@ -234,6 +255,8 @@ def _fit(
         core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
         cost=_cost(design[:4], level, frames, noise, temporal + moved + fixed),
         missing=_cost(design[:4], level, frames, noise, temporal + fixed),
+        theta=theta,
+        inverse=inverse,
     )
 
 
