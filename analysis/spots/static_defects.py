@@ -102,6 +102,7 @@ def examine(
     vibration: bool = False,
     own: bool = False,
     searched: bool = True,
+    first: tuple[int, int] = (0, 0),
 ) -> Examined:
     """Find what is in an image beside the spot.
 
@@ -112,6 +113,7 @@ def examine(
         vibration: whether smear is fitted.
         own: whether the shape was learnt from this very image, so that residuals of it say nothing.
         searched: whether anything is looked for; else what is known already is left out and fitted.
+        first: row and column of the detector at which the image begins; findings tell places on the detector.
 
     Raises:
         SpotError: no spot, or it cannot be measured.
@@ -149,7 +151,7 @@ def examine(
             if np.array_equal(good, before[0]) and terms == before[1]:
                 break
     bad = screened.good & ~good & ~edges
-    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit)))
+    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit, first)))
 
 
 def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
@@ -404,34 +406,30 @@ def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTempl
     return None
 
 
-def _told(bad: Mask, edges: Mask, fit: ScreenedFit) -> list[Finding]:
-    """What was found, in words."""
+def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> list[Finding]:
+    """What was found, in words; places count on the detector."""
     out = []
     full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
     along = np.zeros_like(bad)
     along[:, full[0]] = along[full[1]] = True
     single = int(np.count_nonzero(bad & ~along))
     if single:
-        where = np.argwhere(bad & ~along)[:3]
+        where = np.argwhere(bad & ~along)[:3] + first
         shown = ", ".join(f"({r}, {c})" for r, c in where)
         more = ", ..." if single > 3 else ""
         out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
-    for numbers, name in zip(full, ("columns", "rows"), strict=True):
+    for numbers, begin, name in zip(full, first[::-1], ("columns", "rows"), strict=True):
         if numbers.size:
-            shown = ", ".join(map(str, numbers[:5]))
+            shown = ", ".join(map(str, numbers[:5] + begin))
             out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
     if fit.terms.background:
         what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
         rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
         out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
-        out.append(
-            Finding(
-                "second light",
-                f"at row {row:.1f}, column {column:.1f} with {100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light; "
-                "it is fitted",
-            )
-        )
+        place = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
+        light = f"{100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light"
+        out.append(Finding("second light", f"{place} with {light}; it is fitted"))
     if np.any(edges):
         out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
     if fit.terms.smear:

@@ -12,7 +12,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.resolved import resolve_job
-from tests.twin.dirty_frames import KINDS, draw, measurement
+from tests.twin.dirty_frames import KINDS, clean_scene, draw, measurement, record
 
 SETS = 200
 FALSE_ALARM = 1e-3
@@ -97,6 +97,26 @@ def test_clean_frames_are_not_touched(bench):
             assert spot.clean
             assert spot.cost == 0.0
             assert spot.used.all()
+
+
+def test_findings_tell_places_on_the_ccd(bench):
+    """Of a part of the CCD that was read out, too: a pixel, a column and a reflection have the same places as in all of
+    it.
+    """
+    template, detector, noise = bench
+    rng = np.random.default_rng(8)
+    scene = clean_scene((47.0, 48.0), template.shape)
+    scene.static[30, 21], scene.dead[:, 62], scene.others = 3e4, True, [(60.3, 37.6, 0.03)]
+    frames = record(scene, template, detector, detector.fixed_pattern(template.shape, 3), rng)
+    part = np.s_[:, 9:93, 6:90]
+    with one_blas_thread():
+        whole = examine(screen_frames(frames, noise), noise, template)
+        cut = examine(screen_frames(frames[part], noise), noise, one_shape(template, 0, (84, 84)), first=(9, 6))
+    told = [{one.kind: one.text for one in found.findings} for found in (whole, cut)]
+    for texts in told:
+        assert "(30, 21)" in texts["bad pixels"]
+        assert texts["bad columns"].startswith("62 ")
+        assert "at row 60.3, column 37.6" in texts["second light"]
 
 
 @pytest.mark.parametrize("seed", [18, 139, 154])

@@ -200,7 +200,7 @@ class ChannelMeasurement:
         if not self._searches and not fitted and np.all(screened.good):
             return None
         own = self._learnt and number == 0
-        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches)
+        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches, state.offset)
 
     def measure(self) -> list[Issue]:
         """Measure the spot in every state; what is refused."""

@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 from twin.main_job.series_plots import time_unit
 from twin.main_job.spot_plots import DIVERGING, GRAY, cross, stretch
 from twin.recover.channel_measurement import SpotResult
-from twin.recover.recover_run import RecoverRun
+from twin.recover.recover_run import RecoverRun, state_name
 from twin.run.svg import AFTER, BEFORE, BLUE, INK, LIGHT, ORANGE, SKY, look, new_figure, plain_axes, to_svg
 
 LIMIT = 5.0
@@ -30,8 +30,8 @@ def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, Spo
             continue
         r = run.last.recovery
         states = result.states()
-        last = states[-1]
-        out.append((side, [("before", states[0][1], r.before[0, i]), (last[0], last[1], r.after[0, i])]))
+        name = state_name(run.times, len(states) - 1)
+        out.append((side, [("before", states[0][1], r.before[0, i]), (name, states[-1][1], r.after[0, i])]))
     return out
 
 

@@ -15,7 +15,7 @@ from twin.main_job.monitor_reading import MonitorReading, stated
 from twin.main_job.report_labels import ANGLE, CENTROID_NOTES, GROUND, PARAMETERS, Parameter
 from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
-from twin.recover.recover_run import RecoverRun
+from twin.recover.recover_run import RecoverRun, state_name
 from twin.run.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.run.report import Report, Section, one_sentence
 
@@ -118,7 +118,11 @@ def _name(run: RecoverRun) -> str:
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
     """Sets of frames that were corrected, of how many, the dearest of them and whose it is."""
-    every = [(result.channel.name, name, spot) for result in run.channels for name, spot in result.states()]
+    every = [
+        (result.channel.name, state_name(run.times, k), spot)
+        for result in run.channels
+        for k, (_, spot) in enumerate(result.states())
+    ]
     dirty = [one for one in every if not one[2].clean]
     if not dirty:
         return 0, len(every), None, ""
@@ -247,7 +251,7 @@ def _spots(run: RecoverRun) -> Section:
     heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "found and corrected", "cost in σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):
-        for k, (name, spot) in enumerate(result.states()):
+        for k, (_, spot) in enumerate(result.states()):
             r = run.readings[max(k - 1, 0)].recovery
             place, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
             digits = decimals_for(float(sigma[0, i].min()))
@@ -256,7 +260,7 @@ def _spots(run: RecoverRun) -> Section:
             rows.append(
                 [
                     result.channel.name,
-                    name,
+                    state_name(run.times, k),
                     len(spot.frames.frames),
                     fixed(float(place[0, i, 0]), digits),
                     fixed(float(place[0, i, 1]), digits),

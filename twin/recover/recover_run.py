@@ -20,6 +20,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.channel import SIDES
+from scenes.specs.course import moment
 from scenes.specs.measured.monitor_frames_setup import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.main_job.monitor_reading import MonitorReading
@@ -32,7 +33,7 @@ from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_mea
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector
 
-__all__ = ["RecoverRun", "run_recover"]
+__all__ = ["RecoverRun", "run_recover", "state_name"]
 
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
@@ -131,7 +132,9 @@ def run_recover(
         tables = bench.crosstalk(one) if tables is None else tables
         frames = min(len(result.channel.after[k].frames) for result in results)
         readings.append(MonitorReading(names, bench.cameras, ground, bench.disturbances, one, tables, frames, centroid))
-    return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, (*bench.warnings, *_unlike(results)))
+    return RecoverRun(
+        setup, tuple(readings), results, bench.pitch, smoothed, (*bench.warnings, *_unlike(results, setup.test.times))
+    )
 
 
 def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
@@ -285,16 +288,34 @@ def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], err
     return out
 
 
-def _unlike(results: Sequence[ChannelResult]) -> tuple[str, ...]:
-    """Spots whose core is not as calibrated."""
+def state_name(times: Sequence[float] | None, number: int) -> str:
+    """How a reader knows a state: of a series by its time.
+
+    Args:
+        times: of a series, seconds; None for a single state after.
+        number: 0 for the nominal state, from 1 on those after it.
+    """
+    if number == 0:
+        return "before"
+    return "after" if times is None else f"at {moment(times[number - 1])}"
+
+
+def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None) -> tuple[str, ...]:
+    """Spots whose core is not as calibrated; of a series the worst of each channel."""
     out = []
     for result in results:
-        for name, spot in result.states():
-            if not spot.fits and spot.core is not None:
-                out.append(
-                    f"{result.channel.name} {name}: the spot has not the calibrated shape, reduced chi-square of its"
-                    f" core {spot.core[0]:.2f} over {spot.core[1]} pixels: defocus, a reflection too near to be told"
-                    " apart, or vibration, which `vibration: fitted` allows for; sigma does not hold what it does to"
-                    " the place"
-                )
+        found = [
+            (spot.core[0], spot.core[1], state_name(times, k))
+            for k, (_, spot) in enumerate(result.states())
+            if not spot.fits and spot.core is not None
+        ]
+        if not found:
+            continue
+        chi, pixels, state = max(found)
+        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
+        out.append(
+            f"{result.channel.name} {state}{others}: the spot has not the calibrated shape, reduced chi-square of its"
+            f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
+            " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        )
     return tuple(out)
