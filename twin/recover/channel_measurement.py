@@ -10,7 +10,7 @@ from analysis.monitor.calibration import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import mean_frames
 from analysis.spots.frame_screening import Finding, FramesError, ScreenedFrames, screen_frames
-from analysis.spots.learnt_template import learn_template
+from analysis.spots.learnt_template import learn_template, without_slopes
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.repaired_image import repaired_centroid
@@ -51,6 +51,7 @@ class SpotResult:
         cost: sigma of the place over what it would be without what was found, minus 1.
         core: reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
         fits: whether the core has the calibrated shape.
+        noise_ratio: noise of the frames over the stated one; None where they agree.
     """
 
     frames: StateFrames
@@ -61,6 +62,7 @@ class SpotResult:
     cost: float
     core: tuple[float, int] | None = None
     fits: bool = True
+    noise_ratio: float | None = None
 
     @property
     def clean(self) -> bool:
@@ -191,6 +193,7 @@ class ChannelMeasurement:
             if np.any(lone):
                 told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise off are left out")
                 screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
+            screened = without_slopes(screened, self.channel.noise)
         return screened, learn_template(screened, self.channel.noise)
 
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
@@ -281,6 +284,7 @@ class ChannelMeasurement:
                     cost=self._costs.get(number, 0.0),
                     core=None if fit is None else fit.core,
                     fits=fit is None or (self._learnt and number == 0) or fit.core_fits,
+                    noise_ratio=screened.noise_ratio,
                 )
             )
         return ChannelResult(self.channel, spots[0], tuple(spots[1:]))

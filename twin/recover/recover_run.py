@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -132,9 +133,12 @@ def run_recover(
         tables = bench.crosstalk(one) if tables is None else tables
         frames = min(len(result.channel.after[k].frames) for result in results)
         readings.append(MonitorReading(names, bench.cameras, ground, bench.disturbances, one, tables, frames, centroid))
-    return RecoverRun(
-        setup, tuple(readings), results, bench.pitch, smoothed, (*bench.warnings, *_unlike(results, setup.test.times))
-    )
+    times = setup.test.times
+    source = f"the data sheet {setup.detector.name} says"
+    if setup.test.photon_transfer == "measured":
+        source = "the frames in the dark and in even light say"
+    warnings = (*bench.warnings, *_unlike(results, times), *_noisy(results, times, source))
+    return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 
 
 def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
@@ -317,5 +321,27 @@ def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None) -> 
             f"{result.channel.name} {state}{others}: the spot has not the calibrated shape, reduced chi-square of its"
             f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
             " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        )
+    return tuple(out)
+
+
+def _noisy(results: Sequence[ChannelResult], times: Sequence[float] | None, source: str) -> tuple[str, ...]:
+    """Frames that have another noise than is stated; of a series the worst of each channel."""
+    out = []
+    for result in results:
+        found = [
+            (abs(math.log(spot.noise_ratio)), spot.noise_ratio, state_name(times, k))
+            for k, (_, spot) in enumerate(result.states())
+            if spot.noise_ratio is not None
+        ]
+        if not found:
+            continue
+        _, ratio, state = max(found)
+        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
+        out.append(
+            f"{result.channel.name} {state}{others}: beside the spot the frames are {ratio:.2f} times as noisy as {source}"
+            ": another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and the search"
+            " for defects rest on it: name the right `detector`, or measure it with dark and flat frames and"
+            " `photon_transfer: measured`"
         )
     return tuple(out)
