@@ -45,7 +45,7 @@ third."""
 _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
 """By which the noise of frames may differ from the stated one, as a share of that; and where single differences are cut
 off, for cosmic rays."""
-_LIT = 0.1
+_LIT = 0.02
 """Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
 _MEDIAN = math.pi / 2.0
 """Variance of a median over that of a mean, of many normal numbers."""

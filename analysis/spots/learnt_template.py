@@ -26,6 +26,8 @@ MARGIN_PX = 40
 """By which the shape is larger than the image, so that it can be shifted over it."""
 _TAPER_PX = 4
 _CORE = 0.05
+_LOOKS, _FILLS = 3, 40
+"""How often the frequencies of the light are looked for, and steps by which missing pixels are filled with them."""
 _UNEVEN = 0.5
 """Rms of a slope, in sigmas of a pixel, from which it is the background's; rings of the spot at the edge make less."""
 
@@ -76,7 +78,11 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
     _, _, background, peak, _ = spot_image.coarse(image[None], frames, noise)
     edge = _edge(image.shape)
     level = float(np.median(image[edge & screened.good])) if np.any(edge & screened.good) else float(background[0])
-    light = _without_noise(image - level, noise.temporal_variance_dn2(image, 1) / screened.counts)
+    variance = noise.temporal_variance_dn2(image, 1) / screened.counts
+    light = image - level
+    if not np.all(screened.good):
+        light = _completed(light, screened.good, variance)
+    light = _without_noise(light, variance)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)
     if not core.sum() > 0.0:
@@ -94,6 +100,25 @@ def _taper(shape: tuple[int, ...]) -> Array:
         away = np.minimum(np.arange(size) + 1, size - np.arange(size)) / (_TAPER_PX + 1.0)
         parts.append(0.5 - 0.5 * np.cos(np.pi * np.minimum(away, 1.0)))
     return np.outer(*parts)
+
+
+def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> Array:
+    """The image with its holes filled by what the light in the other pixels says, which optics let through up to a
+    frequency only: the hole takes the value of the low-passed image again and again (Papoulis, IEEE Trans. Circuits
+    Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)).
+    """
+    frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
+    ring = np.rint(frequency * min(light.shape)).astype(np.intp)
+    for _ in range(_LOOKS):
+        # holes that are not filled well yet make noise of all frequencies
+        power = np.abs(np.fft.fft2(light)) ** 2
+        middle = np.array([np.median(power[ring == k]) for k in range(int(ring.max()) + 1)])
+        noise = max(float(variance.sum()), 2.0 * float(np.median(middle[3 * middle.size // 4 :])))
+        dark = np.flatnonzero(middle < 2.0 * noise)
+        passed = ring < (int(dark[0]) if dark.size else middle.size)
+        for _ in range(_FILLS):
+            light = np.where(good, light, np.real(np.fft.ifft2(np.where(passed, np.fft.fft2(light), 0.0))))
+    return light
 
 
 def _without_noise(light: Array, variance: Array) -> Array:

@@ -109,11 +109,20 @@ class ScreenedFit:
         """
         return float(np.square(self.residual(mean)).sum())
 
-    @property
-    def core_fits(self) -> bool:
-        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6."""
+    def core_fits(self, learnt_from: ScreenedFit | None = None) -> bool:
+        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6.
+
+        Args:
+            learnt_from: the fit to the image that the shape was learnt from, whose noise is in the shape, too; None for
+                a shape without noise.
+        """
         value, count = self.core
-        return value * count <= chi2.isf(1e-6, max(count - 4, 1))
+        spread = 1.0
+        if learnt_from is not None:
+            # at the peak, where the noise is that of the light
+            first, own = (float(one.variance.flat[int(np.argmax(one.level))]) for one in (learnt_from, self))
+            spread += first / own * float(self.positions.flux[0] / learnt_from.positions.flux[0]) ** 2
+        return value / spread * count <= chi2.isf(1e-6, max(count - 4, 1))
 
 
 def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:

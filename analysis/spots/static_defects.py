@@ -138,7 +138,9 @@ def examine(
             # found anew every time: an earlier fit may have been wrong, and so may the coarse look before there was one
             start = screened.good & ~(rough & (np.abs(mean - fit.level) > least * np.sqrt(fit.variance)))
             found = _outliers(mean, fit, start, least)
-            lines = _lines(mean, fit, start & ~found, screened.good & (~start | found))
+            place = float(fit.positions.row[0]), float(fit.positions.column[0])
+            z = (mean - fit.level) / np.sqrt(fit.variance)
+            lines = _lines(z, place, start & ~found, screened.good & (~start | found))
             good = start & ~found & ~lines & ~edges
             dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
@@ -167,7 +169,10 @@ def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     variance = noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     found = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
-    return np.asarray(screened.good & (~good | found))
+    top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
+    residual = (mean - smooth) / np.sqrt(variance + (_STEEP * steep) ** 2)
+    lines = _lines(residual, (float(top[0]), float(top[1])), good & ~found, screened.good & (~good | found))
+    return np.asarray(screened.good & (~good | found | lines))
 
 
 def refit(
@@ -251,18 +256,17 @@ def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
     return found
 
 
-def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
-    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted.
+def _lines(residual: Array, place: tuple[float, float], good: Mask, bad: Mask) -> Mask:
+    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted, by residuals in
+    standard deviations.
 
     A line is held against its neighbours, in the median of its pixels away from the spot.
     """
     out = np.zeros_like(good)
-    sigma = np.sqrt(fit.variance)
-    place = fit.positions.row[0], fit.positions.column[0]
     for axis in (0, 1):
         size, lines = good.shape[axis], good.shape[1 - axis]
         far = np.abs(np.arange(size) - place[axis]) > _NEAR_SPOT_PX
-        z = np.moveaxis((mean - fit.level) / sigma, axis, 0)[far]
+        z = np.moveaxis(residual, axis, 0)[far]
         used = np.moveaxis(good, axis, 0)[far]
         count = np.count_nonzero(used, axis=0)
         middle = _medians(z, used, count)

@@ -12,7 +12,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.resolved import resolve_job
-from tests.twin.dirty_frames import KINDS, clean_scene, draw, measurement, record
+from tests.twin.dirty_frames import KINDS, Drawn, clean_scene, draw, measurement, record, replace
 
 SETS = 200
 FALSE_ALARM = 1e-3
@@ -40,7 +40,7 @@ def bench(experiment):
     return one_shape(calibration.template, 0, calibration.template.shape), pair.detector, calibration.noise
 
 
-def squares(bench, kinds, seeds, centroid="ml"):
+def squares(bench, kinds, seeds, centroid="ml", learnt=False):
     """Chi-square of every corrected shift against the truth (two coordinates), and the findings of each set."""
     template, detector, noise = bench
     out, told = [], []
@@ -48,7 +48,8 @@ def squares(bench, kinds, seeds, centroid="ml"):
         for seed in seeds:
             drawn = draw(template, detector, kinds, seed)
             analysis = AnalysisSpec(centroid=centroid)
-            work = measurement(drawn, template, noise, "vibration" in kinds, analysis=analysis)
+            shape = None if learnt else template
+            work = measurement(drawn, template, noise, "vibration" in kinds, shape, analysis=analysis)
             assert work.search() == []
             assert work.measure() == []
             first, second = work.positions
@@ -165,6 +166,63 @@ def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
                 assert found.clean, [f"{one.kind}: {one.text}" for one in found.findings]
                 measured += 1
     assert measured > 12
+
+
+@pytest.mark.parametrize("kind", ["clean", "bad pixels", "background"])
+def test_a_learnt_shape_is_that_of_the_spot_alone(bench, kind):
+    """Without a model the shape is learnt from the frames before: holes in these, a column through the spot among them,
+    are filled by the frequencies that optics let through; slopes of the background do not go with the spot.
+    """
+    seeds = range(28, 32) if kind == "bad pixels" else range(2)
+    found, told = squares(bench, () if kind == "clean" else (kind,), seeds, learnt=True)
+    assert found.sum() < chi2.isf(1e-6, 2 * len(found))
+    # the noise of the shape is no other shape
+    assert all(spot.fits for spots in told for spot in spots)
+
+
+def test_another_spot_is_told_with_a_learnt_shape_as_well(bench):
+    """The test of the core still finds what is no noise: a spot after of 1.1 px more smear."""
+    template, detector, noise = bench
+    rng = np.random.default_rng(5)
+    scenes = [clean_scene((47.0, 48.0), template.shape) for _ in range(2)]
+    scenes[1].smear = 1.2 * np.eye(2)
+    pattern = detector.fixed_pattern(template.shape, 3)
+    before, after = (record(scene, template, detector, pattern, rng) for scene in scenes)
+    with one_blas_thread():
+        work = measurement(Drawn(before, after, np.zeros(2)), template, noise, shape=None)
+        assert work.search() == []
+        assert work.measure() == []
+    assert not work.result().after[0].fits
+
+
+def test_frames_of_another_noise_than_stated_are_told(bench):
+    """The ratio is that of the noises beside the spot; the right one is left alone, also with few frames of a small
+    part, and dirt is not taken for it.
+    """
+    template, detector, noise = bench
+    drawn = draw(template, detector, (), 4)
+    stated = replace(noise, dark_noise_e=0.6 * noise.dark_noise_e)
+    own, other = (float(one.temporal_variance_dn2(one.dark_level_dn, 1)) for one in (noise, stated))
+    found = screen_frames(drawn.before, stated).noise_ratio
+    # differences beyond 4 stated sigmas, 2.5 true ones, are cut off, 4 %; and rings have shot noise that is stated right
+    assert found == pytest.approx(np.sqrt(own / other), rel=0.1)
+    assert screen_frames(drawn.before, replace(noise, dark_noise_e=2.0 * noise.dark_noise_e)).noise_ratio < 0.6
+    for frames in (drawn.before, drawn.before[:2], drawn.before[:3, 30:66, 30:66], drawn.before[:1]):
+        assert screen_frames(frames, noise).noise_ratio is None
+    for kind in KINDS:
+        dirty = draw(template, detector, (kind,), 1000)
+        assert screen_frames(dirty.before, noise).noise_ratio is None
+        assert screen_frames(dirty.after, noise).noise_ratio is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["bad pixels", "cosmic rays", "background", "missing frames"])
+def test_sigmas_hold_with_a_learnt_shape(bench, kind):
+    """200 sets as well."""
+    found, told = squares(bench, (kind,), range(SETS), learnt=True)
+    low, high = (chi2.isf(p, 2 * SETS) for p in (1.0 - FALSE_ALARM / 2.0, FALSE_ALARM / 2.0))
+    assert low < found.sum() < high
+    assert all(spot.fits for spots in told for spot in spots)
 
 
 @pytest.mark.slow

@@ -270,6 +270,9 @@ class ChannelMeasurement:
     def result(self) -> ChannelResult:
         """What was found."""
         spots = []
+        # of a learnt shape the frames before have been fitted, too, for they were searched
+        first = self._examined[0] if self._learnt else None
+        learnt = None if first is None else first.fit
         for number, state in enumerate(self.channel.states):
             examined, screened = self._examined[number], self._screened[number]
             fit = None if examined is None else examined.fit
@@ -283,7 +286,7 @@ class ChannelMeasurement:
                     findings=findings,
                     cost=self._costs.get(number, 0.0),
                     core=None if fit is None else fit.core,
-                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits,
+                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits(learnt),
                     noise_ratio=screened.noise_ratio,
                 )
             )

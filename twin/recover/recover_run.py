@@ -339,9 +339,9 @@ def _noisy(results: Sequence[ChannelResult], times: Sequence[float] | None, sour
         _, ratio, state = max(found)
         others = f", the worst of {len(found)} states" if len(found) > 1 else ""
         out.append(
-            f"{result.channel.name} {state}{others}: beside the spot the frames are {ratio:.2f} times as noisy as {source}"
-            ": another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and the search"
-            " for defects rest on it: name the right `detector`, or measure it with dark and flat frames and"
-            " `photon_transfer: measured`"
+            f"{result.channel.name} {state}{others}: beside the spot the frames are {ratio:.2f} times as noisy as"
+            f" {source}: another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and"
+            " the search for defects rest on it: name the right `detector`, or measure it with dark and flat frames"
+            " and `photon_transfer: measured`"
         )
     return tuple(out)
