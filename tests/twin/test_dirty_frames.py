@@ -204,7 +204,7 @@ def test_frames_of_another_noise_than_stated_are_told(bench):
     stated = replace(noise, dark_noise_e=0.6 * noise.dark_noise_e)
     own, other = (float(one.temporal_variance_dn2(one.dark_level_dn, 1)) for one in (noise, stated))
     found = screen_frames(drawn.before, stated).noise_ratio
-    # differences beyond 4 stated sigmas, 2.5 true ones, are cut off, 4 %; and rings have shot noise that is stated right
+    # differences beyond 4 stated sigmas, 2.5 true ones, are cut off, 4 %; rings have shot noise, which is stated right
     assert found == pytest.approx(np.sqrt(own / other), rel=0.1)
     assert screen_frames(drawn.before, replace(noise, dark_noise_e=2.0 * noise.dark_noise_e)).noise_ratio < 0.6
     for frames in (drawn.before, drawn.before[:2], drawn.before[:3, 30:66, 30:66], drawn.before[:1]):
