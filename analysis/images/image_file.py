@@ -8,6 +8,7 @@ TIFF and of a FITS file nothing but what is asked for is read.
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,6 +34,8 @@ GAMMAS = ("srgb", "1", "2.2")
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"
+_INSIDE = (struct.error, ArithmeticError, AssertionError, AttributeError, LookupError, TypeError)
+"""What readers of spoilt files stumble over; the words of these are about their own code."""
 
 
 @dataclass(frozen=True)
@@ -229,8 +232,14 @@ def _header(path: Path, page: int | None, choose: str) -> ImageHeader:
 
 
 def _reason(error: Exception) -> str:
-    """In one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """In one line, and without what only a reader's author can make something of."""
+    text = " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return "it does not fit into memory"
+    # a codec that is not installed is named by a ValueError
+    if isinstance(error, _INSIDE) or (isinstance(error, ValueError) and "requires" not in text):
+        return "it is damaged"
+    return text or "it is damaged"
 
 
 def tone_curve(gamma: str | None, full_scale: float) -> Callable[[Array], Array]:

@@ -42,6 +42,11 @@ _LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
 _MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
 """A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
 third."""
+_NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
+"""By which the noise of frames may differ from the stated one, as a share of that; and where single differences are cut
+off, for cosmic rays."""
+_LIT = 0.02
+"""Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
 _MEDIAN = math.pi / 2.0
 """Variance of a median over that of a mean, of many normal numbers."""
 
@@ -85,6 +90,8 @@ class ScreenedFrames:
         recorded: number of frames that there are.
         jitter: (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
         findings: what was found.
+        noise_ratio: noise of the frames beside the spot over what was stated; None where they do not differ by more
+            than matters, or where a single frame says nothing of it.
     """
 
     mean: Array
@@ -94,6 +101,7 @@ class ScreenedFrames:
     recorded: int
     jitter: Array
     findings: tuple[Finding, ...]
+    noise_ratio: float | None = None
 
     @property
     def clean(self) -> bool:
@@ -124,6 +132,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
     values = np.where(finite, values, 0.0)
     kept = _lit(values, finite & ~known, findings)
     hits = ~finite
+    ratio = None
     model = np.zeros_like(values)
     jitter = np.zeros((2, 2))
     if len(kept) > 1:
@@ -144,6 +153,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
             model[kept] = found.model
             findings += found.findings()
             jitter = found.jitter
+            ratio = found.noise_ratio
     saturated = _saturated(values[kept], noise) & ~known
     if np.any(saturated):
         findings.append(
@@ -161,7 +171,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
         mean = mean_frames(frames)
     else:
         mean = np.where(lost, model[kept], used).mean(axis=0)
-    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings))
+    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings), ratio)
 
 
 def _numbers(frames: NDArray[np.intp]) -> str:
@@ -207,6 +217,7 @@ class _Compared:
     offset: Array
     spread: Array
     jitter: Array
+    noise_ratio: float | None
 
     def unlike(self) -> Mask:
         """Which frames as a whole."""
@@ -247,12 +258,16 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     light, level, sigmas = np.empty((3, count))
     offset, spread = np.empty((count, 2)), np.empty((count, 2, 2))
     z = np.empty_like(values)
+    # of a median the same for all frames that have not moved
+    still = _basis(reference[0]) if count > 2 else None
     for k, frame in enumerate(values):
         weight = usable[k] / (excess * noise.temporal_variance_dn2(reference[k], 1))
         place = np.zeros(2)
         for _ in range(_MOST_MOVES):
-            shifted = ndimage.shift(reference[k], place, order=3, mode="nearest") if np.any(place) else reference[k]
-            basis = _basis(shifted)
+            if np.any(place):
+                basis = _basis(ndimage.shift(reference[k], place, order=3, mode="nearest"))
+            else:
+                basis = _basis(reference[k]) if still is None else still
             solution, inverse = _robust(basis, frame, weight)
             # of frames without light nothing can be said
             share = max(abs(float(solution[0])), _LEAST_SHARE)
@@ -271,7 +286,30 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     struck = z > threshold if count == 2 else np.abs(z) > threshold
     for k in range(count):
         hits[k] = _grown(struck[k], np.abs(z[k]) > GROWTH_SIGMAS)
-    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, _jitter(offset, spread, count))
+    moved = _jitter(offset, spread, count)
+    ratio = _noise_ratio(z * math.sqrt(excess), usable, model.mean(axis=0))
+    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, moved, ratio)
+
+
+def _noise_ratio(z: Array, usable: Mask, mean: Array) -> float | None:
+    """Noise of frames beside the spot over the stated one, by the differences of each to the next, of which the
+    reference is no part; None where they agree. Of two frames each is the other's reference, and their residuals differ
+    by twice as much.
+
+    Args:
+        z: (N, H, W) residuals in standard deviations of one frame.
+        usable: (N, H, W) pixels.
+        mean: (H, W) DN, of the models.
+    """
+    difference = np.diff(z, axis=0) / (math.sqrt(2.0) if len(z) > 2 else 2.0 * math.sqrt(2.0))
+    low = float(np.median(mean))
+    chosen = difference[usable[1:] & usable[:-1] & (mean < low + _LIT * (float(mean.max()) - low))]
+    if not chosen.size:
+        return None
+    ratio = math.sqrt(max(float(np.minimum(chosen**2, _MOST_SIGMAS**2).mean()), 1e-12))
+    # neighbouring differences share a frame: half as much again in the variance
+    sigma = math.sqrt(1.5 / (2.0 * chosen.size))
+    return ratio if max(ratio, 1.0 / ratio) > 1.0 + max(_NOISE_OFF, 6.0 * sigma) else None
 
 
 def _basis(reference: Array) -> Array:

@@ -8,23 +8,59 @@ stands in the covariance of a shift: the image that the shape is from is fitted 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.spots import spot_image
-from analysis.spots.frame_screening import ScreenedFrames
+from analysis.spots.frame_screening import Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = ["MARGIN_PX", "learn_template"]
+__all__ = ["MARGIN_PX", "learn_template", "without_slopes"]
 
 Array = NDArray[np.float64]
 MARGIN_PX = 40
 """By which the shape is larger than the image, so that it can be shifted over it."""
 _TAPER_PX = 4
 _CORE = 0.05
+_LOOKS, _FILLS = 3, 40
+"""How often the frequencies of the light are looked for, and steps by which missing pixels are filled with them."""
+_UNEVEN = 0.5
+"""Rms of a slope, in sigmas of a pixel, from which it is the background's; rings of the spot at the edge make less."""
+
+
+def without_slopes(screened: ScreenedFrames, noise: NoiseModel) -> ScreenedFrames:
+    """Frames of which an uneven background is taken off, by a plane through the pixels at the edge, lest it is learnt
+    as the spot's and goes with it; the same where there is none.
+
+    Args:
+        screened: frames of the state that the shape is learnt from.
+        noise: of the detector.
+    """
+    mean = screened.mean
+    edge = _edge(mean.shape) & screened.good
+    v, u = np.meshgrid(*(np.linspace(-1.0, 1.0, size) for size in mean.shape), indexing="ij")
+    basis = np.stack([np.ones(np.count_nonzero(edge)), v[edge], u[edge]], axis=1)
+    if len(basis) < 10 * basis.shape[1]:
+        return screened
+    level, down, right = np.linalg.lstsq(basis, mean[edge], rcond=None)[0]
+    slopes = down * v + right * u
+    variance = noise.temporal_variance_dn2(float(level), 1) / np.median(screened.counts)
+    variance += noise.fixed_variance_dn2(float(level))
+    if float(np.mean(slopes[edge] ** 2)) < _UNEVEN**2 * float(variance):
+        return screened
+    rise = f"{np.ptp(slopes):.2g} DN between the corners"
+    told = Finding("uneven background", f"its slopes, {rise}, are taken off before the shape is learnt")
+    return replace(screened, mean=mean - slopes, findings=(*screened.findings, told))
+
+
+def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    out = np.ones(shape, dtype=bool)
+    out[_TAPER_PX:-_TAPER_PX, _TAPER_PX:-_TAPER_PX] = False
+    return out
 
 
 def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
@@ -40,10 +76,13 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
     image = spot_image.filled(screened.mean, screened.good)
     frames = max(int(np.median(screened.counts)), 1)
     _, _, background, peak, _ = spot_image.coarse(image[None], frames, noise)
-    edge = np.ones(image.shape, dtype=bool)
-    edge[_TAPER_PX:-_TAPER_PX, _TAPER_PX:-_TAPER_PX] = False
+    edge = _edge(image.shape)
     level = float(np.median(image[edge & screened.good])) if np.any(edge & screened.good) else float(background[0])
-    light = _without_noise(image - level, noise.temporal_variance_dn2(image, 1) / screened.counts)
+    variance = noise.temporal_variance_dn2(image, 1) / screened.counts
+    light = image - level
+    if not np.all(screened.good):
+        light = _completed(light, screened.good, variance)
+    light = _without_noise(light, variance)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)
     if not core.sum() > 0.0:
@@ -61,6 +100,25 @@ def _taper(shape: tuple[int, ...]) -> Array:
         away = np.minimum(np.arange(size) + 1, size - np.arange(size)) / (_TAPER_PX + 1.0)
         parts.append(0.5 - 0.5 * np.cos(np.pi * np.minimum(away, 1.0)))
     return np.outer(*parts)
+
+
+def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> Array:
+    """The image with its holes filled by what the light in the other pixels says, which optics let through up to a
+    frequency only: the hole takes the value of the low-passed image again and again (Papoulis, IEEE Trans. Circuits
+    Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)).
+    """
+    frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
+    ring = np.rint(frequency * min(light.shape)).astype(np.intp)
+    for _ in range(_LOOKS):
+        # holes that are not filled well yet make noise of all frequencies
+        power = np.abs(np.fft.fft2(light)) ** 2
+        middle = np.array([np.median(power[ring == k]) for k in range(int(ring.max()) + 1)])
+        noise = max(float(variance.sum()), 2.0 * float(np.median(middle[3 * middle.size // 4 :])))
+        dark = np.flatnonzero(middle < 2.0 * noise)
+        passed = ring < (int(dark[0]) if dark.size else middle.size)
+        for _ in range(_FILLS):
+            light = np.where(good, light, np.real(np.fft.ifft2(np.where(passed, np.fft.fft2(light), 0.0))))
+    return light
 
 
 def _without_noise(light: Array, variance: Array) -> Array:

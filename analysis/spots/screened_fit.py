@@ -15,7 +15,7 @@ Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import product
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,21 +25,20 @@ from analysis.spots import spot_image
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
-from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
+from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "one_shape"]
+__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60
+_REST_SIGMAS = 1e-4
+"""Of other spots, which may be so faint that their places are known to a part of a pixel only."""
 _FLUX_SIGMAS = 5.0
-_SLOPE_PX = 0.25
-"""Step of the second derivatives."""
 _MOST_SMEAR = 25.0
 """Px^2; a spot that is smeared by more is another one."""
 _CORE_SHARE = 0.02
 """Of the peak: where the shape of the spot is judged."""
-_NODES, _NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(3)
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,8 @@ class ScreenedFit:
         cost: sigma of the place over what it would be if nothing were missing, nothing else were fitted and the spot
             stood still, minus 1.
         missing: the same without what movement between frames does.
+        theta: (K,) all parameters: row, column, flux, level, then those of what else is fitted; px, DN, px^2.
+        inverse: (K, K) inverse of their information.
     """
 
     positions: SpotPositions
@@ -89,6 +90,8 @@ class ScreenedFit:
     core: tuple[float, int]
     cost: float
     missing: float
+    theta: Array
+    inverse: Array
 
     def residual(self, mean: Array) -> Array:
         """(H, W) what the image has more than the model, in standard deviations; 0 where a pixel is not used.
@@ -106,11 +109,20 @@ class ScreenedFit:
         """
         return float(np.square(self.residual(mean)).sum())
 
-    @property
-    def core_fits(self) -> bool:
-        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6."""
+    def core_fits(self, learnt_from: ScreenedFit | None = None) -> bool:
+        """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6.
+
+        Args:
+            learnt_from: the fit to the image that the shape was learnt from, whose noise is in the shape, too; None for
+                a shape without noise.
+        """
         value, count = self.core
-        return value * count <= chi2.isf(1e-6, max(count - 4, 1))
+        spread = 1.0
+        if learnt_from is not None:
+            # at the peak, where the noise is that of the light
+            first, own = (float(one.variance.flat[int(np.argmax(one.level))]) for one in (learnt_from, self))
+            spread += first / own * float(self.positions.flux[0] / learnt_from.positions.flux[0]) ** 2
+        return value / spread * count <= chi2.isf(1e-6, max(count - 4, 1))
 
 
 def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
@@ -164,6 +176,23 @@ def fit_screened(
         raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
 
 
+def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
+    """Of the fitted image: its derivatives (K, P) by all parameters, what of it is neither the spot nor its level (P,)
+    DN, and the derivatives (K, P) of that.
+
+    Args:
+        fit: of a spot.
+        template: the spot's one shape.
+    """
+    model = _Model(template, fit.terms, *fit.level.shape)
+    design, _ = model.design(fit.theta)
+    alone = fit.theta.copy()
+    alone[2:4] = 0.0
+    beside, extra = model.design(alone)
+    beside[:4] = 0.0
+    return design, extra, beside
+
+
 def _fit(
     mean: Array,
     counts: Array,
@@ -188,9 +217,10 @@ def _fit(
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         inverse = np.linalg.inv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
         step = inverse @ (weighted @ (flat - level))
-        theta, length = model.moved(theta, step)
+        before, theta = theta, model.moved(theta, step)
         spot_image.check_edge(theta[None, :2], *template.shape, 2.0)
-        if length < _REST_PX:
+        rests = model.rests(theta - before, inverse)
+        if rests:
             break
     design, level = model.design(theta)
     spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
@@ -205,7 +235,7 @@ def _fit(
     square = np.square(flat - level) * weight
     used = int(np.count_nonzero(use))
     shape = mean.shape
-    core = use & (model.light(theta) > _CORE_SHARE * model.light(theta).max())
+    core = use & (design[2] > _CORE_SHARE * design[2].max())
     places = [model.other(theta, inverse, k) for k in range(len(terms.others))]
     smear, smear_sigma = model.smear_of(theta, inverse)
     positions = SpotPositions(
@@ -215,7 +245,7 @@ def _fit(
         fixed_covariance=fixed[None],
         flux=theta[2:3],
         background=theta[3:4],
-        converged=np.array([length < _REST_PX]),
+        converged=np.array([rests]),
         iterations=0,
         reduced_chi_square=np.array([square.sum() / max(used - len(theta), 1)]),
         gain_maps=influence.reshape(1, 2, *shape),
@@ -234,6 +264,8 @@ def _fit(
         core=(float(square[core].mean()) if np.any(core) else 0.0, int(np.count_nonzero(core))),
         cost=_cost(design[:4], level, frames, noise, temporal + moved + fixed),
         missing=_cost(design[:4], level, frames, noise, temporal + fixed),
+        theta=theta,
+        inverse=inverse,
     )
 
 
@@ -300,10 +332,9 @@ class _Model:
             theta[self._smear :] = near.smear[0, 0], near.smear[0, 1], near.smear[1, 1]
         return theta
 
-    def moved(self, theta: Array, step: Array) -> tuple[Array, float]:
-        """The next parameters, and by how much the spot's place changes."""
-        places = [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
-        length = max(float(np.abs(step[places]).max()), 1e-300)
+    def moved(self, theta: Array, step: Array) -> Array:
+        """The next parameters: no place by more than a pixel, and the spot's flux stays positive."""
+        length = max(float(np.abs(step[self._places]).max()), 1e-300)
         short = min(1.0, 1.0 / length)
         if step[2] < -0.9 * theta[2]:
             short = min(short, -0.9 * theta[2] / step[2])
@@ -312,78 +343,76 @@ class _Model:
             # not more than the shape itself in one step
             change = np.clip(step[self._smear :], -2.0, 2.0)
             out[self._smear :] = np.clip(theta[self._smear :] + short * change, -_MOST_SMEAR, _MOST_SMEAR)
-        # another spot stays where the shape is known, smear included
-        reach = 1.0 + 1.8 * float(np.sqrt(np.square(self._spread(out)).sum()))
+        # another spot stays where the shape is known
         for k in range(len(self.terms.others)):
             for axis, (low, high) in enumerate(self.template.supported()):
                 at = self._others + 3 * k + axis
-                out[at] = min(max(out[at], low + reach), high - reach)
-        return out, length
-
-    def _spread(self, theta: Array) -> Array:
-        """Square root of the positive part of the smear, (2, 2) px."""
-        if not self.terms.smear:
-            return np.zeros((2, 2))
-        rows, across, columns = theta[self._smear :]
-        value, vector = np.linalg.eigh(np.array([[rows, across], [across, columns]]))
-        return np.asarray(vector * np.sqrt(np.maximum(value, 0.0)))
-
-    def _shape(self, row: float, column: float, spread: Array) -> Array:
-        """(3, P): the shape and its derivatives by row and column."""
-        if not np.any(spread):
-            return np.stack(self.template.evaluate(row, column)).reshape(3, -1)
-        out = np.zeros((3, self.height * self.width))
-        for (x, wx), (y, wy) in product(zip(_NODES, _NODE_WEIGHTS, strict=True), repeat=2):
-            d = spread @ (x, y)
-            part = np.stack(self.template.evaluate(row + d[0], column + d[1])).reshape(3, -1)
-            out += wx * wy / (2.0 * np.pi) * part
+                out[at] = min(max(out[at], low + 1.0), high - 1.0)
         return out
 
-    def _second(self, row: float, column: float, spread: Array) -> Array:
-        """(3, P): half the second derivatives by rows, across (twice the half) and columns."""
-        h = _SLOPE_PX
-        up, down = self._shape(row + h, column, spread), self._shape(row - h, column, spread)
-        right, left = self._shape(row, column + h, spread), self._shape(row, column - h, spread)
-        across = 0.5 * ((up[2] - down[2]) + (right[1] - left[1])) / (2.0 * h)
-        return np.stack([0.5 * (up[1] - down[1]) / (2.0 * h), across, 0.5 * (right[2] - left[2]) / (2.0 * h)])
+    @cached_property
+    def _places(self) -> list[int]:
+        """Numbers of the parameters that are places: the spot's, then the others'."""
+        return [0, 1, *(self._others + 3 * k + axis for k in range(len(self.terms.others)) for axis in (0, 1))]
+
+    def rests(self, change: Array, inverse: Array) -> bool:
+        """Whether places have changed by nothing that matters."""
+        others = self._places[2:]
+        sigma = np.sqrt(np.maximum(np.diag(inverse)[others], 0.0))
+        return bool(
+            np.all(np.abs(change[:2]) < _REST_PX)
+            and np.all(np.abs(change[others]) < np.maximum(_REST_SIGMAS * sigma, _REST_PX))
+        )
+
+    def _spread(self, theta: Array) -> Array:
+        """Positive part of the smear, (2, 2) px^2."""
+        rows, across, columns = theta[self._smear :]
+        value, vector = np.linalg.eigh(np.array([[rows, across], [across, columns]]))
+        return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
 
     def _spots(self, theta: Array) -> list[tuple[int, int, int]]:
         """Numbers of the parameters row, column and flux of every spot."""
         first = [0, *(self._others + 3 * k for k in range(len(self.terms.others)))]
         return [(k, k + 1, k + 2) for k in first]
 
-    def light(self, theta: Array) -> Array:
-        """(P,) DN of the spot itself."""
-        return np.asarray(theta[2] * self._shape(theta[0], theta[1], self._spread(theta))[0])
+    @cached_property
+    def _bends(self) -> Array:
+        """(5, P) slopes and curvature of the background."""
+        v, u = np.meshgrid(np.linspace(-1, 1, self.height), np.linspace(-1, 1, self.width), indexing="ij")
+        return np.stack([v, u, v * v - 1.0 / 3.0, u * v, u * u - 1.0 / 3.0]).reshape(5, -1)
+
+    @cached_property
+    def _shape(self) -> SmearedShape:
+        return SmearedShape(self.template)
 
     def design(self, theta: Array) -> tuple[Array, Array]:
         """Derivatives (K, P) and level (P,)."""
-        design = np.zeros((len(theta), self.height * self.width))
-        level = np.full(self.height * self.width, theta[3])
+        pixels = self.height * self.width
+        design = np.zeros((len(theta), pixels))
+        level = np.full(pixels, theta[3])
         design[3] = 1.0
-        v, u = np.meshgrid(np.linspace(-1, 1, self.height), np.linspace(-1, 1, self.width), indexing="ij")
-        bends = [v, u, v * v - 1.0 / 3.0, u * v, u * u - 1.0 / 3.0]
-        for k in range(self._slopes):
-            design[4 + k] = bends[k].ravel()
-            level += theta[4 + k] * design[4 + k]
-        spread = self._spread(theta)
+        if self._slopes:
+            bends = slice(4, 4 + self._slopes)
+            design[bends] = self._bends[: self._slopes]
+            level += theta[bends] @ design[bends]
+        smears = self.terms.smear
+        spread = self._spread(theta) if smears else None
+        coefficients = None if spread is None else self._shape.smeared(spread)
         for row, column, flux in self._spots(theta):
-            shape = self._shape(theta[row], theta[column], spread)
+            if coefficients is None:
+                shape = np.stack(self.template.evaluate(theta[row], theta[column])).reshape(3, pixels)
+            else:
+                shape = self._shape.evaluate(coefficients, theta[row], theta[column]).reshape(6, pixels)
+                # a smear changes a shape by half its second derivatives
+                design[self._smear :] += theta[flux] * np.array([[0.5], [1.0], [0.5]]) * shape[3:]
             design[flux] = shape[0]
             design[row], design[column] = theta[flux] * shape[1], theta[flux] * shape[2]
             level += theta[flux] * shape[0]
-            if self.terms.smear:
-                design[self._smear :] += theta[flux] * self._second(theta[row], theta[column], spread)
-        if self.terms.smear:
+        if spread is not None:
             # the part that is no smear, by its first order: noise may make a moment negative
-            rest = theta[self._smear :] - self._positive(spread)
+            rest = theta[self._smear :] - (spread[0, 0], spread[0, 1], spread[1, 1])
             level += rest @ design[self._smear :]
         return design, level
-
-    @staticmethod
-    def _positive(spread: Array) -> Array:
-        whole = spread @ spread.T
-        return np.array([whole[0, 0], whole[0, 1], whole[1, 1]])
 
     def other(self, theta: Array, inverse: Array, k: int) -> tuple[Array, Array]:
         """Row, column and share of another spot's light, and their standard deviations."""

@@ -21,10 +21,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
 from scipy.interpolate import BSpline
 
-__all__ = ["SpotTemplate", "TemplateRangeError"]
+__all__ = ["SmearedShape", "SpotTemplate", "TemplateRangeError"]
 
 Array = NDArray[np.float64]
 _DEGREE = 5
@@ -208,7 +208,7 @@ class SpotTemplate:
             raise ValueError(
                 f"spot template: row {rows.shape}, column {columns.shape}, index {which.shape} must all be (B,)"
             )
-        self._check_range(rows, columns, which)
+        self.check_range(rows, columns, which)
         corner, shape = (np.zeros((rows.size, 2), np.intp), self.shape) if part is None else part
         out = np.empty((3, rows.size, *shape))
         self._fill(out[1:], out[0], rows - corner[:, 0], columns - corner[:, 1], which, np.ones(rows.size))
@@ -231,7 +231,7 @@ class SpotTemplate:
             index: as for `evaluate`.
             part: as for `evaluate`.
         """
-        self._check_range(theta[:, 0], theta[:, 1], index)
+        self.check_range(theta[:, 0], theta[:, 1], index)
         place = theta[:, :2] - (0 if part is None else part[0])
         self._fill(out[:, :2].swapaxes(0, 1), out[:, 2], place[:, 0], place[:, 1], index, theta[:, 2])
         out[:, 3] = 1.0
@@ -285,7 +285,14 @@ class SpotTemplate:
             np.matmul(weights[spot], polynomials[which[spot], :, span].reshape(_TAPS, -1), out=out[spot])
         return out.reshape(position.size, 2, pixels, rank)
 
-    def _check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
+    def check_range(self, rows: Array, columns: Array, which: NDArray[np.intp]) -> None:
+        """Raise TemplateRangeError for positions outside `supported`.
+
+        Args:
+            rows: of the spots' centres, (B,), detector pixels.
+            columns: likewise.
+            which: shape of each, (B,).
+        """
         limits = np.array([self.supported(t) for t in range(self.count)])[which]
         place = np.stack([rows, columns], axis=1)
         # written so that NaN is outside
@@ -300,3 +307,71 @@ class SpotTemplate:
             f" {limits[first, 1, 1]:.2f} ({bad.size} such spots); calibrate with a larger margin",
             [int(n) for n in bad],
         )
+
+
+class SmearedShape:
+    """One shape of a template convolved with a normal distribution, with its first and second derivatives.
+
+    The convolution multiplies the spectrum of the spline's coefficients, which is exact for a shape that is
+    band-limited; the template's grid counts as one period, which its dark margins allow.
+
+    Args:
+        template: the shapes.
+        index: which of them.
+    """
+
+    def __init__(self, template: SpotTemplate, index: int = 0) -> None:
+        self._template, self._which = template, np.array([index])
+        coefficients = template.row_factors[index] @ template.column_factors[index].T
+        self._spectrum = fft.rfft2(coefficients)
+        turns = 2.0 * np.pi * template.oversampling
+        self._rows = turns * np.fft.fftfreq(template.grid[0])[:, None]
+        self._columns = turns * np.fft.rfftfreq(template.grid[1])[None, :]
+
+    def smeared(self, covariance: Array) -> Array:
+        """Spline coefficients (M, N) of the smeared shape, for `evaluate`.
+
+        Args:
+            covariance: (2, 2) px^2 of the normal distribution, (row, column); positive semi-definite.
+        """
+        (a, b), (_, c) = covariance
+        power = a * self._rows**2 + 2.0 * b * self._rows * self._columns + c * self._columns**2
+        return np.asarray(fft.irfft2(self._spectrum * np.exp(-0.5 * power), self._template.grid))
+
+    def evaluate(self, coefficients: Array, row: float, column: float) -> Array:
+        """The smeared shape at one place, (6, H, W): value, derivatives by row and by column (1/px), by row twice, by
+        row and column, by column twice (1/px^2). Raises TemplateRangeError for places outside `supported`.
+
+        Args:
+            coefficients: as `smeared` has made them.
+            row: of the centre, detector pixels.
+            column: likewise.
+        """
+        template = self._template
+        template.check_range(np.array([row]), np.array([column]), self._which)
+        centre, (height, width) = template.centre[self._which[0]], template.shape
+        by_row, rows = self._splines(centre[0], row, height)
+        by_column, columns = self._splines(centre[1], column, width)
+        part = coefficients[rows, columns]
+        out = np.empty((6, height, width))
+        lines = [order @ part for order in by_row]
+        for k, (i, j) in enumerate(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
+            np.matmul(lines[i], by_column[j].T, out=out[k])
+        return out
+
+    def _splines(self, centre: float, place: float, pixels: int) -> tuple[Array, slice]:
+        """Weights of the samples in every pixel, and of their first and second derivatives by the place, (3, pixels,
+        samples); and which samples.
+        """
+        step = self._template.oversampling
+        start = centre - step * place
+        base = int(np.floor(start))
+        power, pixel = np.arange(_TAPS), np.arange(pixels)
+        powers = np.zeros((3, _TAPS))
+        powers[0] = (start - base) ** power
+        powers[1, 1:] = -step * power[1:] * powers[0, :-1]
+        powers[2, 2:] = step**2 * power[2:] * power[1:-1] * powers[0, :-2]
+        out = np.zeros((3, pixels, step * (pixels - 1) + _TAPS))
+        out[:, pixel[:, None], step * pixel[:, None] + power] = (powers @ _VALUE)[:, None]
+        first = base - (_TAPS // 2 - 1)
+        return out, slice(first, first + out.shape[2])

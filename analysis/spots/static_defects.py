@@ -102,6 +102,7 @@ def examine(
     vibration: bool = False,
     own: bool = False,
     searched: bool = True,
+    first: tuple[int, int] = (0, 0),
 ) -> Examined:
     """Find what is in an image beside the spot.
 
@@ -112,35 +113,39 @@ def examine(
         vibration: whether smear is fitted.
         own: whether the shape was learnt from this very image, so that residuals of it say nothing.
         searched: whether anything is looked for; else what is known already is left out and fitted.
+        first: row and column of the detector at which the image begins; findings tell places on the detector.
 
     Raises:
         SpotError: no spot, or it cannot be measured.
     """
     mean = screened.mean
-    start = screened.good & ~_rough(mean, screened, noise) if searched else screened.good
-    good = start
+    rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
+    good = screened.good & ~rough
     smeared = (vibration or bool(np.any(screened.jitter))) and not own
     terms = FitTerms()
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
-    dirty = not screened.clean or not np.array_equal(good, screened.good)
+    dirty = not screened.clean
     fit = _fitted(screened, good, noise, template, terms)
     # what is gross first, lest it is taken for smear or for another spot
-    for rough in (True, False):
-        if not rough and smeared:
+    for gross in (True, False):
+        if not gross and smeared:
             terms = replace(terms, smear=True)
             fit = _fitted(screened, good, noise, template, terms, fit)
         for _ in range(_ROUNDS if searched else 0):
             before = good, terms
-            least = (_GROSS if smeared else 1.0) * limit if rough else CLOSER if dirty else limit
-            # found anew every time: an earlier fit may have been wrong
+            least = (_GROSS if smeared else 1.0) * limit if gross else CLOSER if dirty else limit
+            # found anew every time: an earlier fit may have been wrong, and so may the coarse look before there was one
+            start = screened.good & ~(rough & (np.abs(mean - fit.level) > least * np.sqrt(fit.variance)))
             found = _outliers(mean, fit, start, least)
-            lines = _lines(mean, fit, start & ~found, screened.good & (~start | found))
+            place = float(fit.positions.row[0]), float(fit.positions.column[0])
+            z = (mean - fit.level) / np.sqrt(fit.variance)
+            lines = _lines(z, place, start & ~found, screened.good & (~start | found))
             good = start & ~found & ~lines & ~edges
-            dirty = dirty or bool(np.any(found | lines))
+            dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
                 fit = _fitted(screened, good, noise, template, terms, fit)
-            if not own and not rough:
+            if not own and not gross:
                 terms, fit = _uneven(screened, good, noise, template, terms, fit)
                 terms, fit, edge = _others(screened, good, noise, template, terms, fit)
                 edges, good = edges | edge, good & ~edge
@@ -148,7 +153,7 @@ def examine(
             if np.array_equal(good, before[0]) and terms == before[1]:
                 break
     bad = screened.good & ~good & ~edges
-    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit)))
+    return Examined(screened, good, bad, fit, (*screened.findings, *_told(bad, edges, fit, first)))
 
 
 def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
@@ -164,7 +169,10 @@ def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     variance = noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     found = _off(mean, variance + (_STEEP * steep / limit) ** 2, good, limit)
-    return np.asarray(screened.good & (~good | found))
+    top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
+    residual = (mean - smooth) / np.sqrt(variance + (_STEEP * steep) ** 2)
+    lines = _lines(residual, (float(top[0]), float(top[1])), good & ~found, screened.good & (~good | found))
+    return np.asarray(screened.good & (~good | found | lines))
 
 
 def refit(
@@ -214,7 +222,8 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     filled = spot_image.filled(mean, screened.good)
     smooth = ndimage.median_filter(filled, 5)
     sigma = np.sqrt(noise.temporal_variance_dn2(smooth, 1) / screened.counts + noise.fixed_variance_dn2(smooth))
-    steep = ndimage.maximum_filter(smooth, 5) - ndimage.minimum_filter(smooth, 5)
+    # wide enough to reach from a dark ring into the bright ones beside it
+    steep = ndimage.maximum_filter(smooth, 7) - ndimage.minimum_filter(smooth, 7)
     out = np.abs(mean - smooth) > _ROUGH_SIGMAS * sigma + steep
     top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
     row, column = np.indices(mean.shape)
@@ -247,21 +256,20 @@ def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
     return found
 
 
-def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
-    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted.
+def _lines(residual: Array, place: tuple[float, float], good: Mask, bad: Mask) -> Mask:
+    """Columns and rows of which all pixels are off together, or so many bad that none can be trusted, by residuals in
+    standard deviations.
 
     A line is held against its neighbours, in the median of its pixels away from the spot.
     """
     out = np.zeros_like(good)
-    sigma = np.sqrt(fit.variance)
-    place = fit.positions.row[0], fit.positions.column[0]
     for axis in (0, 1):
         size, lines = good.shape[axis], good.shape[1 - axis]
         far = np.abs(np.arange(size) - place[axis]) > _NEAR_SPOT_PX
-        z = np.moveaxis((mean - fit.level) / sigma, axis, 0)[far]
+        z = np.moveaxis(residual, axis, 0)[far]
         used = np.moveaxis(good, axis, 0)[far]
         count = np.count_nonzero(used, axis=0)
-        middle = np.array([np.median(z[used[:, k], k]) if count[k] else 0.0 for k in range(lines)])
+        middle = _medians(z, used, count)
         spread = np.sqrt(math.pi / 2.0 / np.maximum(count, 1))
         limit = float(norm.isf(FALSE_ALARM / (2.0 * lines)))
         use = count > 0.25 * len(z)
@@ -280,6 +288,17 @@ def _lines(mean: Array, fit: ScreenedFit, good: Mask, bad: Mask) -> Mask:
             off[worst] = True
         out |= np.expand_dims(off, axis)
     return np.asarray(out & good)
+
+
+def _medians(values: Array, used: Mask, count: NDArray[np.intp]) -> Array:
+    """Median of the used values of every column; 0 where there are none."""
+    ordered = np.sort(np.where(used, values, np.inf), axis=0)
+    low, high = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
+    column = np.arange(values.shape[1])
+    middle = np.zeros(values.shape[1])
+    some = count > 0
+    middle[some] = 0.5 * (ordered[low, column] + ordered[high, column])[some]
+    return middle
 
 
 def _uneven(
@@ -391,34 +410,30 @@ def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTempl
     return None
 
 
-def _told(bad: Mask, edges: Mask, fit: ScreenedFit) -> list[Finding]:
-    """What was found, in words."""
+def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> list[Finding]:
+    """What was found, in words; places count on the detector."""
     out = []
     full = [np.flatnonzero(bad.sum(axis=axis) > 0.5 * bad.shape[axis]) for axis in (0, 1)]
     along = np.zeros_like(bad)
     along[:, full[0]] = along[full[1]] = True
     single = int(np.count_nonzero(bad & ~along))
     if single:
-        where = np.argwhere(bad & ~along)[:3]
+        where = np.argwhere(bad & ~along)[:3] + first
         shown = ", ".join(f"({r}, {c})" for r, c in where)
         more = ", ..." if single > 3 else ""
         out.append(Finding("bad pixels", f"{single} hot, dead or otherwise off are left out: {shown}{more}"))
-    for numbers, name in zip(full, ("columns", "rows"), strict=True):
+    for numbers, begin, name in zip(full, first[::-1], ("columns", "rows"), strict=True):
         if numbers.size:
-            shown = ", ".join(map(str, numbers[:5]))
+            shown = ", ".join(map(str, numbers[:5] + begin))
             out.append(Finding(f"bad {name}", f"{shown}{', ...' * (numbers.size > 5)} are left out"))
     if fit.terms.background:
         what = "slopes" if fit.terms.background == 1 else "slopes and curvature"
         rise = float(np.ptp(fit.level[[0, 0, -1, -1], [0, -1, 0, -1]]))
         out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
-        out.append(
-            Finding(
-                "second light",
-                f"at row {row:.1f}, column {column:.1f} with {100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light; "
-                "it is fitted",
-            )
-        )
+        place = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
+        light = f"{100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light"
+        out.append(Finding("second light", f"{place} with {light}; it is fitted"))
     if np.any(edges):
         out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
     if fit.terms.smear:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
+from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
 FIRST_ZERO_PX = 7.0
 
@@ -111,3 +111,68 @@ def test_the_smallest_calibration_image_has_one_place(oversampling):
     for less in (image[:-1], image[:, :-1]):
         with pytest.raises(ValueError, match="margin"):
             SpotTemplate.from_image(less, rows // 2, columns // 2, (10, 8), oversampling)
+
+
+# --- smeared ----------------------------------------------------------------------------------------------------------
+
+
+def smeared(oversampling=1, zero=FIRST_ZERO_PX):
+    side = 120 * oversampling
+    centre = (59.4 * oversampling, 60.3 * oversampling)
+    image = airy(*centre, (side, side), zero * oversampling)
+    template = SpotTemplate.from_image(image, *centre, (64, 64), oversampling)
+    return template, SmearedShape(template)
+
+
+@pytest.mark.parametrize("oversampling", [1, 2])
+@pytest.mark.parametrize("covariance", [[[0, 0], [0, 0]], [[0.3, 0.2], [0.2, 0.5]], [[1.0, -1.0], [-1.0, 1.0]]])
+def test_smear_is_the_mean_over_places(oversampling, covariance):
+    """Against the shape itself at the nodes of a product rule of 9 points, exact but for terms of 18th order; also the
+    sign of the cross term. What is left is the interpolation's own error, 1e-5 of the peak and five times that of the
+    slopes at the detector's pitch, a thirtieth of it at half of that. Without smear it is the shape.
+    """
+    template, shape = smeared(oversampling)
+    matrix = np.array(covariance, float)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    values, vectors = np.linalg.eigh(matrix)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    expected = 0.0
+    for x, a in zip(nodes, weights, strict=True):
+        for y, b in zip(nodes, weights, strict=True):
+            d = root @ (x, y)
+            expected = expected + a * b / (2 * np.pi) * np.stack(template.evaluate(31.3 + d[0], 30.8 + d[1]))[:, 0]
+    found = shape.evaluate(shape.smeared(matrix), 31.3, 30.8)
+    for one, other, own in zip(found[:3], expected, (1e-5, 5e-5, 5e-5), strict=True):
+        tolerance = own * (1.0 if oversampling == 1 else 1 / 30) if np.any(matrix) else 1e-8
+        assert np.abs(one - other).max() < tolerance * np.abs(other).max()
+    if np.any(matrix):
+        assert np.abs(found[0] - template.evaluate(31.3, 30.8)[0][0]).max() > 0.02 * found[0].max()
+
+
+def test_derivatives_of_a_smeared_shape():
+    """Second derivatives by differences of the first, those by the smear by differences of the smear: half of them."""
+    _, shape = smeared()
+    matrix = np.array([[0.6, 0.25], [0.25, 0.4]])
+    at = shape.evaluate(shape.smeared(matrix), 30.2, 33.7)
+    h = 1e-4
+    coefficients = shape.smeared(matrix)
+    ends = [shape.evaluate(coefficients, 30.2 + a, 33.7 + b) for a, b in ((h, 0), (-h, 0), (0, h), (0, -h))]
+    by_row, by_column = (ends[0] - ends[1]) / (2 * h), (ends[2] - ends[3]) / (2 * h)
+    pairs = [(by_row[0], 1), (by_column[0], 2), (by_row[1], 3), (by_row[2], 4), (by_column[1], 4), (by_column[2], 5)]
+    for found, number in pairs:
+        assert np.abs(found - at[number]).max() < 1e-6 * np.abs(at[number]).max()
+    for step, number, share in (([[1, 0], [0, 0]], 3, 0.5), ([[0, 1], [1, 0]], 4, 1.0), ([[0, 0], [0, 1]], 5, 0.5)):
+        both = [shape.evaluate(shape.smeared(matrix + sign * h * np.array(step)), 30.2, 33.7)[0] for sign in (1, -1)]
+        slope = (both[0] - both[1]) / (2 * h)
+        # the spline's second derivative is good to its fourth order in the frequencies of the spot
+        assert np.abs(slope - share * at[number]).max() < 2e-3 * np.abs(at[number]).max()
+
+
+def test_a_smeared_shape_keeps_its_light_and_its_range():
+    template, shape = smeared()
+    whole = shape.smeared(np.diag([2.0, 1.0]))
+    assert whole.sum() == pytest.approx(shape.smeared(np.zeros((2, 2))).sum(), rel=1e-12)
+    low, high = template.supported()[0]
+    with pytest.raises(TemplateRangeError):
+        shape.evaluate(whole, high + 0.01, 31.0)
+    assert np.all(np.isfinite(shape.evaluate(whole, low, 31.0)))

@@ -44,6 +44,29 @@ def _pass(folder: Path) -> None:
     subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
 
 
+def _frames(folder: Path) -> None:
+    """Frames of a small course as somebody might have recorded them: packed, a part of the CCD at the later times, with
+    a column and a few pixels that are bad, whole numbers all of them; and the measurement's file.
+    """
+    words = ["twin.render", f"{JOBS}/course.yaml", "--out", str(folder / "run"), "--quiet"]
+    subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
+    text = "instrument: gf7_pair\ndisturbances: launch\ntimes: [0 min, 12 min, 30 min]\nframes:\n"
+    for camera in ("forward", "backward"):
+        for side in ("left", "right"):
+            name = f"{camera}_{side}"
+            before, after = (tifffile.imread(folder / f"run/images/{name}_{k}.tiff") for k in ("before", "course"))
+            if name == "forward_left":
+                for frames in (before, after):
+                    frames[:, :, 20] = 100
+                    frames[:, 60:62, 70] += 900
+            tifffile.imwrite(folder / f"{name}_b.tiff", before, compression="lzw", photometric="minisblack")
+            for k, frame in enumerate(after[:, 4:90, 6:92]):
+                tifffile.imwrite(folder / f"{name}_{k}.tiff", frame, photometric="minisblack")
+            files = ", ".join(f"{name}_{k}.tiff" for k in range(len(after)))
+            text += f"  {camera}/{side}: {{before: {name}_b.tiff, after: [{files}], offset_after: [4, 6]}}\n"
+    (folder / "frames.yaml").write_text(text)
+
+
 @dataclass(frozen=True)
 class Job:
     """One command.
@@ -90,6 +113,7 @@ ALL = (
     _job("render_stray", f"twin.render {RUN % 'stray'}"),
     _job("render_deformed", f"twin.render {RUN % 'deformed'} --quiet"),
     _job("render_refused", f"twin.render {RUN % 'bad'}"),
+    _job("recover", "twin.recover {here}/frames.yaml --out {out} --json", prepare=_frames),
     _job("uncertainty", "twin.uncertainty gf7_pair --states 4 --seed 5 --out {out}"),
     _job("lab_focus", f"twin.lab focus {RUN % 'focus'} --seed 5"),
     _job("lab_distortion", f"twin.lab distortion {RUN % 'distortion'}"),

@@ -21,6 +21,7 @@ from scenes.specs.load import SCENES, load_autocollimator_test, load_error_budge
 from twin.design.__main__ import app as design
 from twin.lab import app as lab
 from twin.orbit.__main__ import app as orbit
+from twin.recover.__main__ import app as recover
 from twin.render import app as render
 from twin.run.cli import explained
 from twin.study.__main__ import app as study
@@ -41,6 +42,8 @@ CUTS = (
     "twin.study.gradient.study_gradient._Traced",
     "twin.study.gradient.study_gradient._whole",
     "twin.design.design_run.optimise",
+    "twin.recover.recover_run._modelled",
+    "twin.recover.recover_run._measured",
 )
 """Functions that begin the long computations."""
 SOONER = (
@@ -133,7 +136,8 @@ def _config(name: str, app: typer.Typer, words: str, resolve: Callable, file: st
 
 def cases() -> dict[str, Case]:
     """All cases by name."""
-    return {case.name: case for case in (*_renders(), *_labs(), *_orbits(), *_measured(), *_studies(), *_rest())}
+    measured = (*_measured(), *_frames())
+    return {case.name: case for case in (*_renders(), *_labs(), *_orbits(), *measured, *_studies(), *_rest())}
 
 
 def _renders() -> Iterator[Case]:
@@ -235,6 +239,64 @@ def _measured() -> Iterator[Case]:
         own = {"test.yaml": text, "data.yaml": data, **tables}
         for target in own if command == "calibrate" else ("test.yaml",):
             yield Case(f"measured-{command}-{Path(target).stem}", orbit, (command,), own, target, weight=0.5)
+
+
+def _fits(frames: int, light: int) -> str:
+    """A FITS file of small frames that is text, as the files of a case are: all its bytes are below 128."""
+    cards = {"SIMPLE": "T", "BITPIX": 16, "NAXIS": 3, "NAXIS1": 32, "NAXIS2": 32, "NAXIS3": frames}
+    lines = [f"{key:8s}= {value:>20}".ljust(80) for key, value in cards.items()]
+    head = "".join([*lines, "END".ljust(80)]).ljust(2880)
+    pixels = [(light if 12 < row < 20 and 12 < column < 20 else 0, 100) for row in range(32) for column in range(32)]
+    data = "".join(chr(high) + chr(low) for high, low in pixels) * frames
+    return head + data.ljust(-(-len(data) // 2880) * 2880, "\0")
+
+
+def _frames() -> Iterator[Case]:
+    """Measured frames of a monitor, and their files."""
+    folder = {
+        f"images/{camera}_{side}_{when}.fits": _fits(1, 8)
+        for camera in ("forward", "backward")
+        for side in ("left", "right")
+        for when in ("before", "after")
+    }
+    text = _with(_text("examples/measured_frames.yaml"), ("../../runs/first/images", "./images"))
+    yield Case("frames-model", recover, (), {"frames.yaml": text, **folder}, "frames.yaml")
+    geometry = """template: measured
+detector: ./ccd.yaml
+exposure: 10 ms
+geometry:
+  one: {focal_length: 5.5 m, separation: 235 mm, pixel: 12 um, look: 26 deg, field: 1.2 deg, focal_length_across: 5.6 m}
+bad_pixels: {one/left: bad.fits, one/right: [bad.fits]}
+dark: dark.fits
+flat: {all: [flat.fits]}
+photon_transfer: measured
+corrections: automatic
+vibration: fitted
+analysis: {centroid: ml}
+"""
+    listed = """times: [0 min, 0.5 h]
+frames:
+  one/left: {before: [a.fits, b.fits], after: [a.fits, [a.fits, b.fits]], offset: [4, 2], offset_after: [0, 0]}
+  one/right: {before: b.fits, after: [b.fits, b.fits]}
+"""
+    # dark and flat frames need noise: two grey values in turns
+    noisy = {"dark.fits": _fits(2, 0), "flat.fits": _fits(2, 0)}
+    for name, values in (("dark.fits", "de"), ("flat.fits", "AZ")):
+        head, data = noisy[name][:2880], list(noisy[name][2880:])
+        for k in range(2 * 32 * 32):
+            data[2 * k + (name == "dark.fits")] = values[(k * k // 7 + k // 1024) % 2]
+        noisy[name] = head + "".join(data)
+    files = {"a.fits": _fits(3, 8), "b.fits": _fits(1, 9), "bad.fits": _fits(1, 0).replace("d", "\0"), **noisy}
+    own = {"frames.yaml": geometry + listed, "ccd.yaml": _text("library/detectors/monitor_ccd.yaml"), **files}
+    for target in ("frames.yaml", "ccd.yaml", "a.fits", "flat.fits"):
+        yield Case(f"frames-{Path(target).stem}", recover, (), own, target)
+    table = "channel,time [min],file,row,column\n" + "".join(
+        f"one/{side},{when},{name}.fits,4,2\n"
+        for side in ("left", "right")
+        for when, name in (("before", "a"), ("before", "b"), ("0", "a"), ("30.5", "b"), ("30.5", "a"))
+    )
+    own = {"frames.yaml": geometry + "frames: frames.csv\n", **{k: v for k, v in own.items() if k != "frames.yaml"}}
+    yield Case("frames-table", recover, (), {**own, "frames.csv": table}, "frames.csv")
 
 
 def _studies() -> Iterator[Case]:

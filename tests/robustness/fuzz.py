@@ -31,6 +31,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import matplotlib.font_manager  # noqa: F401 - makes its folders at home when it is loaded, whichever case is the first
 from typer.testing import CliRunner
 
 from tests.robustness.cases import Case, Reached, cases, cut

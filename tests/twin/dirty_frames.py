@@ -214,7 +214,7 @@ def draw(template, detector: EmvaDetector, kinds, seed: int) -> Drawn:
     return Drawn(before, after, shift)
 
 
-def measurement(drawn: Drawn, template, noise, vibration_fitted=False, **changes) -> ChannelMeasurement:
+def measurement(drawn, template, noise, vibration_fitted=False, shape="template", **changes) -> ChannelMeasurement:
     """The search of one set of frames.
 
     Args:
@@ -222,6 +222,7 @@ def measurement(drawn: Drawn, template, noise, vibration_fitted=False, **changes
         template: one calibrated shape.
         noise: of the detector.
         vibration_fitted: as a measurement's file says.
+        shape: of the spot in place of the template; None to learn it.
         changes: of the measurement.
     """
     spec = MeasurementSpec.model_construct(
@@ -232,7 +233,7 @@ def measurement(drawn: Drawn, template, noise, vibration_fitted=False, **changes
         for name, frames in (("before", drawn.before), ("after", drawn.after))
     ]
     frames = ChannelFrames("forward/left", template.shape, states[0], (states[1],), None, None, None, noise, noise)
-    return ChannelMeasurement(spec, frames, template)
+    return ChannelMeasurement(spec, frames, template if isinstance(shape, str) else shape)
 
 
 __all__ = ["KINDS", "Drawn", "draw", "measurement", "one_shape", "replace"]

@@ -13,9 +13,20 @@ from scenes.specs.course import moment
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, Parameter
+from twin.monitor.smoothed_course import SmoothedCourse
 from twin.run.artefact import plain, significant
 
-__all__ = ["NOISE", "NOISE_ALONE", "assumed", "combination", "contradicted", "contradiction", "limits", "share_text"]
+__all__ = [
+    "NOISE",
+    "NOISE_ALONE",
+    "assumed",
+    "combination",
+    "contradicted",
+    "contradiction",
+    "course_agrees",
+    "limits",
+    "share_text",
+]
 
 NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
@@ -63,6 +74,28 @@ def contradicted(
         f"the shifts of the spots contradict the stated disturbances {stated.name}{when}: chi-square "
         f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
         f"chance of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
+    )
+
+
+def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
+    """Whether all measurements of a course agree with what is stated to move, and how it goes on in time; sentences.
+
+    Args:
+        together: the course.
+        times: of its measurements, seconds.
+    """
+    found = together.consistency
+    what = f"Chi-square of all {len(times)} measurements is {found.chi_square:.4g}"
+    if found.chance > 1.0 - FALSE_ALARM:
+        return f"{what} where {found.degrees} are expected: less moves than is stated, and the sigmas are too large."
+    if found.agrees:
+        expected = f"{found.degrees} are expected, {found.limit:.4g} are the limit (chance {FALSE_ALARM:g})"
+        return f"{what}, as stated: {expected}."
+    worst = int(np.argmax(together.innovations))
+    return (
+        f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
+        "the measurements contradict what was stated, and the sigmas cannot be relied on. The first to look at is "
+        f"the one at {moment(float(times[worst]))}, which those before it leave {together.innovations[worst]:.3g} of."
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration
-from analysis.monitor.disturbances import Consistency, Disturbances
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.recovery import Recovery
@@ -84,6 +84,23 @@ class MonitorReading:
                 columns.setdefault(key, np.zeros(len(stated.spots)))[own] = moved
         bodies = dict.fromkeys(body for body, _, _ in columns)
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
+
+    def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
+        """Of the times of a series the one whose shifts agree least with the stated disturbances, and how they do: its
+        limit is that of the largest of all times, at the same chance of a false alarm. None without a statement.
+
+        Args:
+            shifts: (T, 2 C) px.
+            covariance: (T, 2 C, 2 C) px^2 of these.
+        """
+        stated, false_alarm = self.disturbances, FALSE_ALARM / len(shifts)
+        if stated is None:
+            return None
+        # suspects are looked for at one time only
+        found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(shifts, covariance, strict=True)]
+        worst = int(np.argmax(found))
+        others = self.any_motions(stated)
+        return worst, consistency(shifts[worst], covariance[worst], stated, others, false_alarm=false_alarm)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
+from twin.main_job.assumptions import course_agrees
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.verdict import sharpness_lost
@@ -84,20 +84,7 @@ def _smoothed(series: TimeSeries) -> dict[str, str] | None:
     together = series.smoothed
     if together is None:
         return None
-    found = together.consistency
-    what = f"Chi-square of all {len(series.times)} measurements is {found.chi_square:.4g}"
-    text = f"{what}, as stated: {found.degrees} are expected, {found.limit:.4g} are the limit (chance {FALSE_ALARM:g})."
-    if found.chance > 1.0 - FALSE_ALARM:
-        text = f"{what} where {found.degrees} are expected: less moves than is stated, and the sigmas are too large."
-    if not found.agrees:
-        worst = int(np.argmax(together.innovations))
-        text = (
-            f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
-            "the measurements contradict what was stated, and the sigmas cannot be relied on. The first to look at is "
-            f"the one at {moment(float(series.times[worst]))}, which those before it leave "
-            f"{together.innovations[worst]:.3g} of."
-        )
-    return {"name": together.name, "text": text}
+    return {"name": together.name, "text": course_agrees(together, series.times)}
 
 
 def _worst(series: TimeSeries, estimator: str) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency, consistency
+from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
@@ -149,20 +149,11 @@ class RenderRun:
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
-        """Of the times of a course the one whose shifts agree least with the stated disturbances, and how they do: its
-        limit is that of the largest of all times, at the same chance of a false alarm. None without course or
-        statement.
+        """Of the times of a course the one whose shifts agree least with the stated disturbances, and how they do (see
+        `MonitorReading.worst_of`). None without course or statement.
         """
-        stated, series = self.experiment.disturbances, self.series
-        if stated is None or series is None:
-            return None
-        noise, false_alarm = series.shift_covariance, FALSE_ALARM / len(series.times)
-        # suspects are looked for at one time only
-        found = [consistency(s, r, stated, {}, 0.0).chi_square for s, r in zip(series.shift, noise, strict=True)]
-        worst = int(np.argmax(found))
-        return worst, consistency(
-            series.shift[worst], noise[worst], stated, self.reading.any_motions(stated), false_alarm=false_alarm
-        )
+        series = self.series
+        return None if series is None else self.reading.worst_of(series.shift, series.shift_covariance)
 
     @cached_property
     def limits(self) -> MonitorLimits | None:

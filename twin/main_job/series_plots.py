@@ -38,15 +38,19 @@ UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
 
 
-def time_unit(series: TimeSeries) -> tuple[float, str]:
-    """A unit that suits a course's length, in seconds, and its name."""
-    span = float(series.times[-1] - series.times[0])
+def time_unit(times: np.ndarray) -> tuple[float, str]:
+    """A unit that suits a course's length, in seconds, and its name.
+
+    Args:
+        times: of the course, seconds, in order.
+    """
+    span = float(times[-1] - times[0])
     return next((size, unit) for least, size, unit in UNITS if span >= least)
 
 
 def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
     """Times of a course in a unit that suits its length, and the axis label."""
-    size, unit = time_unit(series)
+    size, unit = time_unit(series.times)
     return series.times / size, f"time [{unit}]"
 
 
@@ -145,7 +149,7 @@ def smoothed_svg(series: TimeSeries) -> str:
     together = series.smoothed
     assert together is not None
     with look("smoothed"):
-        size, unit_name = time_unit(series)
+        size, unit_name = time_unit(series.times)
         label = f"time [{unit_name}]"
         cameras, every = list(series.parameters), np.append(series.times, together.times)
         order = np.argsort(every)

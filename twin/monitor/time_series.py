@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor.disturbances import FALSE_ALARM, Consistency
 from analysis.monitor.ground_error import AXES, GroundError
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
-from analysis.monitor.recovery import Estimates, Recovery, estimates_of, recover
-from analysis.monitor.series_smoother import smooth, window_of
-from analysis.spots.spot_positions import SeriesNoise, SpotError
+from analysis.monitor.recovery import Estimates, Recovery, recover
+from analysis.spots.spot_positions import SpotError
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import cores, one_blas_thread
@@ -28,65 +26,15 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.monitor.truth import Truth, trace_truth
 
 CHUNK = 25
 """States rendered at once, to bound memory; fewer when their frames are large."""
 LARGEST_FRAMES = 200_000_000
 """Pixels of all frames that are exposed at once."""
-MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
-"""Times between two of a course, and in all, at which it is smoothed, too."""
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""
-
-
-@dataclass(frozen=True, eq=False)
-class SmoothedCourse:
-    """What all measurements of a course say together, by the laws in time of what is stated to move.
-
-    Attributes:
-        name: of the stated disturbances.
-        changes: at all times of the course, by the estimators `filtered`, from the measurements up to each time, and
-            `smoothed`, from all.
-        times: (F,) between those of the course, seconds; between: the changes there, likewise.
-        innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
-        consistency: chi-square of the whole series.
-    """
-
-    name: str
-    changes: Estimates
-    times: np.ndarray
-    between: Estimates
-    innovations: np.ndarray
-    each: int
-    consistency: Consistency
-
-    def between_dict(self) -> dict[str, Any]:
-        """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
-        changes = self.between
-        out: dict[str, Any] = {
-            "times_s": self.times.tolist(),
-            "cameras": {name: {e: p.to_dict() for e, p in every.items()} for name, every in changes.parameters.items()},
-        }
-        if changes.angle:
-            out["intersection_angle"] = {e: a.to_dict() for e, a in changes.angle.items()}
-        if changes.ground:
-            out["ground"] = {e: g.to_dict() for e, g in changes.ground.items()}
-        return out
-
-    def to_dict(self) -> dict[str, Any]:
-        """Do the measurements agree with what is stated?"""
-        found = self.consistency
-        return {
-            "name": self.name,
-            "chi_square": found.chi_square,
-            "degrees_of_freedom": found.degrees,
-            "limit": found.limit,
-            "false_alarm": FALSE_ALARM,
-            "chance": found.chance,
-            "agrees": found.agrees,
-            "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,8 +192,8 @@ def run_series(
     shown_photons = np.empty(photons.shape[1:])
     truths: list[Truth] = []
     recoveries: list[Recovery] = []
-    together = _Together(experiment, course.times)
-    for piece in _pieces(len(states), max(1, min(CHUNK, LARGEST_FRAMES // (each * frames)))):
+    together = CourseSmoother(experiment.disturbances, experiment.cameras, experiment.ground, course.times)
+    for piece in pieces(len(states), each * frames):
         some = states[piece]
         try:
             truths.append(trace_truth(experiment.instrument, experiment.backend, some))
@@ -329,7 +277,14 @@ def _course(job: JobSpec) -> CourseSpec:
     return job.course
 
 
-def _pieces(count: int, size: int) -> Iterator[slice]:
+def pieces(count: int, each: int) -> Iterator[slice]:
+    """Times of a series whose frames are worked on at once: `CHUNK`, or fewer where they are large.
+
+    Args:
+        count: times.
+        each: pixels of all frames of one.
+    """
+    size = max(1, min(CHUNK, LARGEST_FRAMES // each))
     for start in range(0, count, size):
         yield slice(start, min(start + size, count))
 
@@ -366,47 +321,6 @@ def _joined_angle(parts: Sequence[IntersectionAngleChange]) -> IntersectionAngle
 
 def _joined_ground(parts: Sequence[GroundError]) -> GroundError:
     return GroundError(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(GroundError)))
-
-
-class _Together:
-    """Collects shifts and noise of all measurements."""
-
-    def __init__(self, experiment: MonitorExperiment, times: Sequence[float]) -> None:
-        self.experiment, self.times = experiment, np.array(times)
-        self.shifts: list[np.ndarray] = []
-        self.noise: SeriesNoise | None = None
-
-    def add(self, found: Recovery) -> Recovery:
-        """Take what is needed of some states, and give it back without the maps."""
-        if found.parts is None:
-            return found
-        before, after = found.parts
-        if self.noise is None:
-            self.noise = SeriesNoise(before, window_of(found.shift.shape[1]))
-        self.noise.add(after)
-        self.shifts.append(found.shift)
-        return found.at(slice(None))
-
-    def smoothed(self) -> SmoothedCourse | None:
-        """Of all that was added; None where nothing is stated to move."""
-        stated, noise = self.experiment.disturbances, self.noise
-        if stated is None or noise is None:
-            return None
-        steps = min(MOST_BETWEEN, LARGEST_BETWEEN // (len(self.times) - 1)) + 1
-        shares = np.arange(1, steps) / steps
-        between = (self.times[:-1, None] + shares * np.diff(self.times)[:, None]).ravel()
-        with one_blas_thread():
-            found = smooth(stated, self.times, np.concatenate(self.shifts), noise, np.append(self.times, between))
-
-        def part(which: slice) -> Estimates:
-            every = {"filtered": found.filtered, "smoothed": found.smoothed}
-            own = {name: (one.values[which], one.noise[which], one.total[which]) for name, one in every.items()}
-            return estimates_of(own, self.experiment.cameras, self.experiment.ground)
-
-        count = len(self.times)
-        each = found.consistency.degrees // count
-        at, rest = part(slice(count)), part(slice(count, None))
-        return SmoothedCourse(stated.name, at, between, rest, found.innovations, each, found.consistency)
 
 
 MIN_LIGHT = 0.5

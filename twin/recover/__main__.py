@@ -61,11 +61,13 @@ def main(
     """
 
     def work(setup: MeasurementSetup, session: Session) -> Result:
-        from twin.recover.recover_report import KIND, recover_numbers, recover_report
         from twin.recover.recover_run import run_recover
-        from twin.run.page import RunFacts, write_test
 
         run = run_recover(setup, session.backend, session.advance)
+        # frames that cannot be measured are told before anything that draws is loaded
+        from twin.recover.recover_report import KIND, recover_numbers, recover_report
+        from twin.run.page import RunFacts, write_test
+
         shown, numbers = recover_report(run), recover_numbers(run)
         facts = RunFacts(
             setup.to_yaml(),

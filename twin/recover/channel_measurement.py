@@ -10,8 +10,10 @@ from analysis.monitor.calibration import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import mean_frames
 from analysis.spots.frame_screening import Finding, FramesError, ScreenedFrames, screen_frames
-from analysis.spots.learnt_template import learn_template
+from analysis.spots.learnt_template import learn_template, without_slopes
+from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
+from analysis.spots.repaired_image import repaired_centroid
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
@@ -49,6 +51,7 @@ class SpotResult:
         cost: sigma of the place over what it would be without what was found, minus 1.
         core: reduced chi-square of the spot's core, and its number of pixels; None where no shape was fitted.
         fits: whether the core has the calibrated shape.
+        noise_ratio: noise of the frames over the stated one; None where they agree.
     """
 
     frames: StateFrames
@@ -59,6 +62,7 @@ class SpotResult:
     cost: float
     core: tuple[float, int] | None = None
     fits: bool = True
+    noise_ratio: float | None = None
 
     @property
     def clean(self) -> bool:
@@ -108,6 +112,8 @@ class ChannelMeasurement:
         self._learnt = shape is None
         self._screened: list[ScreenedFrames] = []
         self._examined: list[Examined | None] = []
+        self._costs: dict[int, float] = {}
+        self._templates: dict[tuple[int, int], SpotTemplate] = {}
         self.positions: list[SpotPositions] = []
 
     @property
@@ -128,7 +134,9 @@ class ChannelMeasurement:
 
     def _template(self, state: StateFrames) -> SpotTemplate:
         assert self.shape is not None
-        return one_shape(self.shape, 0, state.shape)
+        if state.shape not in self._templates:
+            self._templates[state.shape] = one_shape(self.shape, 0, state.shape)
+        return self._templates[state.shape]
 
     def search(self) -> list[Issue]:
         """Compare frames with each other, and images with the shape of the spot; what is refused."""
@@ -185,6 +193,7 @@ class ChannelMeasurement:
             if np.any(lone):
                 told = Finding("bad pixels", f"{np.count_nonzero(lone)} hot, dead or otherwise off are left out")
                 screened = replace(screened, good=screened.good & ~lone, findings=(*screened.findings, told))
+            screened = without_slopes(screened, self.channel.noise)
         return screened, learn_template(screened, self.channel.noise)
 
     def _examine(self, number: int, state: StateFrames) -> Examined | None:
@@ -194,7 +203,7 @@ class ChannelMeasurement:
         if not self._searches and not fitted and np.all(screened.good):
             return None
         own = self._learnt and number == 0
-        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches)
+        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches, state.offset)
 
     def measure(self) -> list[Issue]:
         """Measure the spot in every state; what is refused."""
@@ -219,20 +228,31 @@ class ChannelMeasurement:
             self._examined[number] = examined
         if examined is None or examined.clean:
             positions = self._as_ever(screened, state)
-        elif self._test.analysis.centroid != "ml":
-            reason = f"defects are fitted with the spot's shape, not by the {self._test.analysis.centroid} centroid"
-            raise SpotError({0: f"{reason} ({examined.findings[0].kind}: {examined.findings[0].text})"})
         else:
-            positions = examined.fit.positions
             if examined.fit.missing > DEAREST:
                 what = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
                 grown = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
                 raise SpotError({0: f"too much of the spot is missing ({what}): {grown}"})
+            positions, self._costs[number] = examined.fit.positions, examined.fit.cost
+            if self._test.analysis.centroid != "ml":
+                positions, self._costs[number] = self._repaired(examined, state)
         return self._on_ccd(positions, state)
 
     def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
-        calibration = MonitorCalibration({}, self._template(state), self.channel.noise)
-        return measure_spots(screened.mean[None], screened.frames, calibration, self._test.analysis.centroid)
+        return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
+
+    def _repaired(self, examined: Examined, state: StateFrames) -> tuple[SpotPositions, float]:
+        """By a centroid that knows no shape, and what the corrections cost it."""
+        screened, noise, template = examined.screened, self.channel.noise, self._template(state)
+
+        def measure(image: np.ndarray, own: NoiseModel) -> SpotPositions:
+            return self._centroid(image, screened.frames, own, state)
+
+        return repaired_centroid(screened, examined.fit, noise, template, measure)
+
+    def _centroid(self, mean: np.ndarray, frames: int, noise: NoiseModel, state: StateFrames) -> SpotPositions:
+        calibration = MonitorCalibration({}, self._template(state), noise)
+        return measure_spots(mean, frames, calibration, self._test.analysis.centroid)
 
     def _on_ccd(self, positions: SpotPositions, state: StateFrames) -> SpotPositions:
         """In pixels of the CCD."""
@@ -250,6 +270,9 @@ class ChannelMeasurement:
     def result(self) -> ChannelResult:
         """What was found."""
         spots = []
+        # of a learnt shape the frames before have been fitted, too, for they were searched
+        first = self._examined[0] if self._learnt else None
+        learnt = None if first is None else first.fit
         for number, state in enumerate(self.channel.states):
             examined, screened = self._examined[number], self._screened[number]
             fit = None if examined is None else examined.fit
@@ -261,9 +284,10 @@ class ChannelMeasurement:
                     used=screened.good if examined is None else examined.good,
                     residual=None if fit is None else fit.residual(screened.mean),
                     findings=findings,
-                    cost=0.0 if fit is None or examined is None or examined.clean else fit.cost,
+                    cost=self._costs.get(number, 0.0),
                     core=None if fit is None else fit.core,
-                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits,
+                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits(learnt),
+                    noise_ratio=screened.noise_ratio,
                 )
             )
         return ChannelResult(self.channel, spots[0], tuple(spots[1:]))

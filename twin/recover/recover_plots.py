@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from twin.main_job.series_plots import time_unit
 from twin.main_job.spot_plots import DIVERGING, GRAY, cross, stretch
 from twin.recover.channel_measurement import SpotResult
-from twin.recover.recover_run import RecoverRun
-from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
+from twin.recover.recover_run import RecoverRun, state_name
+from twin.run.svg import AFTER, BEFORE, BLUE, INK, LIGHT, ORANGE, SKY, look, new_figure, plain_axes, to_svg
 
 LIMIT = 5.0
 """Of the colour scale of residuals, sigmas."""
@@ -28,8 +30,8 @@ def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, Spo
             continue
         r = run.last.recovery
         states = result.states()
-        last = states[-1]
-        out.append((side, [("before", states[0][1], r.before[0, i]), (last[0], last[1], r.after[0, i])]))
+        name = state_name(run.times, len(states) - 1)
+        out.append((side, [("before", states[0][1], r.before[0, i]), (name, states[-1][1], r.after[0, i])]))
     return out
 
 
@@ -101,27 +103,72 @@ def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
     figure.colorbar(shown, ax=list(grid.ravel()), label=label, fraction=0.03, pad=0.02)
 
 
-def changes_svg(series: Sequence[tuple[float, Mapping[tuple[str, str], tuple[float, float]]]]) -> str:
-    """Changes over time.
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One change over time.
+
+    Attributes:
+        camera: whose; empty for what is of both.
+        name: with its unit.
+        marks: (3, T) times in seconds, values and their standard deviations, each time by itself.
+        band: (3, F) the same of all times together, also between them; None where nothing is known of that.
+    """
+
+    camera: str
+    name: str
+    marks: np.ndarray
+    band: np.ndarray | None
+
+
+def changes_svg(lines: Sequence[Line]) -> str:
+    """Changes over time, camera by camera beside each other, and below them what is of both.
 
     Args:
-        series: (time, (camera, symbol) -> value and sigma) in order of time.
+        lines: of every change.
     """
     with look("measured-series"):
-        keys = [key for key in series[0][1] if key[0]]
-        cameras, symbols = (list(dict.fromkeys(part)) for part in zip(*keys, strict=True))
-        figure = new_figure(2.2 * len(symbols))
-        rows = figure.subplots(len(symbols), 1, squeeze=False, sharex=True)[:, 0]
-        times = [time for time, _ in series]
-        for axes, symbol in zip(rows, symbols, strict=True):
-            axes.axhline(0.0, color=GREY, lw=0.8)
-            for k, camera in enumerate(cameras):
-                values, sigmas = zip(*(found[camera, symbol] for _, found in series), strict=True)
-                axes.errorbar(
-                    times, values, sigmas, fmt="o-", ms=4, lw=1, capsize=2, color=(BLUE, AFTER)[k % 2], label=camera
-                )
-            axes.set_ylabel(f"{symbol} [{'µm' if symbol == 'Δf' else 'arcsec'}]")
-            plain_axes(axes)
-        rows[0].legend()
-        rows[-1].set_xlabel("time [s]")
+        size, unit = time_unit(lines[0].marks[0])
+        cameras = list(dict.fromkeys(line.camera for line in lines if line.camera))
+        own = {camera: [line for line in lines if line.camera == camera] for camera in cameras}
+        shared = [line for line in lines if not line.camera]
+        rows = max(map(len, own.values())) + len(shared)
+        figure = new_figure(0.7 + 1.5 * rows)
+        grid = figure.add_gridspec(rows, len(cameras))
+        for column, camera in enumerate(cameras):
+            for row, line in enumerate(own[camera]):
+                axes = figure.add_subplot(grid[row, column])
+                _change(axes, line, size)
+                axes.set_ylabel(line.name if column == 0 else "")
+                axes.tick_params(labelbottom=row == rows - 1)
+                if row == 0:
+                    axes.set_title(f"Camera {camera}", loc="left", fontweight="bold")
+                if row == rows - 1:
+                    axes.set_xlabel(f"time [{unit}]")
+        for k, line in enumerate(shared):
+            axes = figure.add_subplot(grid[rows - len(shared) + k, :])
+            _change(axes, line, size)
+            axes.set_ylabel(line.name)
+            axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
+            axes.set_xlabel(f"time [{unit}]")
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        figure.align_ylabels()
         return to_svg(figure)
+
+
+def _change(axes: Axes, line: Line, size: float) -> None:
+    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    if line.band is not None:
+        time, value, sigma = line.band
+        for times, alpha in ((2.0, 0.25), (1.0, 0.45)):
+            low, high = value - times * sigma, value + times * sigma
+            label = f"{'2' if times > 1.0 else ''}σ, smoothed"
+            axes.fill_between(time / size, low, high, color=SKY, alpha=alpha, lw=0, label=label)
+        axes.plot(time / size, value, color=BLUE, lw=1.0, label="smoothed")
+    time, value, sigma = line.marks
+    axes.errorbar(
+        time / size, value, sigma, fmt="o", color=INK, ms=3.0, elinewidth=0.8, capsize=2, label="each time by itself"
+    )
+    plain_axes(axes)
+    axes.grid(axis="y", color=LIGHT, lw=0.5)
+    axes.set_axisbelow(True)

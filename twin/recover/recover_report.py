@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
+from analysis.monitor.disturbances import FALSE_ALARM
 from scenes.specs.course import moment
-from twin.main_job.assumptions import NOISE, assumed, contradicted, limits, share_text
+from twin.main_job.assumptions import NOISE, assumed, contradicted, course_agrees, limits, share_text
 from twin.main_job.monitor_reading import MonitorReading, stated
 from twin.main_job.report_labels import ANGLE, CENTROID_NOTES, GROUND, PARAMETERS, Parameter
 from twin.recover.channel_measurement import ChannelResult, SpotResult
-from twin.recover.recover_plots import changes_svg, residuals_svg, spots_svg
-from twin.recover.recover_run import RecoverRun
+from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
+from twin.recover.recover_run import RecoverRun, state_name
 from twin.run.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.run.report import Report, Section, one_sentence
 
@@ -93,6 +94,9 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
     if run.times is not None:
         out["times_s"] = list(run.times)
         out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
+    if run.smoothed is not None:
+        between = run.smoothed.between_dict()
+        out["smoothed"] = {**run.smoothed.at_dict(), "disturbances": run.smoothed.to_dict(), "between": between}
     return out
 
 
@@ -114,7 +118,11 @@ def _name(run: RecoverRun) -> str:
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
     """Sets of frames that were corrected, of how many, the dearest of them and whose it is."""
-    every = [(result.channel.name, name, spot) for result in run.channels for name, spot in result.states()]
+    every = [
+        (result.channel.name, state_name(run.times, k), spot)
+        for result in run.channels
+        for k, (_, spot) in enumerate(result.states())
+    ]
     dirty = [one for one in every if not one[2].clean]
     if not dirty:
         return 0, len(every), None, ""
@@ -189,7 +197,22 @@ def recover_report(run: RecoverRun) -> Report:
 
 
 def _warnings(run: RecoverRun) -> tuple[str, ...]:
-    return (*run.warnings, *contradicted(run.last.disturbances, run.last.consistency))
+    worst, when, rate = run.worst, "", f"{FALSE_ALARM:g}"
+    if worst is None:
+        return run.warnings
+    if run.times is not None and len(run.times) > 1:
+        when = f" at {moment(run.times[worst[0]])}, the worst of {len(run.times)} times"
+        rate += " for the series"
+    found = (*run.warnings, *contradicted(run.last.disturbances, worst[1], when, rate))
+    if run.smoothed is not None and not run.smoothed.consistency.agrees:
+        # each time may agree with what moves, and all of them not with how it goes on in time
+        found += (
+            f"the series contradicts the stated disturbances {run.smoothed.name} or how it goes on in time: chi-square "
+            f"{significant(run.smoothed.consistency.chi_square)} of {run.smoothed.consistency.degrees} coordinates "
+            f"where {run.smoothed.consistency.limit:.1f} is exceeded with a chance of {FALSE_ALARM:g}; σ of filtered "
+            "and smoothed changes does not hold",
+        )
+    return found
 
 
 def _frames_text(run: RecoverRun) -> str:
@@ -228,7 +251,7 @@ def _spots(run: RecoverRun) -> Section:
     heads = ["channel", "state", "frames", "row [px]", "column [px]", "σ [px]", "found and corrected", "cost in σ [%]"]
     rows: list[list[Cell]] = []
     for i, result in enumerate(run.channels):
-        for k, (name, spot) in enumerate(result.states()):
+        for k, (_, spot) in enumerate(result.states()):
             r = run.readings[max(k - 1, 0)].recovery
             place, sigma = (r.before, r.sigma_before) if k == 0 else (r.after, r.sigma_after)
             digits = decimals_for(float(sigma[0, i].min()))
@@ -237,7 +260,7 @@ def _spots(run: RecoverRun) -> Section:
             rows.append(
                 [
                     result.channel.name,
-                    name,
+                    state_name(run.times, k),
                     len(spot.frames.frames),
                     fixed(float(place[0, i, 0]), digits),
                     fixed(float(place[0, i, 1]), digits),
@@ -300,20 +323,68 @@ def _estimators(run: RecoverRun) -> Section:
 
 def _series(run: RecoverRun) -> Section:
     assert run.times is not None
+    together = run.smoothed
     heads = ["time [s]", "camera", "change", "unit", "value", "σ", "σ of noise"]
     rows: list[list[Cell]] = [
         [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
         for time, reading in zip(run.times, run.readings, strict=True)
         for one in _reads(reading, reading.judged)
     ]
-    title = run.last.estimators[run.last.judged].title
-    caption = f"As the {title} reads it; every time is measured against the same frames before."
-    series = [
-        (time, {(one.camera, one.parameter.symbol): (one.value, one.sigma) for one in _reads(reading, reading.judged)})
-        for time, reading in zip(run.times, run.readings, strict=True)
-    ]
-    figure = SvgFigure("series", "Changes over time", "Bars are one total standard deviation.", changes_svg(series))
-    return Section("Series", (), (figure, Table("times", "Every time", caption, heads, rows)), 1)
+    judged = run.last.estimators[run.last.judged].title
+    caption = f"Value: as the {judged} reads each time by itself, against the same frames before."
+    legend = f"Marks: each time by itself as the {judged} reads it, with one total standard deviation."
+    text: tuple[str, ...] = ()
+    if together is not None:
+        heads += ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
+        every = together.at_dict()
+        reads = list(_reads(run.last, run.last.judged))
+        for number, row in enumerate(rows):
+            k, one = divmod(number, len(reads))
+            for estimator in ("filtered", "smoothed"):
+                found = _of_course(every, reads[one], estimator)
+                row += [found[reads[one].parameter.key][k], found[f"{reads[one].parameter.key}_sigma"][k]]
+        caption += " Filtered: from all times up to it; smoothed: from all times."
+        legend += (
+            f" Line and bands: from all times together (smoothed), by how the disturbances {together.name} go on in "
+            "time, with one and two standard deviations, also between the times."
+        )
+        text = (course_agrees(together, np.array(run.times)),)
+    figure = SvgFigure("series", "Changes over time", legend, changes_svg(_drawn(run)))
+    return Section("Series", text, (figure, Table("times", "Every time", caption, heads, rows)), 1)
+
+
+def _of_course(changes: Mapping[str, Any], one: Read, estimator: str) -> Mapping[str, list[float]]:
+    """A group of changes over the times of a course."""
+    if one.camera:
+        return cast("Mapping[str, list[float]]", changes["cameras"][one.camera][estimator])
+    group = "ground" if one.parameter in GROUND else "intersection_angle"
+    return cast("Mapping[str, list[float]]", changes[group][estimator])
+
+
+def _drawn(run: RecoverRun) -> list[Line]:
+    """What the figure of a series shows: changes of the cameras and of their angle."""
+    assert run.times is not None
+    out = []
+    every = [list(_reads(reading, reading.judged)) for reading in run.readings]
+    for number, one in enumerate(every[-1]):
+        if one.parameter in GROUND:
+            continue
+        key = one.parameter.key
+        values, sigmas = ([getattr(reads[number], name) for reads in every] for name in ("value", "sigma"))
+        band = None
+        if run.smoothed is not None:
+            parts = (
+                (list(run.times), run.smoothed.at_dict()),
+                (run.smoothed.times.tolist(), run.smoothed.between_dict()),
+            )
+            found = [(times, _of_course(part, one, "smoothed")) for times, part in parts]
+            points = np.array(
+                [point for times, of in found for point in zip(times, of[key], of[f"{key}_sigma"], strict=True)]
+            )
+            band = points[np.argsort(points[:, 0])].T
+        name = f"{one.parameter.symbol} [{one.parameter.unit}]"
+        out.append(Line(one.camera, name, np.array([run.times, values, sigmas]), band))
+    return out
 
 
 def _transfer(results: list[ChannelResult]) -> Section:

@@ -2,34 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
-from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.recovery import Recovery, recover, recovery_of
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
-from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.channel import SIDES
+from scenes.specs.course import moment
 from scenes.specs.measured.monitor_frames_setup import MeasurementSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.main_job.monitor_reading import MonitorReading
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
+from twin.monitor.time_series import pieces
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, remedy
 from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_measurement
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector
 
-__all__ = ["RecoverRun", "run_recover"]
+__all__ = ["RecoverRun", "run_recover", "state_name"]
 
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
@@ -43,6 +48,7 @@ class RecoverRun:
         readings: of each state after.
         channels: in the order of the spots.
         pitch: of the CCDs' pixels, metres.
+        smoothed: all times of a series read together; None for a single state, and where nothing is stated to move.
         warnings: what the user should know.
     """
 
@@ -50,6 +56,7 @@ class RecoverRun:
     readings: tuple[MonitorReading, ...]
     channels: tuple[ChannelResult, ...]
     pitch: float
+    smoothed: SmoothedCourse | None = None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -61,6 +68,18 @@ class RecoverRun:
     def last(self) -> MonitorReading:
         """The latest state's."""
         return self.readings[-1]
+
+    @cached_property
+    def worst(self) -> tuple[int, Consistency] | None:
+        """Of the states the one whose shifts agree least with the stated disturbances, and how they do; None without a
+        statement.
+        """
+        found = [reading.recovery for reading in self.readings]
+        if len(found) == 1:
+            return None if self.last.consistency is None else (0, self.last.consistency)
+        return self.last.worst_of(
+            np.concatenate([one.shift for one in found]), np.concatenate([one.shift_covariance for one in found])
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,18 +123,22 @@ def run_recover(
     count = len(setup.channels)
     channels = read_measurement(setup, bench.noise, bench.ccd, lambda done: advance(READ, done, count))
     with one_blas_thread():
-        results, recovery = _measured(setup, bench, channels, advance)
+        results, recoveries, smoothed = _measured(setup, bench, channels, advance)
     names = tuple((camera, side) for camera, side in (name.split("/") for name in setup.channels))
     ground = None if bench.calibration is None else bench.calibration.ground
     centroid = setup.test.analysis.centroid
     tables: Mapping[str, CameraCrosstalk] | None = None
     readings = []
-    for k in range(len(channels[0].after)):
-        one = recovery.at(slice(k, k + 1))
+    for k, one in enumerate(recoveries):
         tables = bench.crosstalk(one) if tables is None else tables
         frames = min(len(result.channel.after[k].frames) for result in results)
         readings.append(MonitorReading(names, bench.cameras, ground, bench.disturbances, one, tables, frames, centroid))
-    return RecoverRun(setup, tuple(readings), results, bench.pitch, (*bench.warnings, *_unlike(results)))
+    times = setup.test.times
+    source = f"the data sheet {setup.detector.name} says"
+    if setup.test.photon_transfer == "measured":
+        source = "the frames in the dark and in even light say"
+    warnings = (*bench.warnings, *_unlike(results, times), *_noisy(results, times, source))
+    return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 
 
 def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
@@ -159,8 +182,8 @@ def _formulas(setup: MeasurementSetup) -> _Bench:
 
 def _measured(
     setup: MeasurementSetup, bench: _Bench, channels: Sequence[ChannelFrames], advance: Advance
-) -> tuple[tuple[ChannelResult, ...], Recovery]:
-    """All spots, and what they say of all states."""
+) -> tuple[tuple[ChannelResult, ...], list[Recovery], SmoothedCourse | None]:
+    """All spots, what they say of each state, and of a series together."""
     test = setup.test
     found: list[ChannelMeasurement] = []
     issues: list[Issue] = []
@@ -178,36 +201,75 @@ def _measured(
         raise InputError(*issues)
     if bench.calibration is not None and test.template == "twin" and all(one.plain for one in found):
         # clean frames of whole CCDs: to the bit what the main job makes of them
-        before = np.stack([channel.before.frames for channel in channels])
-        after = np.stack(
-            [np.stack([channel.after[k].frames for channel in channels]) for k in range(len(channels[0].after))]
-        )
         try:
-            recovery = recover(
-                before, after, bench.calibration, test.analysis.centroid, disturbances=bench.disturbances
-            )
+            states, smoothed = _plain(setup, bench, bench.calibration, channels)
         except SpotError as error:
             raise InputError(*_spot_issues(setup, channels, error)) from error
-        return tuple(one.result() for one in found), recovery
+        return tuple(one.result() for one in found), states, smoothed
     for one in found:
         issues += one.measure()
     if issues:
         raise InputError(*issues)
+    return tuple(one.result() for one in found), *_corrected(setup, bench, found)
+
+
+def _plain(
+    setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
+) -> tuple[list[Recovery], SmoothedCourse | None]:
+    """As the main job measures a state and a course, as many states at once as there."""
+    before = np.stack([channel.before.frames for channel in channels])
+    states = len(channels[0].after)
+    smoother = _smoother(setup, bench)
+    out: list[Recovery] = []
+    for piece in pieces(states, sum(channel.after[0].frames.size for channel in channels)):
+        after = np.stack([np.stack([c.after[k].frames for c in channels]) for k in range(piece.start, piece.stop)])
+        try:
+            found = recover(
+                before, after, calibration, setup.test.analysis.centroid,
+                disturbances=bench.disturbances, keep_parts=smoother is not None,
+            )  # fmt: skip
+        except SpotError as error:
+            raise SpotError({piece.start * len(channels) + n: why for n, why in error.reasons.items()}) from error
+        if smoother is not None:
+            found = smoother.add(found)
+        out += [found.at(slice(k, k + 1)) for k in range(piece.stop - piece.start)]
+    return out, None if smoother is None else smoother.smoothed()
+
+
+def _corrected(
+    setup: MeasurementSetup, bench: _Bench, found: Sequence[ChannelMeasurement]
+) -> tuple[list[Recovery], SmoothedCourse | None]:
+    """Of spots that have been measured channel by channel."""
     calibration = bench.calibration
     if calibration is None:
         template = found[0].shape
         assert template is not None
         calibration = MonitorCalibration(bench.cameras, template, bench.noise)
-    states = len(channels[0].after)
+    smoother = _smoother(setup, bench)
     first = _joined([one.positions[0] for one in found])
-    second = _joined([one.positions[1 + k] for k in range(states) for one in found])
-    spread = [
-        difference_covariance(one.positions[0], one.positions[1 + k], one.channel.noise)
-        for k in range(states)
-        for one in found
-    ]
-    recovery = recovery_of(first, second, np.concatenate(spread), calibration, bench.disturbances)
-    return tuple(one.result() for one in found), recovery
+    out: list[Recovery] = []
+    for k in range(1, len(found[0].positions)):
+        second = _joined([one.positions[k] for one in found])
+        spread = [difference_covariance(one.positions[0], one.positions[k], one.channel.noise) for one in found]
+        out.append(recovery_of(first, second, np.concatenate(spread), calibration, bench.disturbances))
+        if smoother is not None:
+            smoother.take(out[-1].shift, _parts(found, 0), _parts(found, k))
+    return out, None if smoother is None else smoother.smoothed()
+
+
+def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
+    """Of a series of which is stated how it goes on in time."""
+    times = setup.test.times
+    if times is None or bench.disturbances is None:
+        return None
+    ground = None if bench.calibration is None else bench.calibration.ground
+    return CourseSmoother(bench.disturbances, bench.cameras, ground, times)
+
+
+def _parts(found: Sequence[ChannelMeasurement], state: int) -> NoiseParts:
+    """Noise of the spots in one state, each by its own CCD's."""
+    each = [noise_parts(one.positions[state], one.channel.noise) for one in found]
+    return NoiseParts(np.concatenate([one.temporal for one in each]), np.concatenate([one.pattern for one in each]))
 
 
 def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
@@ -230,16 +292,56 @@ def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], err
     return out
 
 
-def _unlike(results: Sequence[ChannelResult]) -> tuple[str, ...]:
-    """Spots whose core is not as calibrated."""
+def state_name(times: Sequence[float] | None, number: int) -> str:
+    """How a reader knows a state: of a series by its time.
+
+    Args:
+        times: of a series, seconds; None for a single state after.
+        number: 0 for the nominal state, from 1 on those after it.
+    """
+    if number == 0:
+        return "before"
+    return "after" if times is None else f"at {moment(times[number - 1])}"
+
+
+def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None) -> tuple[str, ...]:
+    """Spots whose core is not as calibrated; of a series the worst of each channel."""
     out = []
     for result in results:
-        for name, spot in result.states():
-            if not spot.fits and spot.core is not None:
-                out.append(
-                    f"{result.channel.name} {name}: the spot has not the calibrated shape, reduced chi-square of its"
-                    f" core {spot.core[0]:.2f} over {spot.core[1]} pixels: defocus, a reflection too near to be told"
-                    " apart, or vibration, which `vibration: fitted` allows for; sigma does not hold what it does to"
-                    " the place"
-                )
+        found = [
+            (spot.core[0], spot.core[1], state_name(times, k))
+            for k, (_, spot) in enumerate(result.states())
+            if not spot.fits and spot.core is not None
+        ]
+        if not found:
+            continue
+        chi, pixels, state = max(found)
+        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
+        out.append(
+            f"{result.channel.name} {state}{others}: the spot has not the calibrated shape, reduced chi-square of its"
+            f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
+            " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        )
+    return tuple(out)
+
+
+def _noisy(results: Sequence[ChannelResult], times: Sequence[float] | None, source: str) -> tuple[str, ...]:
+    """Frames that have another noise than is stated; of a series the worst of each channel."""
+    out = []
+    for result in results:
+        found = [
+            (abs(math.log(spot.noise_ratio)), spot.noise_ratio, state_name(times, k))
+            for k, (_, spot) in enumerate(result.states())
+            if spot.noise_ratio is not None
+        ]
+        if not found:
+            continue
+        _, ratio, state = max(found)
+        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
+        out.append(
+            f"{result.channel.name} {state}{others}: beside the spot the frames are {ratio:.2f} times as noisy as"
+            f" {source}: another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and"
+            " the search for defects rest on it: name the right `detector`, or measure it with dark and flat frames"
+            " and `photon_transfer: measured`"
+        )
     return tuple(out)

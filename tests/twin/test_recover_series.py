@@ -1,0 +1,185 @@
+"""python -m twin.recover on a series: filter and smoother are those of the main job's course, through files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from optics.geometry.tree import State
+from scenes.specs.job import JobSpec
+from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.resolved import ResolvedJob, resolve_job
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.time_series import TimeSeries, run_series, series_states
+from twin.recover.recover_report import recover_numbers, recover_report
+from twin.recover.recover_run import RecoverRun, run_recover
+
+TIMES = ("0 min", "12 min", "0.5 h", "50 min")
+FRAMES, SEED = 3, 7
+COURSE = {
+    "instrument": "gf7_pair",
+    "disturbances": "orbit",
+    "course": {
+        "times": list(TIMES),
+        "detail": "12 min",
+        "temperature": {"base/forward": {"change": ["0 K", "0.08 K", "0.15 K", "0.05 K"]}},
+        "motion": {
+            "base/forward/M2": {
+                "shift": [[f"{x} um", "0 um", f"{z} um"] for x, z in ((0, 0), (0.1, 0.2), (0.2, 0.3), (0.1, 0))]
+            }
+        },
+    },
+    "render": {"frames": FRAMES, "seed": SEED},
+}
+
+
+@dataclass
+class Course:
+    """The main job's course, and the frames that it was measured in as files."""
+
+    job: ResolvedJob
+    experiment: MonitorExperiment
+    series: TimeSeries
+    states: list[State]
+    folder: Path
+
+    def measured(self, backend, text: str, name: str = "series.yaml") -> RecoverRun:
+        file = self.folder / name
+        file.write_text(text)
+        return run_recover(resolve_measurement(file), backend, experiment=self.experiment)
+
+    def text(self, times=TIMES, which=None, **other: str) -> str:
+        """A measurement's file; other: channel -> file in place of that of the second time."""
+        out = f"instrument: gf7_pair\ndisturbances: orbit\ntimes: [{', '.join(times)}]\nframes:\n"
+        for channel in self.experiment.path.channels:
+            stem = f"{channel.camera}_{channel.side}"
+            files = [f"{stem}_{k}.tiff" for k in (range(len(times)) if which is None else which)]
+            if stem in other:
+                files[1] = other[stem]
+            out += f"  {channel.key}: {{before: {stem}_before.tiff, after: [{', '.join(files)}]}}\n"
+        return out
+
+
+@pytest.fixture(scope="module")
+def course(experiment, tmp_path_factory) -> Course:
+    job = resolve_job(JobSpec.model_validate(COURSE))
+    pair = experiment("gf7_pair").stating(job)
+    states = series_states(pair, job.job)
+    series = run_series(pair, job, states)
+    folder = tmp_path_factory.mktemp("series")
+    before = pair.frames_before(FRAMES, SEED)
+    after = pair.frames_after(pair.path.expected_photons(states), FRAMES, SEED)
+    for i, channel in enumerate(pair.path.channels):
+        stem = f"{channel.camera}_{channel.side}"
+        for name, frames in (("before", before[i]), *((k, after[k, i]) for k in range(len(states)))):
+            tifffile.imwrite(folder / f"{stem}_{name}.tiff", frames, photometric="minisblack", compression="lzw")
+    return Course(job, pair, series, states, folder)
+
+
+def dicts(run_or_series) -> tuple:
+    """All that the smoother says."""
+    found = run_or_series.smoothed
+    return found.at_dict(), found.between_dict(), found.to_dict()
+
+
+def sigmas_away(one, other, key: str) -> float:
+    """Largest difference of the smoothed changes of the cameras in sigmas of the noise."""
+    worst = 0.0
+    for name, every in one.smoothed.changes.parameters.items():
+        a, b = every[key], other.smoothed.changes.parameters[name][key]
+        worst = max(worst, float(np.max(np.abs(a.vector - b.vector) / b.sigma_noise)))
+    return worst
+
+
+def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
+    found = course.measured(backend, course.text())
+    assert dicts(found) == dicts(course.series)
+    for k, reading in enumerate(found.readings):
+        np.testing.assert_array_equal(reading.recovery.shift[0], course.series.shift[k])
+        np.testing.assert_array_equal(reading.recovery.shift_covariance[0], course.series.shift_covariance[k])
+    numbers = recover_numbers(found)
+    written = course.series.to_dict()
+    for name, every in numbers["smoothed"]["cameras"].items():
+        for estimator in ("filtered", "smoothed"):
+            assert every[estimator] == written["cameras"][name][estimator]
+    assert numbers["smoothed"]["between"] == written["between"]
+    assert numbers["smoothed"]["disturbances"] == written["disturbances"]
+    # from the last time on nothing comes, so that both are one
+    last = found.smoothed.changes.parameters["forward"]
+    np.testing.assert_allclose(last["filtered"].vector[-1], last["smoothed"].vector[-1], rtol=1e-9)
+    assert np.all(last["smoothed"].sigma[0] <= last["filtered"].sigma[0] * (1.0 + 1e-9))
+
+
+def test_the_report_shows_the_series(course, backend):
+    found = course.measured(backend, course.text())
+    section = next(one for one in recover_report(found).sections if one.title == "Series")
+    table = next(one for one in section.artefacts if getattr(one, "name", "") == "times")
+    assert list(table.heads)[-4:] == ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
+    each = len(table.rows) // len(TIMES)
+    assert len(table.rows) == each * len(TIMES)
+    changes = found.smoothed.changes
+    for k, time in enumerate((0.0, 720.0, 1800.0, 3000.0)):
+        row = table.rows[each * k]
+        assert row[:3] == [time, "forward", "Δα"]
+        assert row[-2] == changes.parameters["forward"]["smoothed"].to_dict()["d_alpha_arcsec"][k]
+        assert row[-1] == changes.parameters["forward"]["smoothed"].to_dict()["d_alpha_arcsec_sigma"][k]
+    assert "Chi-square of all 4 measurements" in section.text[0]
+    assert "contradict" not in section.text[0]
+    assert recover_report(found).warnings == ()
+
+
+def test_only_time_differences_matter(course, backend):
+    """Stated motions are stationary: a series that begins ten hours later says the same."""
+    later = [f"{60 * 10 + minute} min" for minute in (0, 12, 30, 50)]
+    found = course.measured(backend, course.text(later))
+    for name, every in found.smoothed.changes.parameters.items():
+        for estimator, one in every.items():
+            other = course.series.smoothed.changes.parameters[name][estimator]
+            # the law is a function of differences of times, which round at 1e-16 of ten hours
+            np.testing.assert_allclose(one.vector, other.vector, rtol=0, atol=1e-9 * float(np.max(other.sigma)))
+    np.testing.assert_allclose(found.smoothed.times - 36000.0, course.series.smoothed.times, atol=1e-9)
+
+
+def test_corrected_frames_are_smoothed_as_well(course, backend):
+    """A cosmic ray in one frame of one time takes all channels on the other way: the same readings but for it."""
+    frames = tifffile.imread(course.folder / "forward_left_1.tiff")
+    row, column = np.unravel_index(int(frames.mean(axis=0).argmax()), frames.shape[1:])
+    frames[1, row + 6, column + 3 : column + 6] += 3000
+    tifffile.imwrite(course.folder / "struck.tiff", frames, photometric="minisblack")
+    found = course.measured(backend, course.text(forward_left="struck.tiff"))
+    spots = [spot for channel in found.channels for _, spot in channel.states()]
+    assert [spot.clean for spot in spots].count(False) == 1
+    # three pixels beside the spot, of which two of three frames are left
+    assert sigmas_away(found, course.series, "smoothed") < 0.3
+    sigma = [one.smoothed.changes.parameters["forward"]["smoothed"].sigma_noise for one in (found, course.series)]
+    np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.02)
+    # without the correction it is another measurement
+    raw = course.measured(backend, "corrections: none\n" + course.text(forward_left="struck.tiff"))
+    assert sigmas_away(raw, course.series, "smoothed") > 3.0
+
+
+def test_the_worst_time_is_told_wherever_it_is(course, backend):
+    """The frames of the second time are those of a spot that nothing stated could have moved so."""
+    frames = tifffile.imread(course.folder / "forward_left_1.tiff")
+    tifffile.imwrite(course.folder / "moved.tiff", np.roll(frames, 14, axis=1), photometric="minisblack")
+    found = course.measured(backend, course.text(forward_left="moved.tiff"))
+    assert found.last.consistency.agrees
+    assert found.worst[0] == 1
+    told = " ".join(recover_report(found).warnings)
+    assert "orbit at 12 min, the worst of 4 times" in told
+    assert "for the series" in told
+    assert not found.smoothed.consistency.agrees
+    assert "how it goes on in time" in told
+
+
+def test_a_single_time_and_one_without_statements_are_not_smoothed(course, backend):
+    alone = course.measured(backend, course.text(TIMES[:1]))
+    assert alone.smoothed is None
+    assert "smoothed" not in recover_numbers(alone)
+    text = course.text().replace("disturbances: orbit", "disturbances: none")
+    (course.folder / "none.yaml").write_text(text)
+    plain = run_recover(resolve_measurement(course.folder / "none.yaml"), backend)
+    assert plain.smoothed is None
+    assert recover_report(plain).sections[0].text == ()
