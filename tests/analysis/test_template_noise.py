@@ -118,8 +118,8 @@ def test_places_on_edges_keep_in_their_covariances():
 
 
 def test_a_bare_edge_has_no_place_along_it():
-    """However strong, and in whichever direction: the noise's own slopes do not count. What passes stands by chance on a
-    place where the noises of both are alike, 11 of 800 of another seed; by the normal matrix alone it is twice as many.
+    """However strong, and in whichever direction: the noise's own slopes do not count. What passes stands by chance on
+    a place where the noises of both are alike, 11 of 800 of another seed; by the normal matrix alone twice as many.
     """
     found = edges(200, noise=2.0, faint=0.0, seed=4).matched()
     assert found.accepted.sum() <= stats.binom.isf(1e-3, 200, 11 / 800)

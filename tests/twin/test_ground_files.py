@@ -100,7 +100,8 @@ def test_covariances_stand_along_the_axes_that_are_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["tif", "gtx"])
 def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
-    """Bilinear between whole degrees, by the formula; the date line is crossed. It is kept in single precision: 4e-6 m."""
+    """Bilinear between whole degrees, by the formula; the date line is crossed. It is kept in single precision: 4e-6 m.
+    """
     values = (0.1 * np.arange(181.0)[:, None] - 20.0 * np.cos(np.radians(np.arange(360.0) - 180.0))[None]).astype("f4")
     how = {"driver": "GTX" if ending == "gtx" else "GTiff", "width": 360, "height": 181, "count": 1, "dtype": "float32"}
     with rasterio.open(
