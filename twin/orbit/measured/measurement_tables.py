@@ -74,6 +74,10 @@ _LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
 """Between two readings, radians, and radians for each second: more than agile satellites turn."""
 
 
+CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
+"""Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
+
+
 @dataclass(frozen=True, eq=False)
 class PassTables:
     """The tables of a pass as they were read, for whoever reads them in other conventions.
@@ -114,12 +118,15 @@ class PassTables:
         ties = read_table(files["tie_points"], COLUMNS["image_points"]) if "tie_points" in files else None
         return cls(name, spec.epoch, orbit, attitude, lines, ground, images, ties)
 
-    def measurements(self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec) -> PassMeasurements:
+    def measurements(
+        self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, needed: Mapping[str, int] = CALIBRATING
+    ) -> PassMeasurements:
         """What they say in these conventions.
 
         Args:
             conventions: of all tables.
             camera: whose lines they name.
+            needed: role -> in how many line cameras one of its points must be seen.
 
         Raises:
             InputError: what they say cannot be, with file, line and column.
@@ -149,7 +156,7 @@ class PassTables:
         rays = np.zeros(len(ground), int)
         for row in images.values():
             np.add.at(rays, row.point, 1)
-        for role, least in (("control", 1), ("check", 2)):
+        for role, least in needed.items():
             if not np.any((ground.role == role) & (rays >= least)):
                 seen = "one line camera" if least == 1 else "two line cameras"
                 allowed = f"{role} points in the ground table whose image points are measured"
@@ -162,7 +169,10 @@ class PassTables:
 
 
 def read_measurements(
-    data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent
+    data: OrbitDataSpec,
+    camera: ThreeLineCameraSpec,
+    advance: Advance = silent,
+    needed: Mapping[str, int] = CALIBRATING,
 ) -> tuple[PassMeasurements, ...]:
     """All passes of a test.
 
@@ -170,13 +180,14 @@ def read_measurements(
         data: conventions and files.
         camera: whose lines they name.
         advance: how far it is.
+        needed: role -> in how many line cameras one of its points must be seen.
 
     Raises:
         InputError: a table cannot be read, or what it says cannot be, with file, line and column.
     """
     found = []
     for name, files in data.passes.items():
-        found.append(PassTables.read(name, files).measurements(data.conventions, camera))
+        found.append(PassTables.read(name, files).measurements(data.conventions, camera, needed))
         advance("read", len(found), len(data.passes))
     return tuple(found)
 
