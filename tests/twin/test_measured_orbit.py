@@ -16,13 +16,13 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data import body_axes_matrix
 from scenes.specs.measured.orbit_data_setup import (
     is_measured,
     resolve_any_angle,
     resolve_measured_angle,
     resolve_measured_calibration,
 )
+from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.specs.orbit_angle import EffectsSpec
 from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_simulate
 from scenes.yaml.errors import InputError
@@ -679,3 +679,57 @@ def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None
     assert measured.exit_code == 2
     assert "measurements are files already" in measured.output
     assert not (tmp_path / "other").exists()
+
+
+def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
+    """A pass with an SP3 in GPS time and an AEM in UTC gives what tables of the same numbers give, but for a millimetre
+    of the SP3's last digit and 1e-9 of the AEM's quaternions.
+    """
+    from scenes.specs.measured.pass_files_setup import resolve_check
+    from tests.twin.orbit_file_bench import aem, check_files, sp3
+    from twin.orbit.conventions.check_export import exported as check_exported
+    from twin.orbit.conventions.check_run import run_check
+
+    spec = check_files(tmp_path)
+    (tmp_path / "check.yaml").write_text(dump_yaml(spec))
+    checked = run_check(resolve_check(tmp_path / "check.yaml"), None, 0)
+    folder = tmp_path / "pass"
+    for name, text in check_exported(checked).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    sp3(folder / "pass.sp3", step=1.0)
+    aem(folder / "pass.aem")
+    (one,) = read_yaml(folder / "data.yaml").data["passes"]
+    data = read_yaml(folder / "data.yaml").data
+    passes = data["passes"][one]
+    for key in ("orbit", "attitude"):
+        del passes[key]
+    passes["platform"] = {
+        "orbit": {"file": "pass.sp3", "satellite": "L51"},
+        "attitude": {"file": "pass.aem", "body_axes": ["forward", "right", "down"]},
+        "earth": {"ut1_utc": "0 s"},
+    }
+    for key in ("quaternion", "body_axes"):
+        del data["conventions"][key]
+    (folder / "other.yaml").write_text(dump_yaml(data))
+    errors = {"gps": {"noise": ["1 m"] * 3}, "star_tracker": {"noise": ["1 arcsec"] * 3}}
+    found = []
+    for file in ("data.yaml", "other.yaml"):
+        test = {"name": "angle", "camera": "./camera.yaml", "data": file, "errors": errors, "time": "0 s"}
+        (folder / "angle.yaml").write_text(dump_yaml(test))
+        found.append(
+            run_measured_angle(resolve_measured_angle(folder / "angle.yaml"), None, 0).passes[0].estimate.along
+        )
+    assert found[0].values == pytest.approx(found[1].values, abs=0.02 * found[0].sigma.min())
+    # files that are missing are told by their key, with the nearest name
+    passes["platform"]["orbit"]["file"] = "pas.sp3"
+    (folder / "other.yaml").write_text(dump_yaml(data))
+    with pytest.raises(InputError, match=r"no such file(.|\n)*pass\.sp3"):
+        resolve_measured_angle(folder / "angle.yaml")
+    # a table of an attitude without its conventions
+    (folder / "data.yaml").write_text(
+        dump_yaml({**read_yaml(folder / "data.yaml").data, "conventions": data["conventions"]})
+    )
+    (folder / "angle.yaml").write_text(dump_yaml({**test, "data": "data.yaml"}))
+    with pytest.raises(InputError, match="quaternion is missing"):
+        resolve_measured_angle(folder / "angle.yaml")
