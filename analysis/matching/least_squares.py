@@ -17,11 +17,12 @@ derivatives fit the rest. Neither noise needs to be known, and a template withou
 **Covariance.** Noise of the image, interpolated noise of the template and what the model leaves unexplained all stand
 in the residuals. Assumed: over one window they are stationary, with a variance of its own (residual square sum over
 redundancy) and with a correlation of neighbours up to three pixels that all points share. It is the median over
-the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel)
-the covariance is B C B', and more where smoothing leaves few residuals to tell it by. To it comes what residuals tell
-of displacements that differ within the window (`analysis.matching.window_relief`) and the error of interpolation; steps
-of them are tested for (`analysis.matching.window_halves`). Not in the covariance: what pulls all points alike (an error
-of the reference's georeference) and aliasing of the image.
+the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel),
+by the curvature that is left when the slopes of the template's noise are taken off
+(`analysis.matching.template_noise`), the covariance is B C B', and more where smoothing leaves few residuals to tell it
+by. To it comes what residuals tell of displacements that differ within the window (`analysis.matching.window_relief`)
+and the error of interpolation; steps of them are tested for (`analysis.matching.window_halves`). Not in the covariance:
+what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
+from analysis.matching.template_noise import TemplateNoise, noise_energy, template_noise
 from analysis.matching.window_halves import WindowHalves, window_halves
 from analysis.matching.window_relief import ResidualCorrelation, WindowRelief, residual_correlation, window_relief
 
@@ -73,6 +75,7 @@ class Fits:
         reason: (n,) codes of `Reason`: ACCEPTED, TEMPLATE, OUTSIDE, IMAGE, SATURATED, FLAT, DIVERGED, MOVED,
             DISTORTED.
         spread: what the covariance of the noise is made of.
+        template: what noise of the templates does to the places.
         relief: what is seen of displacements within the windows.
         halves: how far apart halves of the windows put the places.
     """
@@ -87,6 +90,7 @@ class Fits:
     iterations: Index
     reason: NDArray[np.int8]
     spread: ResidualCorrelation
+    template: TemplateNoise
     relief: WindowRelief
     halves: WindowHalves
 
@@ -99,14 +103,19 @@ class Fits:
         """The two parts of `covariance`: of noise and interpolation, and of displacements within the window."""
         noise, hidden, tau, _usual = self._parts(good)
         relief = tau[:, None, None] * self.relief.effect
-        return noise * hidden[:, None, None] + _INTERPOLATION**2 * np.eye(2), relief
+        lean = self.template.covariance(self.reason == Reason.ACCEPTED if good is None else good)
+        return noise * hidden[:, None, None] + lean + _INTERPOLATION**2 * np.eye(2), relief
 
     def steps(self, good: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
         """(n,) chance that halves of windows without a step of the displacement are so far apart, and the power of that
         test; see `WindowHalves.judged`.
         """
         noise, hidden, _tau, usual = self._parts(good)
-        return self.halves.judged(self.spread.variance * self._coloured(noise) * hidden, usual)
+        # where noise of the template leaves no covariance the others' colour will do
+        coloured = self._coloured(noise)
+        shared = float(np.nanmedian(coloured)) if np.isfinite(coloured).any() else 1.0
+        coloured = np.where(np.isfinite(coloured), coloured, shared)
+        return self.halves.judged(self.spread.variance * coloured * hidden, usual)
 
     def _parts(self, good: NDArray[np.bool_] | None) -> tuple[Array, Array, Array, float]:
         """Covariance of visible noise, factor of the hidden, tau^2 of each point and of one that is like most."""
@@ -184,7 +193,7 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
     for turn in range(2):
         going = np.flatnonzero(reason == 0)
         most = int(level.max(initial=0)) + 1 if turn else len(some)
-        chosen = _best_smoothing(stack, most, going, grey, (row, column), shift, affine, options)
+        chosen, lowered = _best_smoothing(stack, some[:most], going, grey, (row, column), shift, affine, options)
         going = going[(chosen != level)[going] | (turn == 0)]
         level = chosen
         for iteration in range(options.iterations + 1):
@@ -218,7 +227,21 @@ def _fit(image: NDArray[np.generic], templates: Array, start: Array, options: Ma
             going = going[~((rest & moved) | far | bent)]
         reason[going] = Reason.DIVERGED
     smoothing = np.array(some)[level]
-    return _summary(grey, anchor + shift, affine, linear, design, residual, smoothing, iterations, reason, reach)
+    of_template = template_noise(
+        stack,
+        level * count + np.arange(count),
+        (row, column),
+        shift,
+        affine,
+        linear,
+        smoothing,
+        design,
+        residual,
+        lowered,
+    )
+    return _summary(
+        grey, anchor + shift, affine, linear, design, residual, smoothing, iterations, reason, reach, of_template
+    )
 
 
 def _windows(
@@ -250,32 +273,38 @@ def _windows(
 
 def _best_smoothing(
     stack: SplineStack,
-    most: int,
+    some: list[float],
     which: Index,
     grey: Array,
     window: tuple[Array, Array],
     shift: Array,
     affine: Array,
     options: MatchOptions,
-) -> Index:
-    """(n,) number, below most, of the strongest with which templates predict the image as well as with the best, after
-    one linear step. 0 for those that are not which.
+) -> tuple[Index, tuple[Array, Array]]:
+    """(n,) number of the strongest of some low passes with which templates predict the image as well as with the best,
+    after one linear step, and by how much it lowers residuals and noise against the first (`template_noise`). 0 for
+    those that are not which.
     """
-    best = np.zeros(len(grey), np.intp)
+    best, lowered = np.zeros(len(grey), np.intp), (np.zeros(len(grey)), np.zeros(len(grey)))
     if not which.size:
-        return best
+        return best, lowered
     # the gain of the first guess only scales columns, which residuals do not feel
     linear = np.zeros((which.size, options.parameters - 3 - 4 * options.affine))
     linear[:, :1] = 1.0
-    square = np.zeros((most, which.size))
-    for k in range(most):
+    most = len(some)
+    square, energy = np.zeros((2, most, which.size))
+    for k, smoothing in enumerate(some):
         number = k * len(grey) + which
-        residual = _step(stack, number, grey[which], window, shift[which], affine[which], linear, 1, options)[2]
+        step, _, residual = _step(stack, number, grey[which], window, shift[which], affine[which], linear, 1, options)
         square[k] = np.einsum("np,np->n", residual, residual)
+        energy[k] = noise_energy(step[:, 3 + 4 * options.affine :], smoothing)
     # too little smoothing claims too much, too much loses a little
     alike = square <= square.min(axis=0) * (1.0 + _CHANCE / grey.shape[1])
     best[which] = most - 1 - np.argmax(alike[::-1], axis=0)
-    return best
+    at = best[which], np.arange(which.size)
+    for one, values in zip(lowered, (square, energy), strict=True):
+        one[which] = values[0] - values[at]
+    return best, lowered
 
 
 def _step(
@@ -330,6 +359,7 @@ def _summary(
     iterations: Index,
     reason: NDArray[np.int8],
     reach: int,
+    of_template: TemplateNoise,
 ) -> Fits:
     none = np.isin(reason, (Reason.TEMPLATE, Reason.OUTSIDE, Reason.IMAGE, Reason.FLAT, Reason.SATURATED))
     square = np.einsum("np,np->n", residual, residual)
@@ -356,7 +386,8 @@ def _summary(
         smoothing * hidden,
         iterations,
         reason,
-        residual_correlation(*fitted, side),
+        residual_correlation(*fitted, side, of_template.inverse),
+        of_template,
         window_relief(*fitted, side),
         window_halves(*fitted, side),
     )

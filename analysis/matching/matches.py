@@ -95,7 +95,9 @@ def match(
     # NaN compares false
     reason[(reason == 0) & ~(_worst(noise) <= chosen.largest_sigma)] = Reason.UNCERTAIN
     reason[(reason == 0) & ~(_worst(covariance) <= chosen.largest_sigma)] = Reason.RELIEF
-    reason = _without_steps(reason, *fits.steps(good), chosen)
+    # windows that noise of the template makes unknown still tell whether windows here have steps
+    silent = good & ~np.isfinite(_worst(noise))
+    reason = _without_steps(reason, silent, *fits.steps(good), chosen)
     reason[_open(reason) & (reason != 0) & (fits.contrast < chosen.least_contrast)] = Reason.FLAT
     return Matches(
         place=fits.place,
@@ -107,12 +109,15 @@ def match(
     )
 
 
-def _without_steps(reason: NDArray[np.int8], chance: Array, power: Array, options: MatchOptions) -> NDArray[np.int8]:
-    """Verdicts after the test for steps of the displacement within windows."""
+def _without_steps(
+    reason: NDArray[np.int8], silent: NDArray[np.bool_], chance: Array, power: Array, options: MatchOptions
+) -> NDArray[np.int8]:
+    """Verdicts after the test for steps of the displacement within windows; the silent are only counted."""
     tested = reason == Reason.ACCEPTED
     # NaN compares false
     step = tested & ~(chance >= FALSE_ALARM)
-    share = float(step.sum()) / max(int(tested.sum()), 1)
+    counted = tested | silent
+    share = float(np.sum(step | (silent & (chance < FALSE_ALARM)))) / max(int(counted.sum()), 1)
     weak = tested & ~step & ~(risk(share, power) <= options.largest_risk)
     return np.where(step, Reason.RELIEF, np.where(weak, Reason.UNTESTED, reason)).astype(np.int8)
 

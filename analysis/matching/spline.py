@@ -118,11 +118,11 @@ class SplineStack:
             row: (m, p) in pixels of the template; clipped to it.
             column: (m, p).
             which: (m,) template of each row of places.
-            order: highest derivative, 1 to 3.
+            order: highest derivative, 1 to 4.
 
         Returns:
-            (3, 6 or 10, m, p): value; by row, column; by row row, row column, column column; by row row row, row row
-            column, row column column, column column column.
+            (3, 6, 10 or 15, m, p): value; by row, column; by row row, row column, column column; by row row row, row
+            row column, row column column, column column column; and so on.
         """
         weights, base = [], np.broadcast_to(self._first[which][:, None], row.shape)
         for place, step in ((row, self._stride), (column, 1)):
@@ -154,11 +154,11 @@ def _weights(fraction: Array, orders: int) -> Array:
 
 
 def _pieces() -> Array:
-    """(4, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
+    """(5, 6, 6) coefficients of the basis and its derivatives: order, knot, power."""
     basis = PPoly.from_spline(BSpline.basis_element(np.arange(_DEGREE + 2.0), extrapolate=False))
-    table = np.zeros((4, _DEGREE + 1, _DEGREE + 1))
+    table = np.zeros((5, _DEGREE + 1, _DEGREE + 1))
     start = np.searchsorted(basis.x, np.arange(_DEGREE + 1.0), side="right") - 1
-    for order in range(4):
+    for order in range(5):
         # highest power first; knot j + m about place j + f meets the piece (degree + 1) / 2 - m
         rising = basis.derivative(order).c[::-1][:, start[::-1]] if order else basis.c[::-1][:, start[::-1]]
         table[order, :, : len(rising)] = rising.T

@@ -40,7 +40,8 @@ class ResidualCorrelation:
 
     Attributes:
         variance: (n,) of the residuals, DN^2, by redundancy.
-        white: (n, 2, 2) covariance of the place for residuals that are white with unit variance.
+        white: (n, 2, 2) covariance of the place for residuals that are white with unit variance; NaN where most of what
+            the fit knows is noise of the template.
         influence: (n, lags, 2, 2) by how much correlation 1 at a lag and at its opposite raises it.
         correlation: (n, lags) of the residuals, freed of what the fit takes out of white noise.
         pixels, unknowns: (n,) of the fits.
@@ -77,13 +78,17 @@ class ResidualCorrelation:
         return np.asarray(self.variance[:, None, None] * matrix)
 
 
-def residual_correlation(design: Array, residual: Array, side: int) -> ResidualCorrelation:
+def residual_correlation(
+    design: Array, residual: Array, side: int, inverse: Array | None = None
+) -> ResidualCorrelation:
     """From designs (n, q, p), the first two columns by place, and residuals (n, p) of square windows; NaN: no fit.
 
     Args:
         design: derivatives of the model, (n, q, p), the first two by place.
         residual: (n, p), grey values; NaN where there is no fit.
         side: of the windows, px, with p = side^2.
+        inverse: (n, q, q) of the curvature, by which the unknowns answer to residuals
+            (`analysis.matching.template_noise`); NaN where that is not known. None: of the normal matrix.
     """
     count, unknowns, pixels = design.shape
     variance = np.full(count, np.nan)
@@ -97,9 +102,12 @@ def residual_correlation(design: Array, residual: Array, side: int) -> ResidualC
         return ResidualCorrelation(variance, white, influence, correlation, *size)
     scaled = design[used] / scale[used, :, None]
     # a pseudo-inverse, because some unknowns may be open where there is little texture
-    inverse = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
-    hat = (inverse @ scaled).reshape(len(used), unknowns, side, side)
-    place = hat[:, :2] / scale[used, :2, None, None]
+    normal = np.linalg.pinv(scaled @ np.swapaxes(scaled, 1, 2), rcond=1e-11, hermitian=True)
+    hat = (normal @ scaled).reshape(len(used), unknowns, side, side)
+    if inverse is None:
+        place = hat[:, :2] / scale[used, :2, None, None]
+    else:
+        place = (inverse[used, :2] @ design[used]).reshape(len(used), 2, side, side)
     column = scaled.reshape(hat.shape)
     rest = residual[used].reshape(-1, side, side)
     square = np.maximum(np.einsum("nij,nij->n", rest, rest), 1e-300)

@@ -165,7 +165,7 @@ def taken(annotation: Any, metadata: typing.Iterable[Any] = ()) -> Takes:
     if isinstance(annotation, type) and issubclass(annotation, Spec):
         return Takes("mapping", below=(("", annotation),))
     if typing.get_origin(annotation) in (types.UnionType, typing.Union):
-        return _either([taken(one) for one in typing.get_args(annotation)])
+        return _either([taken(one) for one in typing.get_args(annotation) if one is not types.NoneType])
     if typing.get_origin(annotation) is tuple:
         return _listed(typing.get_args(annotation), marks)
     if typing.get_origin(annotation) is dict:

@@ -18,6 +18,7 @@ from tests.benchmarks import (
     quality_speed,
     start_speed,
     study_speed,
+    table_speed,
     trace_speed,
 )
 from tests.benchmarks.number import Speed
@@ -51,6 +52,7 @@ BENCHMARKS = (
     Benchmark("layouts", "information of a monitor's layout, and a search for layouts", layout_speed.measure, 90, 20),
     Benchmark("geolocation", "ground points of all pixels", geolocation_speed.measure, 8, 2),
     Benchmark("pushbroom", "images of the ground", pushbroom_speed.measure, 60, 15),
+    Benchmark("tables", "tables of measurements with a million rows", table_speed.measure, 40, 2),
     Benchmark("quality", "image quality with shadows and without", quality_speed.measure, 20, 5),
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),

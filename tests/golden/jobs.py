@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import tifffile
@@ -67,6 +69,36 @@ def _frames(folder: Path) -> None:
     (folder / "frames.yaml").write_text(text)
 
 
+def _files(folder: Path) -> None:
+    """The same pass as files, with what is to be measured in its images: a test for `match`."""
+    words = ["twin.orbit", "simulate", f"{JOBS}/simulate.yaml", "--out", str(folder / "pass"), "--quiet"]
+    words += ["--export", str(folder / "files")]
+    subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
+    lines = json.loads((folder / "pass/simulate.json").read_text())["lines"]
+    clock = "time_scale: UTC, epoch: 2011-03-05T03:05:00Z"
+    text = f"""
+        name: match
+        camera: th1
+        platform:
+          orbit: {{file: files/simulate/orbit.csv, frame: ITRS, {clock}}}
+          attitude:
+            {{file: files/simulate/attitude.csv, frame: ITRS, {clock}, scalar: last, turns: body_to_frame,
+            body_axes: [forward, right, down]}}
+        lines: {{file: files/simulate/lines.csv, {clock}, moment: middle}}
+        orthophoto: {{file: pass/images/orthophoto.tiff}}
+        dem: {{file: pass/images/dem.tiff}}
+        control_sigma: [1 m, 2 m]
+        points: {{control: 40, check: 20, tie: 30, reach: 40, template: 31}}
+        images:
+        """
+    images = [
+        f"  {name}: {{file: pass/images/{name}.tiff, first_line: {line['first_line']}, "
+        f"first_pixel: {line['first_pixel']}, first_pixel_sees: right}}\n"
+        for name, line in lines.items()
+    ]
+    (folder / "match.yaml").write_text(dedent(text).lstrip().rstrip(" ") + "".join(images))
+
+
 @dataclass(frozen=True)
 class Job:
     """One command.
@@ -118,6 +150,8 @@ ALL = (
     _job("lab_focus", f"twin.lab focus {RUN % 'focus'} --seed 5"),
     _job("lab_distortion", f"twin.lab distortion {RUN % 'distortion'}"),
     _job("lab_turntable", f"twin.lab turntable {RUN % 'turntable'} --json"),
+    _job("lab_focus_measured", "twin.lab focus scenes/lab/measured/focus.yaml --out {out}"),
+    _job("lab_turntable_measured", "twin.lab turntable scenes/lab/measured/turntable.yaml --out {out} --json"),
     _job("orbit_simulate", f"twin.orbit simulate {RUN % 'simulate'}"),
     _job("orbit_angle", f"twin.orbit angle {RUN % 'angle'} --json"),
     _job("orbit_angle_traced", f"twin.orbit angle {RUN % 'angle_gf7'}"),
@@ -126,6 +160,10 @@ ALL = (
     _job("orbit_calibrate_monitor", f"twin.orbit calibrate {RUN % 'calibrate_monitor'}"),
     _job("orbit_calibrate_strip", f"twin.orbit calibrate {RUN % 'calibrate_strip'}"),
     _job("orbit_calibrate_images", f"twin.orbit calibrate {RUN % 'calibrate_images'}"),
+    _job("orbit_angle_measured", "twin.orbit angle scenes/orbit/measured/angle.yaml --out {out} --quiet"),
+    _job("orbit_calibrate_measured", "twin.orbit calibrate scenes/orbit/measured/calibrate.yaml --out {out}"),
+    _job("orbit_check", "twin.orbit check scenes/orbit/measured/check.yaml --out {out}"),
+    _job("orbit_match", "twin.orbit match {here}/match.yaml --out {out}", prepare=_files),
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
     _job("orbit_export", "twin.orbit export {here}/pass --out {out}", prepare=_pass),
     _job("orbit_export_traced", f"twin.orbit export {RUN % 'angle_gf7'}"),

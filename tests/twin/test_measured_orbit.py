@@ -16,19 +16,21 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_data import body_axes_matrix
 from scenes.specs.measured.orbit_data_setup import (
     is_measured,
     resolve_any_angle,
     resolve_measured_angle,
     resolve_measured_calibration,
 )
+from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.specs.orbit_angle import EffectsSpec
-from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
+from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
+from twin.orbit.angle.angle_export import angle_exported
+from twin.orbit.angle.angle_run import run_angle
 from twin.orbit.angle.measured_angle import run_measured_angle
 from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
@@ -631,3 +633,103 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
     nothing = done.setup.model_copy(update={"test": done.setup.test.model_copy(update={"points": None})})
     with pytest.raises(InputError, match="images alone give no tables"):
         simulation_exported(replace(done, setup=nothing, points=None))
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"effects": {"corrected": False}}, {"errors": {"points": "0.1 m"}, "time": "7 s"}]
+)
+def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> None:
+    """Planes, along the track and resection: values to the rounding of a coordinate in the ITRS, 1e-9 m and 2e-15 rad
+    from 500 km, which is 3e-9 of the sigmas; three of it. Sigmas to what 1e-6 px adds.
+    """
+    tolerance = 1e-8
+    plain = read_yaml(SCENES / ORBIT / "angle.yaml").data | {"passes": 2}
+    for key, value in changes.items():
+        plain[key] = plain[key] | value if isinstance(value, dict) else value
+    (tmp_path / "angle.yaml").write_text(dump_yaml(plain))
+    run_ = run_angle(resolve_angle(tmp_path / "angle.yaml"), None, 3)
+    for name, text in angle_exported(run_).items():
+        (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "out" / name).write_text(text)
+    again = run_measured_angle(resolve_measured_angle(tmp_path / "out/angle.yaml"), None, 0)
+    assert len(again.passes) == 1
+    one, two = run_.estimate, again.passes[0].estimate
+    for method in one.angles:
+        sigma = one.angles[method].sigma
+        assert np.abs(one.angles[method].values - two.angles[method].values).max() < tolerance * sigma.min()
+        assert two.angles[method].covariance == pytest.approx(one.angles[method].covariance, rel=1e-8)
+    assert np.abs(one.along.values - two.along.values).max() < tolerance * one.along.sigma.min()
+    pairs = tuple(run_.flight.pairs.values())
+    spread = one.resection.angle_covariance(pairs)
+    apart = one.resection.angles(pairs) - two.resection.angles(pairs)
+    assert np.abs(apart).max() < tolerance * np.sqrt(np.diag(spread)).min()
+    assert two.resection.angle_covariance(pairs) == pytest.approx(spread, rel=1e-8)
+
+
+def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None:
+    """Traced lines; and measurements, which are files."""
+    traced = run(
+        "angle", SCENES / ORBIT / "angle_gf7.yaml", "--out", tmp_path / "run", "--export", tmp_path / "other", "--quiet"
+    )
+    assert traced.exit_code == 2
+    assert "the lines of an instrument are traced" in traced.output
+    measured = run(
+        "angle", angle_file(files.parent), "--out", tmp_path / "run", "--export", tmp_path / "other", "--quiet"
+    )
+    assert measured.exit_code == 2
+    assert "measurements are files already" in measured.output
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
+    """A pass with an SP3 in GPS time and an AEM in UTC gives what tables of the same numbers give, but for a millimetre
+    of the SP3's last digit and 1e-9 of the AEM's quaternions.
+    """
+    from scenes.specs.measured.pass_files_setup import resolve_check
+    from tests.twin.orbit_file_bench import aem, check_files, sp3
+    from twin.orbit.conventions.check_export import exported as check_exported
+    from twin.orbit.conventions.check_run import run_check
+
+    spec = check_files(tmp_path)
+    (tmp_path / "check.yaml").write_text(dump_yaml(spec))
+    checked = run_check(resolve_check(tmp_path / "check.yaml"), None, 0)
+    folder = tmp_path / "pass"
+    for name, text in check_exported(checked).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    sp3(folder / "pass.sp3", step=1.0)
+    aem(folder / "pass.aem")
+    (one,) = read_yaml(folder / "data.yaml").data["passes"]
+    data = read_yaml(folder / "data.yaml").data
+    passes = data["passes"][one]
+    for key in ("orbit", "attitude"):
+        del passes[key]
+    passes["platform"] = {
+        "orbit": {"file": "pass.sp3", "satellite": "L51"},
+        "attitude": {"file": "pass.aem", "body_axes": ["forward", "right", "down"]},
+        "earth": {"ut1_utc": "0 s"},
+    }
+    for key in ("quaternion", "body_axes"):
+        del data["conventions"][key]
+    (folder / "other.yaml").write_text(dump_yaml(data))
+    errors = {"gps": {"noise": ["1 m"] * 3}, "star_tracker": {"noise": ["1 arcsec"] * 3}}
+    found = []
+    for file in ("data.yaml", "other.yaml"):
+        test = {"name": "angle", "camera": "./camera.yaml", "data": file, "errors": errors, "time": "0 s"}
+        (folder / "angle.yaml").write_text(dump_yaml(test))
+        found.append(
+            run_measured_angle(resolve_measured_angle(folder / "angle.yaml"), None, 0).passes[0].estimate.along
+        )
+    assert found[0].values == pytest.approx(found[1].values, abs=0.02 * found[0].sigma.min())
+    # files that are missing are told by their key, with the nearest name
+    passes["platform"]["orbit"]["file"] = "pas.sp3"
+    (folder / "other.yaml").write_text(dump_yaml(data))
+    with pytest.raises(InputError, match=r"no such file(.|\n)*pass\.sp3"):
+        resolve_measured_angle(folder / "angle.yaml")
+    # a table of an attitude without its conventions
+    (folder / "data.yaml").write_text(
+        dump_yaml({**read_yaml(folder / "data.yaml").data, "conventions": data["conventions"]})
+    )
+    (folder / "angle.yaml").write_text(dump_yaml({**test, "data": "data.yaml"}))
+    with pytest.raises(InputError, match="quaternion is missing"):
+        resolve_measured_angle(folder / "angle.yaml")

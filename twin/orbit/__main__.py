@@ -43,6 +43,13 @@ def calibration_export(run: Any) -> Mapping[str, str]:
     return exported(run)
 
 
+def angle_export(run: Any) -> Mapping[str, str]:
+    """What a measurement of angles was made from, as files."""
+    from twin.orbit.angle.angle_export import angle_exported
+
+    return angle_exported(run)
+
+
 def match_export(run: Any) -> Mapping[str, str]:
     """Points that were matched, with the pass, as files."""
     from twin.orbit.matching.match_numbers import exported
@@ -85,13 +92,15 @@ add_test(
     space resection as the second method.
 
     A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
-    against those of the laboratory.
+    against those of the laboratory. `--export DIR` writes such a folder of what a simulation measured, with a test file
+    angle.yaml.
 
     angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
     station and of the points.
 
     Example: `python -m twin.orbit angle scenes/orbit/angle.yaml`
     """,
+    angle_export,
 )
 
 add_test(

@@ -8,38 +8,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from scenes.specs.measured.pass_files import BodyAxes, PlatformFilesSpec
 from scenes.specs.orbit_angle import Angles, EffectsSpec, Flag, Moment
 from scenes.specs.orbit_calibration import LaunchSpec, MapLimitsSpec, checked_schemes
 from scenes.specs.orbit_spec import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.spec import Name, Named, Reference, Spec
-
-Toward = Literal["forward", "back", "right", "left", "up", "down"]
-_TOWARD: Mapping[str, tuple[int, int, int]] = {
-    "forward": (1, 0, 0),
-    "back": (-1, 0, 0),
-    "right": (0, 1, 0),
-    "left": (0, -1, 0),
-    "down": (0, 0, 1),
-    "up": (0, 0, -1),
-}
-"""In the project's body axes: X forward, Y right, Z down."""
-
-
-def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
-    """Rows: the file's body x, y and z in the project's body axes, so that v_file = matrix @ v_project."""
-    return tuple(_TOWARD[axis] for axis in axes)
-
-
-def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, Toward]:
-    (a, b, c), (d, e, f), (g, h, i) = body_axes_matrix(axes)
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
-        allowed = "three directions square to each other, z = x × y, as [forward, right, down]"
-        raise Problem("no right-handed axes", names_text(axes), allowed)
-    return axes
-
-
-BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
 
 
 class QuaternionSpec(Spec):
@@ -56,12 +30,13 @@ class QuaternionSpec(Spec):
 
 
 class ConventionsSpec(Spec):
-    """How the numbers of the tables are to be read. All of it must be said.
+    """How the numbers of the tables are to be read. All must be said; quaternion and body axes where a table
+    holds quaternions.
 
     Attributes:
         frame: axes of positions, velocities and quaternions; velocities are those against these axes. itrs is
             Earth-fixed (WGS 84, CGCS2000 and ITRF agree with it to some centimetres).
-        quaternion: order and sense.
+        quaternion: order and sense; of tables.
         body_axes: what x, y and z of the quaternions' body point to in flight, as [forward, right, down].
         time_scale: in which the epochs of the passes are written. Times in tables are SI seconds from them.
         line_moment: which moment of its exposure the time of a line is.
@@ -71,8 +46,8 @@ class ConventionsSpec(Spec):
     """
 
     frame: Literal["itrs"]
-    quaternion: QuaternionSpec
-    body_axes: BodyAxes
+    quaternion: QuaternionSpec | None = None
+    body_axes: BodyAxes | None = None
     time_scale: Literal["utc"]
     line_moment: Literal["start", "middle", "end"]
     centre: Literal["integer", "half"]
@@ -89,7 +64,8 @@ class PassFilesSpec(Spec):
 
     Attributes:
         epoch: of the times in all tables.
-        platform: orbit and attitude in one table; or each in its own:
+        platform: orbit and attitude in one table, or files of other formats (SP3, OEM, AEM ...) with what they do not
+            say themselves; or each in its own table:
         orbit: time, x, y, z and perhaps vx, vy, vz.
         attitude: time, q1, q2, q3, q4.
         lines: when the lines of each line camera were exposed.
@@ -99,7 +75,7 @@ class PassFilesSpec(Spec):
     """
 
     epoch: UtcTime
-    platform: Reference | None = None
+    platform: Reference | PlatformFilesSpec | None = None
     orbit: Reference | None = None
     attitude: Reference | None = None
     lines: Reference
@@ -112,15 +88,15 @@ class PassFilesSpec(Spec):
         apart = (self.orbit is not None, self.attitude is not None)
         if (self.platform is not None) == any(apart) or (any(apart) and not all(apart)):
             given = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
-            allowed = "`platform: FILE`, or `orbit: FILE` and `attitude: FILE`"
+            allowed = "`platform: FILE`, `platform:` with files of other formats, or `orbit: FILE` and `attitude: FILE`"
             raise Problem("orbit and attitude are not given once", " and ".join(given) or "none of them", allowed)
         return self
 
     @property
     def files(self) -> dict[str, str]:
-        """Key -> what it names, for all that are given."""
+        """Key -> what it names, for all that are given; without files of other formats."""
         found = {name: getattr(self, name) for name in FILE_KEYS}
-        return {name: file for name, file in found.items() if file is not None}
+        return {name: file for name, file in found.items() if isinstance(file, str)}
 
 
 def _some_passes(passes: Named[PassFilesSpec]) -> Named[PassFilesSpec]:

@@ -13,6 +13,7 @@ from scenes.specs.measured.orbit_data import (
     OrbitDataSpec,
     PassFilesSpec,
 )
+from scenes.specs.measured.pass_files import PlatformFilesSpec, with_absolute_files
 from scenes.specs.orbit_setup import AngleSetup, CalibrationSetup, resolve_angle, resolve_calibration
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
@@ -136,32 +137,58 @@ def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
     if test.data is None:
         assert test.conventions is not None
         assert test.passes is not None
-        return OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test, test.passes, folder))
+        data = OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test, test.passes, folder))
+        return _with_quaternions_said(test, data)
     place = folder / test.data
     file = place / DATA_FILE if place.is_dir() else place
     if not file.is_file():
         allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
         raise test.error("no such measurements", ("data",), found=str(place), allowed=allowed)
     data = validate(OrbitDataSpec, read_yaml(file))
-    return data.model_copy(update={"passes": _placed(data, data.passes, file.parent)})
+    return _with_quaternions_said(data, data.model_copy(update={"passes": _placed(data, data.passes, file.parent)}))
 
 
 def _placed(owner: Spec, passes: Mapping[str, PassFilesSpec], folder: Path) -> FrozenMap[str, PassFilesSpec]:
     """The passes with absolute paths. InputError, at the key of the owner, for a file that is not there."""
     found = {}
     for name, one in passes.items():
-        files = {}
-        for key, value in one.files.items():
-            place = folder / value
-            if not _is_there(place):
-                beside = [place.with_name(other.name) for other in _beside(place)]
-                meant = nearest(str(place), [str(other) for other in beside])
-                told = None if meant is None else str(Path(value).with_name(Path(meant).name))
-                allowed = "a CSV file, its path relative to this one"
-                raise owner.error("no such file", ("passes", name, key), found=value, allowed=allowed, suggestion=told)
-            files[key] = str(place.absolute())
+        files: dict[str, Any] = {
+            key: _present(owner, ("passes", name, key), folder, value) for key, value in one.files.items()
+        }
+        if isinstance(one.platform, PlatformFilesSpec):
+            others = {
+                ("orbit", "file"): one.platform.orbit.file,
+                ("attitude", "file"): one.platform.attitude.file,
+                ("earth_orientation",): one.platform.earth_orientation,
+            }
+            for key, value in others.items():
+                if value is not None:
+                    _present(owner, ("passes", name, "platform", *key), folder, value, "a file")
+            files["platform"] = with_absolute_files(one.platform, folder)
         found[name] = one.model_copy(update=files)
     return FrozenMap(found)
+
+
+def _present(owner: Spec, key: tuple[str, ...], folder: Path, value: str, what: str = "a CSV file") -> str:
+    """The absolute path of a file. InputError, at the key of the owner, where it is not there."""
+    place = folder / value
+    if not _is_there(place):
+        beside = [place.with_name(other.name) for other in _beside(place)]
+        meant = nearest(str(place), [str(other) for other in beside])
+        told = None if meant is None else str(Path(value).with_name(Path(meant).name))
+        allowed = f"{what}, its path relative to this one"
+        raise owner.error("no such file", key, found=value, allowed=allowed, suggestion=told)
+    return str(place.absolute())
+
+
+def _with_quaternions_said(owner: Spec, data: OrbitDataSpec) -> OrbitDataSpec:
+    """The same. InputError where a table of an attitude is not said how to be read."""
+    tables = any(not isinstance(one.platform, PlatformFilesSpec) for one in data.passes.values())
+    for key in ("quaternion", "body_axes"):
+        if tables and getattr(data.conventions, key) is None:
+            problem = f"{key} is missing: a table of an attitude does not say how it is to be read"
+            raise owner.error(problem, ("conventions",), allowed=f"`{key}:`")
+    return data
 
 
 def _is_there(place: Path) -> bool:

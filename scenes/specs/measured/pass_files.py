@@ -5,15 +5,41 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.measured.orbit_data import BodyAxes
 from scenes.specs.orbit_spec import EarthSpec
-from scenes.yaml.errors import Problem
+from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Reference, Spec, Text
 from scenes.yaml.units import ANGLE, LENGTH, TIME
+
+Toward = Literal["forward", "back", "right", "left", "up", "down"]
+_TOWARD: Mapping[str, tuple[int, int, int]] = {
+    "forward": (1, 0, 0),
+    "back": (-1, 0, 0),
+    "right": (0, 1, 0),
+    "left": (0, -1, 0),
+    "down": (0, 0, 1),
+    "up": (0, 0, -1),
+}
+"""In the project's body axes: X forward, Y right, Z down."""
+
+
+def body_axes_matrix(axes: tuple[str, str, str]) -> tuple[tuple[int, int, int], ...]:
+    """Rows: the file's body x, y and z in the project's body axes, so that v_file = matrix @ v_project."""
+    return tuple(_TOWARD[axis] for axis in axes)
+
+
+def _right_handed(axes: tuple[Toward, Toward, Toward]) -> tuple[Toward, Toward, Toward]:
+    (a, b, c), (d, e, f), (g, h, i) = body_axes_matrix(axes)
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
+        allowed = "three directions square to each other, z = x × y, as [forward, right, down]"
+        raise Problem("no right-handed axes", names_text(axes), allowed)
+    return axes
+
+
+BodyAxes = Annotated[tuple[Toward, Toward, Toward], AfterValidator(_right_handed)]
 
 TimeScale = Literal["UTC", "GPS", "TAI", "TT", "GAL", "QZS", "BDT"]
 OrbitFrame = Literal["ITRS", "GCRS", "EME2000", "TEME"]

@@ -126,7 +126,7 @@ def changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
 
 _LINE_TIME = 1e-3
 """Seconds; of an image of one line only its middle is used."""
-_LEAST_SIGMA = 1e-3
+LEAST_SIGMA = 1e-3
 """Metres. Points without errors are given this sigma, for an adjustment needs weights."""
 _LEAST_CONVERGENCE = np.radians(1.0)
 """Rays that meet at a smaller angle give no heights: one arcsecond would be half a kilometre and more."""
@@ -307,7 +307,7 @@ class AnglePass:
         found = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
         if corrected.light_time or corrected.aberration or corrected.refraction:
             found = without_effects(found, place, self.velocity, self.earth, corrected)
-        sigma = max(errors.points, _LEAST_SIGMA)
+        sigma = max(errors.points, LEAST_SIGMA)
         strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(found, len(lines)), strict=True)}
         inside = {name: interior(self.laboratory[name], self.pixel[name]) for name in lines}
         return Measurement(

@@ -187,6 +187,11 @@ class AngleRun:
     height: Mapping[str, float | None]
 
     @property
+    def shown(self) -> np.random.SeedSequence:
+        """Of the errors of the pass that is shown."""
+        return _streams(self.seed)[1]
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the angles."""
         return tuple(self.flight.pairs)
@@ -242,7 +247,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         InputError: an instrument's changes are not possible.
         BenchError: the test cannot be carried out as its file says.
     """
-    terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
+    terrain, shown, repeats = _streams(seed)
     flight = fly(setup, angle_camera(setup, backend), terrain)
     pairs = tuple(flight.pairs.values())
     count = setup.test.passes
@@ -291,6 +296,12 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         )
     except (PlaneError, AngleError, ResectionError) as error:
         raise BenchError(str(error), ("strips",), "a longer strip, more points, or smaller errors") from error
+
+
+def _streams(seed: int) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
+    """Of the terrain, of the errors of the pass that is shown, of those of its repeats."""
+    terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
+    return terrain, shown, repeats
 
 
 def resected(measurement: Measurement, flight: TestedLines) -> Resection:

@@ -21,7 +21,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit_angle import LEAST_POINTS, usual_angles
 from scenes.yaml.errors import names_text, nearest
-from twin.orbit.angle.angle_flight import INTERIOR, Measurement, interior, without_effects
+from twin.orbit.angle.angle_flight import INTERIOR, LEAST_SIGMA, Measurement, interior, without_effects
 from twin.orbit.angle.angle_run import Estimate, estimated
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.measured.orbit_data import ReadingErrorsSpec
     from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
-
-_LEAST_SIGMA = 1e-3
-"""Metres. Points without errors are given this sigma, for an adjustment needs weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +131,7 @@ def run_measured_angle(
         BenchError: the points do not determine the angles.
     """
     passes = []
-    for one in read_measurements(setup.data, setup.camera, advance):
+    for one in read_measurements(setup.data, setup.camera, advance, needed={}):
         try:
             passes.append(measured_angles(setup, one))
         except (PlaneError, AngleError, ResectionError, ValueError) as error:
@@ -248,7 +245,7 @@ def _strip(
     ]
     slope = np.stack(slopes, axis=-1)
     spread = spread + slope @ points.covariance @ np.swapaxes(slope, 1, 2)
-    spread = spread + _LEAST_SIGMA**2 * np.eye(3)
+    spread = spread + LEAST_SIGMA**2 * np.eye(3)
     square = np.sum(arm**2, axis=1)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None, :]
     turned, moved = _shared(seconds - moment, path, errors)
     spread = spread + turned[:, None, None] * square + moved[:, None, None] * np.eye(3)

@@ -139,7 +139,10 @@ def measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tupl
     errors, gps = test.errors.star_tracker, test.errors.gps
     angles = ", ".join(format_quantity(v, ANGLE) for v in errors.noise)
     lengths = ", ".join(format_quantity(v, LENGTH) for v in gps.noise)
-    quaternion = said.quaternion
+    quaternion = "as the files of the platform say"
+    if said.quaternion is not None and said.body_axes is not None:
+        turns = said.quaternion.turns.replace("_", " ")
+        quaternion = f"scalar {said.quaternion.scalar}, {turns}, body {', '.join(said.body_axes)}"
     paths = {one.measured.interpolation for one in run.campaign.passes}
     joined = {"spline": "cubic spline", "lagrange": "Lagrange's polynomial of ten readings"}
     light = "none" if not any_effect(run.campaign.effects) else "taken out" if test.effects.corrected else "left in"
@@ -152,10 +155,7 @@ def measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tupl
             "Frame and time",
             f"{said.frame}; epochs in {said.time_scale.upper()}; a line's time is the {said.line_moment}",
         ),
-        (
-            "Quaternions",
-            f"scalar {quaternion.scalar}, {quaternion.turns.replace('_', ' ')}, body {', '.join(said.body_axes)}",
-        ),
+        ("Quaternions", quaternion),
         (
             "Pixels",
             f"middle of pixel n at {'n' if said.centre == 'integer' else 'n + 0.5'}, the first is {said.first_pixel}",

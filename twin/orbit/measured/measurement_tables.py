@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.orbit.calibration_parameters import level_covariance
-from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec, body_axes_matrix
+from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
+from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
@@ -22,6 +24,7 @@ from scenes.yaml.units import LENGTH, SPEED, TIME
 from twin.orbit.flight.line_times import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
+from twin.orbit.measured.platform_columns import platform_of
 from twin.run.procedure import Advance, silent
 
 Array = NDArray[np.float64]
@@ -60,18 +63,11 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
 }
 """Key of a pass -> columns of its table; `tie_points` has those of `image_points`."""
 _SIGMAS = (("sigma",), ("sigma_plan", "sigma_height"), ("sigma_x", "sigma_y", "sigma_z"))
-_LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
-"""Metres from the Earth's centre: of satellites that map the Earth."""
 _MOST_HEIGHT = 2.0e4
 """Metres above or below the ellipsoid: farther no ground point lies, whatever its datum."""
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
-_SPEED_TOLERANCE = 0.02
-"""Of a velocity: positions of 1 m noise 1 s apart differ by less; that against the stars differs by 6 % and more."""
-_UNIT_TOLERANCE = 1e-3
-_FALL, _JUMP = 12.0, 0.05
-"""Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
-_LEAST_TURN, _FASTEST_TURN = np.radians(2.0), np.radians(10.0)
-"""Between two readings, radians, and radians for each second: more than agile satellites turn."""
+CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
+"""Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +77,17 @@ class PassTables:
     Attributes:
         name: of the pass.
         epoch: of all times.
-        orbit, attitude, lines, ground, image_points: the tables.
+        orbit, attitude, lines, ground, image_points: the tables; the first two are None where files of other formats
+            take their place.
+        files: those, with what they do not say themselves.
         tie_points: likewise, None where there are none.
     """
 
     name: str
     epoch: str
-    orbit: Table
-    attitude: Table
+    orbit: Table | None
+    attitude: Table | None
+    files: PlatformFilesSpec | None
     lines: Table
     ground: Table
     image_points: Table
@@ -106,25 +105,31 @@ class PassTables:
             InputError: a table cannot be read or is not as `COLUMNS` says.
         """
         files = spec.files
-        if "platform" in files:
+        other = spec.platform if isinstance(spec.platform, PlatformFilesSpec) else None
+        orbit: Table | None = None
+        attitude: Table | None = None
+        if other is None and "platform" in files:
             orbit = attitude = read_table(files["platform"], COLUMNS["platform"], 2)
-        else:
+        elif other is None:
             orbit, attitude = (read_table(files[key], COLUMNS[key], 2) for key in ("orbit", "attitude"))
         lines, ground, images = (read_table(files[key], COLUMNS[key]) for key in ("lines", "ground", "image_points"))
         ties = read_table(files["tie_points"], COLUMNS["image_points"]) if "tie_points" in files else None
-        return cls(name, spec.epoch, orbit, attitude, lines, ground, images, ties)
+        return cls(name, spec.epoch, orbit, attitude, other, lines, ground, images, ties)
 
-    def measurements(self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec) -> PassMeasurements:
+    def measurements(
+        self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, needed: Mapping[str, int] = CALIBRATING
+    ) -> PassMeasurements:
         """What they say in these conventions.
 
         Args:
             conventions: of all tables.
             camera: whose lines they name.
+            needed: role -> in how many line cameras one of its points must be seen.
 
         Raises:
             InputError: what they say cannot be, with file, line and column.
         """
-        platform = platform_of(self.epoch, self.orbit, self.attitude, conventions)
+        platform = self._platform(conventions)
         times, origins = line_times_of(self.lines, conventions, camera, platform)
         ground = ground_of(self.ground)
         number = {name: k for k, name in enumerate(ground.ids.tolist())}
@@ -149,7 +154,7 @@ class PassTables:
         rays = np.zeros(len(ground), int)
         for row in images.values():
             np.add.at(rays, row.point, 1)
-        for role, least in (("control", 1), ("check", 2)):
+        for role, least in needed.items():
             if not np.any((ground.role == role) & (rays >= least)):
                 seen = "one line camera" if least == 1 else "two line cameras"
                 allowed = f"{role} points in the ground table whose image points are measured"
@@ -160,9 +165,22 @@ class PassTables:
             raise InputError(Issue("too few line cameras", self.image_points.file, found=found, allowed=allowed))
         return PassMeasurements(self.name, platform, {k: times[k] for k in images}, ground, images)
 
+    def _platform(self, conventions: ConventionsSpec) -> PlatformTable:
+        if self.files is None:
+            assert self.orbit is not None
+            assert self.attitude is not None
+            return platform_of(self.epoch, self.orbit, self.attitude, conventions)
+        # what reads them waits for libraries that tables do not need
+        from twin.orbit.measured.platform_files import platform_table, read_platform
+
+        return platform_table(*read_platform(self.files, Path()), self.epoch)
+
 
 def read_measurements(
-    data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent
+    data: OrbitDataSpec,
+    camera: ThreeLineCameraSpec,
+    advance: Advance = silent,
+    needed: Mapping[str, int] = CALIBRATING,
 ) -> tuple[PassMeasurements, ...]:
     """All passes of a test.
 
@@ -170,78 +188,16 @@ def read_measurements(
         data: conventions and files.
         camera: whose lines they name.
         advance: how far it is.
+        needed: role -> in how many line cameras one of its points must be seen.
 
     Raises:
         InputError: a table cannot be read, or what it says cannot be, with file, line and column.
     """
     found = []
     for name, files in data.passes.items():
-        found.append(PassTables.read(name, files).measurements(data.conventions, camera))
+        found.append(PassTables.read(name, files).measurements(data.conventions, camera, needed))
         advance("read", len(found), len(data.passes))
     return tuple(found)
-
-
-def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: ConventionsSpec) -> PlatformTable:
-    """Orbit and attitude.
-
-    Args:
-        epoch: UTC.
-        orbit: its table.
-        attitude: its table, which may be the same.
-        conventions: of both.
-
-    Raises:
-        InputError: a time twice, a place where no satellite is, a velocity that is not that of the places, a
-            quaternion that is not of unit length.
-    """
-    order, looks = _rising(orbit), _rising(attitude)
-    time, place = orbit["time"][order], orbit.stacked("x", "y", "z")[order]
-    radius = np.linalg.norm(place, axis=1)
-    wrong = np.flatnonzero((radius < _LEAST_RADIUS) | (radius > _MOST_RADIUS))
-    if len(wrong):
-        found = f"{radius[wrong[0]] / 1e3:.6g} km from the Earth's centre"
-        allowed = f"{_LEAST_RADIUS / 1e3:g} to {_MOST_RADIUS / 1e3:g} km; is the unit in the head right?"
-        raise orbit.error(int(order[wrong[0]]), "x", "no place of a satellite", found, allowed)
-    _check_jumps(orbit, order, time, place)
-    speed = None
-    given = [name for name in ("vx", "vy", "vz") if name in orbit]
-    if given:
-        missing = [name for name in ("vx", "vy", "vz") if name not in orbit]
-        if missing:
-            raise InputError(
-                Issue(f"no column {missing[0]!r}", orbit.file, found=names_text(given), allowed="all three or none")
-            )
-        speed = orbit.stacked("vx", "vy", "vz")[order]
-        _check_velocity(orbit, order, time, place, speed)
-    numbers = attitude.stacked("q1", "q2", "q3", "q4")[looks]
-    norm = np.linalg.norm(numbers, axis=1)
-    far = np.flatnonzero(np.abs(norm - 1.0) > _UNIT_TOLERANCE)
-    if len(far):
-        found = f"a norm of {norm[far[0]]:.6g}"
-        raise attitude.error(int(looks[far[0]]), "q1", "no unit quaternion", found, "four numbers of norm 1")
-    quaternion = quaternions_of(numbers, conventions)
-    _check_turns(attitude, looks, quaternion)
-    return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
-
-
-def quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
-    """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
-
-    Args:
-        numbers: (n, 4) q1 to q4 as the file has them.
-        conventions: what they mean.
-    """
-    said = conventions.quaternion
-    xyzw = numbers if said.scalar == "last" else np.roll(numbers, -1, axis=1)
-    if said.turns == "frame_to_body":
-        xyzw = xyzw * np.array([-1.0, -1.0, -1.0, 1.0])
-    axes = np.array(body_axes_matrix(conventions.body_axes), np.float64)
-    if np.array_equal(axes, np.eye(3)):
-        return np.asarray(xyzw, np.float64)
-    from scipy.spatial.transform import Rotation
-
-    # v_frame = R(q) v_file, v_file = axes @ v_project
-    return np.asarray((Rotation.from_quat(xyzw) * Rotation.from_matrix(axes)).as_quat(canonical=False))
 
 
 def line_times_of(
@@ -413,55 +369,6 @@ def image_points_of(
         spread = np.stack([np.stack([a * a, a * b * c], -1), np.stack([a * b * c, b * b], -1)], axis=1)
         found[name] = ImagePoints.of(number[order], line, pixel, spread)
     return found
-
-
-def _rising(table: Table) -> NDArray[np.intp]:
-    """Rows in the order of time. InputError for a time twice."""
-    order = np.argsort(table["time"], kind="stable")
-    twice = np.flatnonzero(np.diff(table["time"][order]) == 0.0)
-    if len(twice):
-        row = int(order[twice[0] + 1])
-        raise table.error(row, "time", "this time stands twice", f"{table['time'][row]:.9g} s", "each time once")
-    return np.asarray(order, np.intp)
-
-
-def _check_jumps(table: Table, order: NDArray[np.intp], time: Array, place: Array) -> None:
-    """InputError for a place that no orbit passes between its neighbours."""
-    step = np.diff(time)
-    with np.errstate(over="ignore", invalid="ignore"):  # of times that all but coincide
-        rate = np.diff(place, axis=0) / step[:, None]
-        change = np.linalg.norm(np.diff(rate, axis=0), axis=1)
-        speed = np.median(np.linalg.norm(rate, axis=1))
-        jump = np.flatnonzero(~(change <= _FALL * (step[1:] + step[:-1]) + _JUMP * speed))
-    if len(jump):
-        row = int(order[jump[0] + 1])
-        found = f"the velocity changes by {change[jump[0]]:.4g} m/s"
-        raise table.error(
-            row, "x", "a jump of the orbit", found, "one pass without manoeuvre; leave out wrong readings"
-        )
-
-
-def _check_turns(table: Table, order: NDArray[np.intp], quaternion: Array) -> None:
-    """InputError for a turn from one reading to the next that no satellite makes."""
-    step = np.diff(table["time"][order])
-    turn = 2.0 * np.arccos(np.clip(np.abs(np.sum(quaternion[1:] * quaternion[:-1], axis=1)), 0.0, 1.0))
-    jump = np.flatnonzero(turn > _LEAST_TURN + _FASTEST_TURN * step)
-    if len(jump):
-        row, found = int(order[jump[0] + 1]), f"{np.degrees(turn[jump[0]]):.4g} deg in {step[jump[0]]:.4g} s"
-        raise table.error(row, "q1", "a jump of the attitude", found, "leave out wrong readings")
-
-
-def _check_velocity(table: Table, order: NDArray[np.intp], time: Array, place: Array, speed: Array) -> None:
-    """InputError unless the velocity is the rate of change of the places."""
-    rate = np.diff(place, axis=0) / np.diff(time)[:, None]
-    mean = 0.5 * (speed[1:] + speed[:-1])
-    # across a long step the chord is shorter than the arc, and lies to its side; that is no error of the velocity
-    far = np.linalg.norm(rate - mean, axis=1) / np.linalg.norm(rate, axis=1)
-    if np.median(far) > _SPEED_TOLERANCE:
-        row = int(order[int(np.argsort(far)[len(far) // 2])])
-        found = f"they differ by {100.0 * np.median(far):.3g} % in the median"
-        allowed = "velocities against the same axes as the positions; those against the stars differ by 6 % and more"
-        raise table.error(row, "vx", "not the velocity of these positions", found, allowed)
 
 
 def _known(table: Table, column: str, names: tuple[str, ...]) -> None:

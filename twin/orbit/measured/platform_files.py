@@ -14,7 +14,7 @@ import erfa
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.specs.measured.orbit_data import body_axes_matrix
+from scenes.specs.measured.pass_files import body_axes_matrix
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
