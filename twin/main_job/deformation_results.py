@@ -1,4 +1,6 @@
-"""What the tables of displaced nodes were found to be: numbers and warnings, and where a run keeps the tables."""
+"""What the tables of displaced nodes were found to be: numbers and warnings; where a run keeps the tables of nodes, so
+that its config.yaml repeats it.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +15,24 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.render_results import RenderRun
 
-FOLDER = "deformation"
-"""In the run folder: the tables of the job, so that config.yaml there repeats the run."""
-
 
 def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
     """Body -> what its table is."""
     return run.experiment.deformed(run.resolved.job)
 
 
-def table_names(job: JobSpec) -> Mapping[str, str]:
-    """Body -> name of its table in the run folder."""
+def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
+    """Body and what a table does to it, a key of its perturbation -> name of the table in the run folder."""
+    named = {
+        (path, kind): spec.table
+        for path, what in job.perturb.items()
+        for kind, spec in (("deformation", what.deformation), ("temperature", what.temperature))
+        if spec is not None and spec.table is not None
+    }
     return FrozenMap(
         {
-            path: f"{FOLDER}/{path.replace('/', '_')}{PurePath(what.deformation.table).suffix.lower()}"
-            for path, what in job.perturb.items()
-            if what.deformation is not None
+            (path, kind): f"{kind}/{path.replace('/', '_')}{PurePath(table).suffix.lower()}"
+            for (path, kind), table in named.items()
         }
     )
 
@@ -39,11 +43,9 @@ def config_text(resolved: ResolvedJob) -> str:
     if not names:
         return resolved.to_yaml()
     perturb = dict(resolved.job.perturb)
-    for path, name in names.items():
-        spec = perturb[path].deformation
-        assert spec is not None
-        moved = spec.model_copy(update={"table": name})
-        perturb[path] = perturb[path].model_copy(update={"deformation": moved})
+    for (path, kind), name in names.items():
+        moved = getattr(perturb[path], kind).model_copy(update={"table": name})
+        perturb[path] = perturb[path].model_copy(update={kind: moved})
     job = resolved.job.model_copy(update={"perturb": FrozenMap(perturb)})
     return resolved.model_copy(update={"job": job}).to_yaml()
 
@@ -51,7 +53,8 @@ def config_text(resolved: ResolvedJob) -> str:
 def deformation_numbers(run: RenderRun) -> dict[str, Any]:
     """Contents of deformation.json."""
     names = table_names(run.resolved.job)
-    return {"bodies": {path: {"table": names[path], **_numbers(face)} for path, face in faces_of(run).items()}}
+    faces = faces_of(run).items()
+    return {"bodies": {path: {"table": names[path, "deformation"], **_numbers(face)} for path, face in faces}}
 
 
 def _numbers(face: NodalDeformation) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed
 from twin.main_job.deformation_section import deformation_section
+from twin.main_job.heat_section import heat_section
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
 from twin.main_job.render_report import PICTURES, write_report
@@ -80,7 +81,9 @@ def write_run(run: RenderRun, session: Session, picture: bool = False) -> str:
     write_data(run, folder)
     folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
     deformed = deformation_section(run)
-    sections = (*((deformed,) if deformed else ()), limits_section(run.limits), *further_sections("render", run))
+    warmed = heat_section(run)
+    tables = tuple(section for section in (deformed, warmed) if section is not None)
+    sections = (*tables, limits_section(run.limits), *further_sections("render", run))
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     folder.write_with("summary.png", lambda file: write_summary(run, file))
     problem = ""

@@ -12,6 +12,7 @@ import xarray as xr
 
 from scenes.specs.channel import Channel
 from twin.main_job.deformation_results import config_text, deformation_numbers, faces_of, table_names
+from twin.main_job.heat_section import heat_numbers, heated_of
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
@@ -32,9 +33,8 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", config_text(run.resolved))
-    for path, name in table_names(run.resolved.job).items():
-        given = run.resolved.job.perturb[path].deformation
-        assert given is not None
+    for (path, kind), name in table_names(run.resolved.job).items():
+        given = getattr(run.resolved.job.perturb[path], kind)
         folder.write_bytes(name, Path(given.table).read_bytes())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     recovered = recovered_numbers(run)
@@ -58,6 +58,8 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
         _write_targets(run.targets, folder)
     if faces_of(run):
         _write_numbers(folder, "deformation", deformation_numbers(run))
+    if heated_of(run):
+        _write_numbers(folder, "temperature", heat_numbers(run))
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
 

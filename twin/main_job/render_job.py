@@ -170,6 +170,7 @@ def render_job(
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
+            *(text for path, body in experiment.heated(resolved.job).items() for text in body.warnings(path)),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
+from scenes.specs.node_tables import HEAT_KEYS
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
@@ -220,6 +221,9 @@ def _refuse_names(study: StudySpec, place: KeyPath) -> None:
     if "deformation" in place:
         text = "a table of displaced nodes is part of the base, and a study does not vary it"
         raise Problem(text, key_text(place), "another key of perturb: rotate, shift, scale, figure or temperature")
+    if "temperature" in place[:-1] and place[-1] in HEAT_KEYS:
+        text = "a table of temperatures is part of the base, and a study does not vary it"
+        raise Problem(text, key_text(place), "change or gradient, which are added to the table")
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:
