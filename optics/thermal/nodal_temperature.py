@@ -23,7 +23,7 @@ MOST_WARM_NODES = 200_000
 FLAT = 1e-6
 """Of the longest extent: nodes within a layer so thin lie in a plane."""
 _JITTER = 1e-7
-"""Of the extents, by which nodes are moved before they are triangulated: on a lattice many tetrahedra share a sphere."""
+"""Of the extents, by which nodes are moved before they are triangulated: a lattice leaves its tetrahedra a choice."""
 _EDGE = 1e-6
 """Barycentric coordinate down to which a place counts as inside of the outermost tetrahedra."""
 _MOST_STEPS = 2000
@@ -54,9 +54,10 @@ class _Between:
         for _ in range(_MOST_STEPS):
             if not len(going):
                 break
-            matrix = cells.transform[at[going]]
-            two = np.einsum("pij,pj->pi", matrix[:, :3], places[going] - matrix[:, 3])
-            shares = np.column_stack([two, 1.0 - two.sum(axis=1)])
+            corners = cells.points[cells.simplices[at[going]]]
+            edges = (corners[:, :3] - corners[:, 3:]).transpose(0, 2, 1)
+            three = np.linalg.solve(edges, (places[going] - corners[:, 3])[..., None])[..., 0]
+            shares = np.column_stack([three, 1.0 - three.sum(axis=1)])
             # toward the face that the place lies farthest behind: such a walk ends in every Delaunay triangulation
             worst = np.argmin(shares, axis=1)
             least = shares[np.arange(len(going)), worst]
