@@ -20,6 +20,7 @@ from scenes.specs.course import (
     Term,
 )
 from scenes.specs.disturbances import JobDisturbances
+from scenes.specs.finishes import FinishesSpec, checked_finishes
 from scenes.specs.instrument import Frames
 from scenes.specs.node_tables import (
     Deformation,
@@ -145,9 +146,11 @@ class StraySpec(Spec):
 
     Attributes:
         paths: from every source.
+        finishes: measured BSDFs and coatings of surfaces in place of the built-in finishes.
     """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
+    finishes: FinishesSpec | None = None
 
 
 def _switch(value: Any) -> Any:
@@ -275,7 +278,7 @@ class JobSpec(Spec):
 
 
 def with_tables(job: JobSpec) -> JobSpec:
-    """The job with the full paths and checksums of the tables of nodes that deform or warm its bodies.
+    """The job with the full paths and checksums of its tables: of nodes that deform or warm its bodies, of finishes.
 
     Raises:
         InputError: a table that cannot be read or is not the one of the checksum.
@@ -289,7 +292,12 @@ def with_tables(job: JobSpec) -> JobSpec:
             update["temperature"] = checked(job, ("perturb", path, "temperature"), what.temperature)
         if update:
             changed[path] = what.model_copy(update=update)
-    return job.model_copy(update={"perturb": FrozenMap({**job.perturb, **changed})}) if changed else job
+    whole: dict[str, Any] = {"perturb": FrozenMap({**job.perturb, **changed})} if changed else {}
+    stray = job.render.stray
+    if stray is not None and stray.finishes is not None:
+        finishes = checked_finishes(job, ("render", "stray", "finishes"), stray.finishes)
+        whole["render"] = job.render.model_copy(update={"stray": stray.model_copy(update={"finishes": finishes})})
+    return job.model_copy(update=whole) if whole else job
 
 
 @dataclass(frozen=True)

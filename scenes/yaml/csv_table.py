@@ -38,6 +38,7 @@ class Column:
         needed: whether a table without it is refused.
         least, most: of its numbers, both allowed, SI units.
         whole: whether its numbers are whole.
+        bare: whether the unit may be missing, and numbers are then in the SI unit.
     """
 
     name: str
@@ -47,11 +48,12 @@ class Column:
     least: float = _LEAST
     most: float = _MOST
     whole: bool = False
+    bare: bool = False
 
     @property
     def head(self) -> str:
         """An example of its head."""
-        return self.name if self.kind is None else f"{self.name} [{self.kind.units[0]}]"
+        return self.name if self.kind is None or self.bare else f"{self.name} [{self.kind.units[0]}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +201,8 @@ def _scale(file: str, line: int, head: str, column: Column, unit: str | None) ->
     if column.kind is None:
         if unit is not None:
             raise InputError(Issue("this column has no unit", file, line, (head,), shown(unit), repr(column.head)))
+        return 1.0, 0.0
+    if column.bare and unit is None:
         return 1.0, 0.0
     if not unit:
         raise InputError(Issue("a head without a unit", file, line, (head,), allowed=repr(column.head)))

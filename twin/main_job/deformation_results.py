@@ -1,53 +1,19 @@
-"""What the tables of displaced nodes were found to be: numbers and warnings; where a run keeps the tables of nodes, so
-that its config.yaml repeats it.
-"""
+"""What the tables of displaced nodes were found to be: numbers and warnings."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from pathlib import PurePath
 from typing import Any
 
 from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import PRINTED, SEEN, NodalDeformation
-from scenes.specs.job import JobSpec
-from scenes.specs.resolved import ResolvedJob
+from twin.main_job.job_tables import table_names
 from twin.main_job.render_results import RenderRun
 
 
 def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
     """Body -> what its table is."""
     return run.experiment.deformed(run.resolved.job)
-
-
-def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
-    """Body and what a table does to it, a key of its perturbation -> name of the table in the run folder."""
-    named = {
-        (path, kind): spec.table
-        for path, what in job.perturb.items()
-        for kind, spec in (("deformation", what.deformation), ("temperature", what.temperature))
-        if spec is not None and spec.table is not None
-    }
-    return FrozenMap(
-        {
-            (path, kind): f"{kind}/{path.replace('/', '_')}{PurePath(table).suffix.lower()}"
-            for (path, kind), table in named.items()
-        }
-    )
-
-
-def config_text(resolved: ResolvedJob) -> str:
-    """Text of the run folder's config.yaml, which names the tables beside it."""
-    names = table_names(resolved.job)
-    if not names:
-        return resolved.to_yaml()
-    perturb = dict(resolved.job.perturb)
-    for (path, kind), name in names.items():
-        moved = getattr(perturb[path], kind).model_copy(update={"table": name})
-        perturb[path] = perturb[path].model_copy(update={kind: moved})
-    job = resolved.job.model_copy(update={"perturb": FrozenMap(perturb)})
-    return resolved.model_copy(update={"job": job}).to_yaml()
 
 
 def deformation_numbers(run: RenderRun) -> dict[str, Any]:

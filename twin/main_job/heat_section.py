@@ -7,7 +7,7 @@ from typing import Any
 
 from analysis.units import ARCSEC
 from scenes.models.heated_bodies import HeatedBody
-from twin.main_job.deformation_results import table_names
+from twin.main_job.job_tables import table_names
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import Cell, Table
 from twin.run.report import Section

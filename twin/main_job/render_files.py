@@ -11,8 +11,9 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.channel import Channel
-from twin.main_job.deformation_results import config_text, deformation_numbers, faces_of, table_names
+from twin.main_job.deformation_results import deformation_numbers, faces_of
 from twin.main_job.heat_section import heat_numbers, heated_of
+from twin.main_job.job_tables import config_text, finish_names, finish_tables, table_names
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
@@ -36,6 +37,9 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
     for (path, kind), name in table_names(run.resolved.job).items():
         given = getattr(run.resolved.job.perturb[path], kind)
         folder.write_bytes(name, Path(given.table).read_bytes())
+    finishes = finish_tables(run.resolved.job)
+    for key, name in finish_names(run.resolved.job).items():
+        folder.write_bytes(name, Path(finishes[key].table).read_bytes())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):

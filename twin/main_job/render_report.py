@@ -11,7 +11,7 @@ import cv2
 from markupsafe import Markup
 
 from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.deformation_results import config_text
+from twin.main_job.job_tables import config_text
 from twin.main_job.light_path_plots import footprints_svg, side_view_svg
 from twin.main_job.motion_map import motion_map_svg
 from twin.main_job.render_results import PROGRAM, RenderRun
