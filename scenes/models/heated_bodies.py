@@ -9,15 +9,15 @@ followed, and a table that has more of it than does not matter is refused.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optics.geometry.tree import Motion, State
 from optics.numerics.frozen_map import FrozenMap
-from optics.thermal.deformation import FaceChange
+from optics.thermal.deformation import Displacement, FaceChange
 from optics.thermal.heat import Temperature
-from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodesError
+from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
 from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_part
 from scenes.models.deformed_faces import pose_of_frame
 from scenes.models.thermal_model import Held, ThermalModel
@@ -47,6 +47,26 @@ INDEX_WAVES = 0.01
 
 
 @dataclass(frozen=True, eq=False)
+class HeatedFace:
+    """What a table does to an optical face beyond its linear part.
+
+    Attributes:
+        motion: of the face's body: rigid, Zernike terms and, of a mirror, a grid with the rest.
+        lost: what is not carried, metres rms of sag.
+        unmeshed: by how much coarser finite elements differ, metres rms of sag.
+    """
+
+    motion: Motion
+    lost: float
+    unmeshed: float
+
+    @property
+    def figure_rms(self) -> float:
+        """Figure from Z4 on, metres rms over the disk of the terms."""
+        return float(np.sqrt(sum(a * a for j, a in self.motion.figure.items() if j > 3)))
+
+
+@dataclass(frozen=True, eq=False)
 class HeatedBody:
     """What a table of temperatures is for its body.
 
@@ -58,7 +78,6 @@ class HeatedBody:
         between: rms of the error at nodes that are left out, kelvin.
         coverage: of the body by the nodes, None for a body without finite elements.
         faces: body of a face -> what the rest does to it.
-        unmeshed: body of a face -> by how much coarser finite elements differ in it, metres rms of sag.
         index_path: largest optical path that the index of the rest may be worth, metres; 0 for what is not glass.
     """
 
@@ -68,17 +87,23 @@ class HeatedBody:
     left: tuple[float, float]
     between: float
     coverage: Coverage | None
-    faces: Mapping[str, FaceChange]
-    unmeshed: Mapping[str, float]
+    faces: Mapping[str, HeatedFace]
     index_path: float
 
-    def state(self) -> State:
-        """What the rest does, beyond the linear field."""
-        return {path: Motion(c.rotate, c.shift, figure=FrozenMap(c.figure)) for path, c in self.faces.items()}
+    def state(self, gridded: State | None = None) -> State:
+        """What the rest does, beyond the linear field.
 
-    def change_rms(self, face: str) -> float:
-        """Figure that the rest gives to a face, metres rms over the disk of its terms."""
-        return float(np.sqrt(sum(a * a for a in self.faces[face].figure.values())))
+        Args:
+            gridded: motions of the same bodies whose grids these are to be added to.
+        """
+        out = {}
+        for path, face in self.faces.items():
+            other = gridded[path].grid if gridded is not None and path in gridded else None
+            own = face.motion.grid
+            out[path] = (
+                face.motion if own is None or other is None else replace(face.motion, grid=own.sampled_as(other))
+            )
+        return out
 
     def warnings(self, path: str) -> tuple[str, ...]:
         """What the user should know of the table of the body ``path``."""
@@ -96,15 +121,15 @@ class HeatedBody:
                 "refine the mesh, or doubt what it does to images"
             )
         for face, change in self.faces.items():
-            size = self.change_rms(face)
-            if self.unmeshed[face] > max(SEEN, MESHED_TO * size):
+            size = change.figure_rms
+            if change.unmeshed > max(SEEN, MESHED_TO * size):
                 out.append(
-                    f"{face}: finite elements here follow the table to {1e9 * self.unmeshed[face]:.3g} nm rms only, of "
+                    f"{face}: finite elements here follow the table to {1e9 * change.unmeshed:.3g} nm rms only, of "
                     f"{1e9 * size:.3g} nm; give the displacements of the structural program (deformation)"
                 )
-            if change.residual_rms > max(SEEN, PRINTED * size):
+            if change.lost > max(SEEN, PRINTED * size):
                 out.append(
-                    f"{face}: {1e9 * change.residual_rms:.3g} nm rms of its change by the table are finer than "
+                    f"{face}: {1e9 * change.lost:.3g} nm rms of its change by the table are finer than "
                     f"Z{TERMS} and not carried; give displacements (deformation)"
                 )
         if self.index_path > SEEN:
@@ -158,7 +183,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
                 f"the nearest linear field, {_in_words(nodes.linear)}, and displacements of the structural program",
             )
         left = float(np.sqrt(np.mean(nodes.departures**2))), nodes.departure()
-        return HeatedBody(len(nodes.points), nodes.spacing, nodes.linear, left, nodes.between, None, {}, {}, 0.0)
+        return HeatedBody(len(nodes.points), nodes.spacing, nodes.linear, left, nodes.between, None, {}, 0.0)
     elastic, _ = fine
     coverage = nodes.coverage(elastic.places, elastic.volumes)
     if coverage.outside > 1.0 - LEAST_INSIDE:
@@ -181,21 +206,31 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
             f"is worth up to {1e9 * index_path:.3g} nm of path",
             f"the nearest linear field, {_in_words(linear)}, or a table that departs from it by less",
         )
-    faces: dict[str, FaceChange] = {}
-    unmeshed: dict[str, float] = {}
+    faces: dict[str, HeatedFace] = {}
     if largest > ROUNDING and thermal.materials[path].expansion != 0.0:
 
         def field(places: np.ndarray) -> np.ndarray:
             return nodes.at(places) - linear.change - places @ np.array(linear.gradient)
 
-        coarser, faces = (
-            thermal.changes(path, body.solve_many([field], support)[0], TERMS) for body, support in (coarse, fine)
-        )
+        solved = [body.solve_many([field], support)[0] for body, support in (coarse, fine)]
+        coarser, finer = (thermal.changes(path, moved, TERMS) for moved in solved)
         sizes = thermal.face_radii(path)
-        unmeshed = {face: _apart(change, coarser[face], sizes[face]) for face, change in faces.items()}
-    return HeatedBody(
-        len(nodes.points), nodes.spacing, linear, left, nodes.between, coverage, faces, unmeshed, index_path
-    )
+        for face, change in finer.items():
+            motion, lost = Motion(change.rotate, change.shift, figure=FrozenMap(change.figure)), change.residual_rms
+            if thermal.is_mirror(path):
+                nodal = _at_nodes(thermal, path, solved[1])
+                motion, lost = nodal.motion(), nodal.rms(nodal.lost)
+            faces[face] = HeatedFace(motion, lost, _apart(change, coarser[face], sizes[face]))
+    return HeatedBody(len(nodes.points), nodes.spacing, linear, left, nodes.between, coverage, faces, index_path)
+
+
+def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDeformation:
+    """A mirror's displacement at its face's nodes, as those of another program's table are taken apart."""
+    ((aperture, _),) = thermal.faces_of(path).values()
+    surface = thermal.surface(path)
+    x, y, z = moved.nodes.T
+    face = np.abs(z - surface.sag(x, y)) <= 1e-9 * float(np.max(np.ptp(moved.nodes, axis=0)))
+    return nodal_deformation(moved.nodes[face], moved.values[face], surface, aperture, TERMS)
 
 
 def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None]:

@@ -68,11 +68,10 @@ def on_deformed(
     of temperatures.
     """
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
+    own = {path: face.motion() for path, face in deformed.items()}
     for warm in (heated or {}).values():
-        moved = compose(warm.state(), moved, bodies) if warm.faces else moved
-    if not deformed:
-        return moved
-    return compose({path: face.motion() for path, face in deformed.items()}, moved, bodies)
+        moved = compose(warm.state(own), moved, bodies) if warm.faces else moved
+    return compose(own, moved, bodies) if own else moved
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:

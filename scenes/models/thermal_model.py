@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, triple
 from optics.geometry.solid import Solid, solid_mesh
+from optics.geometry.surface import Surface
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
 from optics.materials.material import Material, material
@@ -237,14 +238,17 @@ class ThermalModel:
         """Whether a body is a camera's mirror."""
         return path in self._mirrors
 
+    def surface(self, face: str) -> Surface:
+        """Nominal shape of the optical face of a body."""
+        return next(e.surface for e in self.instrument.assembly.elements.values() if e.body == face)
+
     def extent(self, path: str) -> np.ndarray:
         """Points of a body between which its temperature lies, (P, 3), metres, in its frame."""
         return self._extent(path)
 
     def face_radii(self, path: str) -> dict[str, float]:
         """Body of an optical face of a mirror or a solid -> radius of the disk of its figure's terms, metres."""
-        surfaces = {e.body: e.surface for e in self.instrument.assembly.elements.values()}
-        return {face: surfaces[face].figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
+        return {face: self.surface(face).figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
 
     def index_path(self, path: str, field: Temperature, rest: float) -> float:
         """Largest optical path that a temperature of ``rest`` kelvin beside a linear field may be worth in a body's
@@ -345,9 +349,8 @@ class ThermalModel:
             displaced: in its frame.
             terms: highest Noll index of the figures.
         """
-        surfaces = {e.body: e.surface for e in self.instrument.assembly.elements.values()}
         return {
-            face: face_change(displaced, surfaces[face], aperture, pose, terms)
+            face: face_change(displaced, self.surface(face), aperture, pose, terms)
             for face, (aperture, pose) in self.faces_of(path).items()
         }
 

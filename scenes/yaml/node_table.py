@@ -4,8 +4,11 @@ import contextlib
 import hashlib
 import io
 import re
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +37,8 @@ HEAT_COLUMNS = (
     COLUMNS[-1],
 )
 """Of a table of temperatures: absolute ones, or changes from the instrument's."""
+LONGEST_READING, LONGEST_PER_BYTE = 10.0, 2e-6
+"""Seconds for a mesh, and for each of its bytes: ten times what whole files take."""
 READINGS = ("change", "K", "degC")
 """What the temperatures of a mesh, whose file has no heads, may be."""
 ZERO_CELSIUS = 273.15
@@ -173,9 +178,7 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
     if path.stat().st_size > LARGEST_TABLE:
         raise InputError(Issue("too large", file, allowed="at most 1 GB"))
     try:
-        # it prints its complaints, and leaves the program for some
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            mesh = meshio.read(file, file_format=MESHES[path.suffix.lower()])
+        mesh = _in_time(path, lambda: meshio.read(file, file_format=MESHES[path.suffix.lower()]))
         points = np.asarray(mesh.points, np.float64)
         shapes = [(len(points), 3)] if what == "vectors" else [(len(points),), (len(points), 1)]
         fields = {
@@ -183,6 +186,8 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
             for name, values in mesh.point_data.items()
             if np.shape(values) in shapes
         }
+    except InputError:
+        raise
     except (Exception, SystemExit) as error:
         reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
         raise InputError(Issue(f"meshio cannot read this mesh: {reason}", file)) from None
@@ -202,6 +207,33 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
         )
     _within(file, points, FARTHEST, "coordinates", "up to 100 m")
     return points, fields[name] if what == "vectors" else fields[name].reshape(len(points))
+
+
+def _in_time(path: Path, read: Callable[[], Any]) -> Any:
+    """What a reader of meshes returns or raises; refused when it takes longer than any mesh of that size.
+
+    With a count of nodes that is not that of the file some readers go on for hours. A thread that does so is left
+    behind: the program's end does not wait for it.
+    """
+    ended: dict[str, Any] = {}
+
+    def run() -> None:
+        try:
+            ended["value"] = read()
+        except BaseException as error:
+            ended["error"] = error
+
+    thread = threading.Thread(target=run, daemon=True)
+    # readers print their complaints, and leave the program for some
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        thread.start()
+        thread.join(LONGEST_READING + path.stat().st_size * LONGEST_PER_BYTE)
+    if thread.is_alive():
+        text = "meshio does not come to an end with this mesh"
+        raise InputError(Issue(text, str(path), allowed="a whole file, whose counts are those of its nodes and cells"))
+    if "error" in ended:
+        raise ended["error"]
+    return ended["value"]
 
 
 def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str) -> None:

@@ -18,7 +18,7 @@ _HEADS = (
 )
 _FACES = (
     *("face", "rotate x [arcsec]", "rotate y [arcsec]", "shift z [nm]", "figure [nm rms]"),
-    *("after Zernike [nm rms]", "coarser elements [nm rms]"),
+    *("not carried [nm rms]", "coarser elements [nm rms]"),
 )
 
 
@@ -49,11 +49,12 @@ def _numbers(body: HeatedBody) -> dict[str, Any]:
         "index_path_not_carried_nm": 1e9 * body.index_path,
         "faces": {
             face: {
-                "rotate_arcsec": [turn / ARCSEC for turn in change.rotate],
-                "shift_nm": [1e9 * move for move in change.shift],
-                "figure_nm": {f"Z{j}": 1e9 * a for j, a in change.figure.items()},
-                "residual_rms_nm": 1e9 * change.residual_rms,
-                "coarser_elements_rms_nm": 1e9 * body.unmeshed[face],
+                "rotate_arcsec": [turn / ARCSEC for turn in change.motion.rotate],
+                "shift_nm": [1e9 * move for move in change.motion.shift],
+                "growth_ppm": 1e6 * change.motion.stretch,
+                "figure_nm": {f"Z{j}": 1e9 * a for j, a in change.motion.figure.items()},
+                "not_carried_rms_nm": 1e9 * change.lost,
+                "coarser_elements_rms_nm": 1e9 * change.unmeshed,
             }
             for face, change in body.faces.items()
         },
@@ -75,8 +76,8 @@ def heat_section(run: RenderRun) -> Section | None:
     ]
     faces: list[tuple[Cell, ...]] = [
         (
-            *(face, change.rotate[0] / ARCSEC, change.rotate[1] / ARCSEC, 1e9 * change.shift[2]),
-            *(1e9 * body.change_rms(face), 1e9 * change.residual_rms, 1e9 * body.unmeshed[face]),
+            *(face, change.motion.rotate[0] / ARCSEC, change.motion.rotate[1] / ARCSEC, 1e9 * change.motion.shift[2]),
+            *(1e9 * change.figure_rms, 1e9 * change.lost, 1e9 * change.unmeshed),
         )
         for body in bodies.values()
         for face, change in body.faces.items()
