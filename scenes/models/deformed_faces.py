@@ -9,7 +9,7 @@ from optics.raytrace.assembly import Interaction
 from optics.thermal.nodal_deformation import NodalDeformation, NodesError, nodal_deformation
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
-from scenes.specs.node_tables import DeformationSpec
+from scenes.specs.job_tables import DeformationSpec
 from scenes.yaml.errors import KeyPath, names_text, nearest
 from scenes.yaml.node_table import read_nodes
 

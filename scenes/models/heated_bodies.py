@@ -22,7 +22,7 @@ from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_
 from scenes.models.deformed_faces import pose_of_frame
 from scenes.models.thermal_model import Held, ThermalModel
 from scenes.specs.job import JobSpec
-from scenes.specs.node_tables import TableTemperatureSpec
+from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.yaml.node_table import read_temperatures
 
 COARSE_CELLS, FINE_CELLS = 12, 16

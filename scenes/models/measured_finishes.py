@@ -11,7 +11,7 @@ import numpy as np
 from optics.materials.coating_table import CoatingTable
 from optics.materials.finish import Finish
 from scenes.models.scene_surface import Finishes
-from scenes.specs.finishes import FinishSpec
+from scenes.specs.job_tables import FinishSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.bsdf_file import MeasuredScatter, read_bsdf
 from scenes.yaml.coating_file import read_coating

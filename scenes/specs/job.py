@@ -20,15 +20,16 @@ from scenes.specs.course import (
     Term,
 )
 from scenes.specs.disturbances import JobDisturbances
-from scenes.specs.finishes import FinishesSpec, checked_finishes
 from scenes.specs.instrument import Frames
-from scenes.specs.node_tables import (
+from scenes.specs.job_tables import (
     Deformation,
+    FinishesSpec,
     PlainTemperature,
     TableTemperature,
     TableTemperatureSpec,
     TemperatureSpec,
     checked,
+    checked_finishes,
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
 from scenes.yaml.quantity import Quantity

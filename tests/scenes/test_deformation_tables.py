@@ -10,8 +10,8 @@ import pytest
 
 from scenes.models.deformed_faces import deformed_face
 from scenes.specs.job import JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_job
-from scenes.specs.node_tables import DeformationSpec
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.node_table import read_nodes

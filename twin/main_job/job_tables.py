@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import PurePath
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.finishes import FinishTableSpec
 from scenes.specs.job import JobSpec
+from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
 
 

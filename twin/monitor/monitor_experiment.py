@@ -32,7 +32,7 @@ from scenes.models.thermal_model import ThermalModel
 from scenes.specs.channel import SIDES
 from scenes.specs.course import NO_MOTION
 from scenes.specs.job import JobSpec
-from scenes.specs.node_tables import DeformationSpec, TableTemperatureSpec
+from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec, PerturbationSpec
-from scenes.specs.node_tables import TableTemperatureSpec
+from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector

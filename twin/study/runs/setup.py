@@ -14,8 +14,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
-from scenes.specs.node_tables import HEAT_KEYS
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
