@@ -134,7 +134,7 @@ def _try(tmp_path: Path, kind: str, count: int, seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["nodes.csv", "heat.csv", "bsdf", "coating.csv", "heat.vtu"])
 def test_some_spoilt_files(tmp_path, kind: str) -> None:
-    _try(tmp_path, kind, 40, 1)
+    _try(tmp_path, kind, 25, 1)
 
 
 @pytest.mark.slow

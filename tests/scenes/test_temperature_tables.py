@@ -138,8 +138,11 @@ def quadratic(points: np.ndarray) -> np.ndarray:
     return 4.0 * x**2 - 2.0 * x * y + 1.0 * y * z + 30.0 * z**2
 
 
-@pytest.mark.slow
-def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path) -> None:
+LATTICES = [(21, 19, 9), (41, 37, 17)]
+
+
+@pytest.mark.parametrize("lattices", [LATTICES[:1], pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"])
+def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path, lattices) -> None:
     """Solved directly on the same elements; a table of 12 mm lies h^2/8 of the curvature below the field."""
     held = silica.elastic(M1, cells=FINE_CELLS)
     assert held is not None
@@ -147,7 +150,7 @@ def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path) -> N
     ((aperture, _),) = silica.faces_of(M1).values()
     surface = silica.surface(M1)
     errors = []
-    for counts in ((21, 19, 9), (41, 37, 17)):
+    for counts in lattices:
         points = lattice(silica, M1, counts)
         body = warmed(silica, tmp_path, M1, points, quadratic(points))
 
@@ -165,9 +168,10 @@ def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path) -> N
         assert body.warnings(M1) == ()
     assert size > 1e-8
     assert errors[0] < 0.05
-    assert errors[1] < 0.3 * errors[0]  # of second order: a quarter
+    assert errors[-1] == errors[0] or errors[1] < 0.3 * errors[0]  # of second order: a quarter
 
 
+@pytest.mark.slow
 def test_what_the_rest_does_comes_on_top_of_other_motions(silica, tmp_path) -> None:
     points = lattice(silica, M1, (9, 8, 4))
     place = write(tmp_path / "heat.csv", points, quadratic(points))
@@ -218,7 +222,7 @@ def test_bodies_without_finite_elements_follow_linear_fields_only(silica, tmp_pa
 
 
 def test_warnings_of_coverage_and_of_coarse_tables(silica, tmp_path) -> None:
-    points = lattice(silica, M1, (13, 13, 5))
+    points = lattice(silica, M1, (9, 9, 4))
     half = points[points[:, 0] < np.quantile(points[:, 0], 0.8)]
     texts = warmed(silica, tmp_path, M1, half, quadratic(half)).warnings(M1)
     assert "lie outside of the table's nodes" in texts[0]

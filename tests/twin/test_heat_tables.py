@@ -150,6 +150,7 @@ def test_a_run_folder_keeps_all_tables(silica, tmp_path) -> None:
     page = (moved / "report.html").read_text()
     assert "Bodies warmed by tables" in page
     assert "warmed by a table of nodes" in page
+    assert "Measured finishes" in page
     assert str(tmp_path / "heat.csv") not in page + (moved / "config.yaml").read_text()
     again = invoke(app, moved / "config.yaml", "--out", tmp_path / "two")
     assert again.exit_code == 0, again.output

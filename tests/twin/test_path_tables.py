@@ -140,6 +140,22 @@ def test_between_whole_degrees_all_that_the_table_says_is_scattered(backend) -> 
     assert np.all(np.abs(counts - expected) < 3.9 * np.sqrt(expected) + 0.01 * expected)
 
 
+def test_between_two_angles_of_incidence_both_have_their_part(backend) -> None:
+    """A table that scatters into one ring at 30 degrees and into another at 31."""
+    radial = np.radians([0.0, 1.0, 5.0, 6.0, 12.0, 13.0, 17.0, 18.0])
+    values = np.zeros((2, 1, 8))
+    values[0, 0, [1, 2]], values[1, 0, [5, 6]] = 2.0, 1.0
+    table = ScatterTable(np.radians([30.0, 31.0]), np.zeros(1), radial, values)
+    angle = np.radians(30.3)
+    specular = np.array([0.0, np.sin(angle), np.cos(angle)])
+    direction, event, _ = scattered(backend, Finish(reflectance=1.0, table=table), specular)
+    r, _ = relative(direction[event == Event.SCATTER], specular)
+    inner, outer = 0.7 * table.total(np.radians(30.0)), 0.3 * table.total(np.radians(31.0))
+    found = np.mean(r < np.radians(9.0))
+    share = inner / (inner + outer)
+    assert abs(found - share) < 3.9 * np.sqrt(share * (1.0 - share) / len(r))
+
+
 def test_drawing_more_scatter_keeps_its_power(backend) -> None:
     table = of_lobe(ABg(1e-5, 1e-4, 2.0))
     specular = unit(0.2, 0.1, 0.9)

@@ -13,6 +13,7 @@ from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed
 from twin.main_job.deformation_section import deformation_section
+from twin.main_job.finish_section import finish_section
 from twin.main_job.heat_section import heat_section
 from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
@@ -82,7 +83,7 @@ def write_run(run: RenderRun, session: Session, picture: bool = False) -> str:
     folder.write_with("scene.glb", lambda file: write_scene(run.experiment, run.state, file))
     deformed = deformation_section(run)
     warmed = heat_section(run)
-    tables = tuple(section for section in (deformed, warmed) if section is not None)
+    tables = tuple(section for section in (deformed, warmed, finish_section(run)) if section is not None)
     sections = (*tables, limits_section(run.limits), *further_sections("render", run))
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     folder.write_with("summary.png", lambda file: write_summary(run, file))
