@@ -196,7 +196,8 @@ class ScatterTable:
             there, back = self._between(a, b, p), self._between(b, a, p)
             if there is not None and back is not None and there + back > 0.0:
                 differences.append((there - back) / (0.5 * (there + back)))
-        return float(np.sqrt(np.mean(np.square(differences)))) if differences else float("nan")
+        # to 1e-9: below is the rounding of angles
+        return round(float(np.sqrt(np.mean(np.square(differences)))), 9) if differences else float("nan")
 
     def _between(self, arriving: float, leaving: float, turn: float) -> float | None:
         """BSDF from one polar angle to another, ``turn`` from the plane of incidence on the far side of the normal."""

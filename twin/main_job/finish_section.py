@@ -37,8 +37,8 @@ def finish_section(run: RenderRun) -> Section | None:
                 if degrees == 0.0 or np.radians(degrees) <= coating.angles[-1]:
                     reflected, passed = coating.at(float(np.radians(degrees)), through)
                     coats.append((kind, float(degrees), 100.0 * reflected, 100.0 * passed if through else ""))
-        heads = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
+        columns = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
         text = "At the monitor's wavelength, for unpolarised light."
-        tables.append(Table("finish_coatings", "Measured coatings", text, heads, coats, (), 4))
+        tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
     about = "Finishes by tables that somebody measured; all others are built in."
     return Section("Measured finishes", (about,), tuple(tables), 1)
