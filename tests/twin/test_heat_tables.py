@@ -94,6 +94,29 @@ def test_one_material_evenly_heated_keeps_its_angles(silica, tmp_path) -> None:
         assert np.max(np.abs(change.d_f)) < 1e-11
 
 
+def test_a_table_of_displaced_nodes_of_the_same_mirror_is_added(silica, tmp_path) -> None:
+    points = lattice(silica.thermal, M1, (9, 8, 4))
+    write(tmp_path / "heat.csv", points, quadratic(points))
+    element = silica.instrument.assembly.elements["forward/M1"]
+    x0, x1, y0, y1 = element.aperture.bounds
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(x0, x1, 24), np.linspace(y0, y1, 20)))
+    bump = 2e-8 * np.sin(30.0 * x) * np.cos(25.0 * y)
+    rows = np.stack([1e3 * x, 1e3 * y, 1e3 * element.surface.sag(x, y), 0.0 * x, 0.0 * x, 1e9 * bump], axis=-1)
+    heads = "x [mm],y [mm],z [mm],dx [nm],dy [nm],dz [nm]"
+    (tmp_path / "nodes.csv").write_text("\n".join([heads, *(",".join(map(repr, r)) for r in rows.tolist())]))
+    text = "instrument: gf7_pair\nperturb:\n  base/forward/M1: {%s}\n"
+    both, heat, bent = (
+        silica.motions(job(tmp_path, text % keys))[M1]
+        for keys in ("deformation: nodes.csv, temperature: heat.csv", "temperature: heat.csv", "deformation: nodes.csv")
+    )
+    for j in both.figure:
+        assert both.figure[j] == pytest.approx(heat.figure[j] + bent.figure[j], abs=1e-14)
+    u, v = np.random.default_rng(1).uniform(-0.05, 0.05, (2, 50)) + np.array([[0.5 * (x0 + x1)], [0.5 * (y0 + y1)]])
+    sag = heat.grid.sag(u, v) + bent.grid.sag(u, v)
+    # the grid of the heat is put on the samples of the other
+    np.testing.assert_allclose(both.grid.sag(u, v), sag, rtol=0, atol=0.02 * np.max(np.abs(heat.grid.values)))
+
+
 def test_in_a_course_the_table_stays_and_the_course_is_added(silica, tmp_path) -> None:
     points = lattice(silica.thermal, M1, (7, 7, 3))
     write(tmp_path / "heat.csv", points, 0.5 + points @ np.array([0.2, 0.0, 0.1]))
