@@ -33,9 +33,11 @@ from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
 from scenes.specs.measured.monitor_frames_setup import read_frame_table
 from scenes.specs.resolved import resolve
+from scenes.yaml.coating_file import COLUMNS as COATING_COLUMNS
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.node_table import COLUMNS as NODE_COLUMNS
+from scenes.yaml.node_table import HEAT_COLUMNS
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.laboratory.measured_focus import IMAGE_COLUMNS, MTF_COLUMNS
@@ -138,7 +140,8 @@ def tables() -> list[Piece]:
 MEASURED = {
     "docs/measured_laboratory.md": (COMPARISON_COLUMNS, SPOT_COLUMNS, MTF_COLUMNS, IMAGE_COLUMNS),
     "docs/measured_orbit.md": tuple(COLUMNS.values()),
-    "docs/finite_elements.md": (NODE_COLUMNS,),
+    "docs/finite_elements.md": (NODE_COLUMNS, HEAT_COLUMNS),
+    "docs/stray_light.md": (COATING_COLUMNS,),
 }
 """Page whose tables are measurements, or nodes, and no courses -> columns of the sorts of table that it shows."""
 FRAMES = "docs/measured_frames.md"

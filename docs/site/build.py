@@ -17,7 +17,8 @@ ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 NOTEBOOKS = ("start", "my_camera", "heat", "targets_mtf", "orbit_calibration", "trade_study")
 GUIDES = (
-    *("live", "monitor", "monitor_layout", "monitor_design", "disturbances", "finite_elements", "measured_frames"),
+    *("live", "monitor", "monitor_layout", "monitor_design", "disturbances", "finite_elements", "stray_light"),
+    *("measured_frames",),
     *("camera", "prescriptions", "laboratory", "measured_laboratory"),
     *("orbit", "measured_orbit", "orbit_files", "studies"),
 )

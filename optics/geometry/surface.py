@@ -98,6 +98,13 @@ class GridFigure:
             raise ValueError("two grid figures of one surface stand on different samples; put them on the same ones")
         return GridFigure(self.values + other.values, self.bounds)
 
+    def sampled_as(self, other: GridFigure) -> GridFigure:
+        """The same figure on the samples of another one."""
+        x0, x1, y0, y1 = other.bounds
+        rows, columns = other.values.shape
+        x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
+        return GridFigure(self.sag(x, y), other.bounds)
+
     @property
     def spacing(self) -> tuple[float, float]:
         """Sample distance along x and y, metres."""

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from optics.materials import scatter_table
+from optics.materials.coating_table import CoatingTable
 from optics.materials.scatter import ABg, Scatter
+from optics.materials.scatter_table import ScatterTable
 from optics.numerics.array_math import select, sqrt
 
 GRAZING = 1e-12
@@ -48,6 +53,10 @@ class Finish:
         scatter: lobe around the specular and the refracted direction, which takes its share out of them.
         bare: bare glass: reflectance and transmission are Fresnel's and must be given as 0.
         records: whether the light that is absorbed counts as detected.
+        coating: measured, in place of reflectance and transmission; light goes through where transmission is not 0.
+        table: measured scattering about the specular direction, in place of ``scatter``: what it scatters comes out of
+            what is reflected.
+        scattered_only: whether nothing is reflected but what the table scatters; reflectance is then given as 0.
 
     Raises:
         ValueError: the shares are impossible.
@@ -59,9 +68,13 @@ class Finish:
     scatter: Scatter | None = None
     bare: bool = False
     records: bool = False
+    coating: CoatingTable | None = None
+    table: ScatterTable | None = None
+    scattered_only: bool = False
 
     def __post_init__(self) -> None:
         """Check the shares."""
+        self._check_table()
         shares = (self.reflectance, self.transmission, self.diffuse)
         if min(shares) < 0.0 or sum(shares) > 1.0 + 1e-12:
             raise ValueError(
@@ -69,6 +82,27 @@ class Finish:
             )
         if self.bare and any(shares):
             raise ValueError("a bare glass surface takes its shares from Fresnel's formulas; give none")
+
+    def _check_table(self) -> None:
+        """Check what a table scatters against what is reflected."""
+        if self.bare and (self.coating is not None or self.table is not None):
+            raise ValueError("bare glass has neither a coating nor a table of its scattering")
+        if self.scattered_only and (self.table is None or self.reflectance > 0.0):
+            raise ValueError("only what a table scatters is reflected: give a table and no reflectance")
+        if self.table is None:
+            return
+        if self.scatter is not None or self.transmission > 0.0:
+            raise ValueError("a table of scattering stands in place of a lobe, on what light does not go through")
+        for k in range(scatter_table.STEPS if not self.scattered_only else 0):
+            angle = 0.5 * np.pi * k / scatter_table.STEPS
+            reflected = self.reflectance if self.coating is None else self.coating.at(angle, False)[0]
+            if self.table.drawn.share[k] > reflected:
+                raise ValueError(
+                    f"at {np.degrees(angle):.0f} deg the table scatters {self.table.drawn.share[k]:.4g} of the light, "
+                    f"and only {reflected:.4g} are reflected"
+                )
+        if self.scattered_only and float(np.max(self.table.drawn.share)) + self.diffuse > 1.0:
+            raise ValueError("more than all of the light would come back")
 
     @property
     def absorptance(self) -> float:

@@ -104,6 +104,7 @@ class ElasticBody:
 
     Attributes:
         nodes: all nodes of the quadratic elements, metres, shape (N, 3).
+        places: at which loads are taken, metres, (P, 3); volumes: that they stand for, m^3, (P,).
     """
 
     def __init__(self, mesh: MeshHex2 | MeshTet1, material: Material):
@@ -115,6 +116,9 @@ class ElasticBody:
         self._material = material
         self._finder = Finder(mesh, element, basis.element_dofs)
         self._points = np.moveaxis(np.asarray(basis.global_coordinates()), 0, -1)  # (cells, Q, 3)
+        self.places = self._points.reshape(-1, 3)
+        # evenly within a cell: Gauss' weights of tetrahedra may be negative
+        self.volumes = np.repeat(np.mean(basis.dx, axis=1), self._points.shape[1])
         gradient = np.stack([np.asarray(b[0].grad) for b in basis.basis]).transpose(2, 0, 1, 3)  # (cells, I, 3, Q)
         cells, local, _, _ = gradient.shape
         self._weighted = (gradient * basis.dx[:, None, None, :]).reshape(cells, 3 * local, -1)
@@ -172,7 +176,7 @@ class ElasticBody:
 
     def _load(self, temperature: Field) -> np.ndarray:
         """Thermal forces over Young's modulus, shape (3 N,)."""
-        points = self._points.reshape(-1, 3)
+        points = self.places
         change = np.asarray(temperature(points), np.float64)
         if change.shape != (len(points),):
             raise ValueError(f"a temperature field needs one value for each of {len(points)} points: {change.shape}")

@@ -9,6 +9,7 @@ from optics.geometry.pose import triple
 from optics.geometry.tree import Motion, State, compose
 from optics.thermal.nodal_deformation import NodalDeformation
 from scenes.models.deformed_faces import deformed_face
+from scenes.models.heated_bodies import HeatedBody, heated_bodies, with_heat
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
@@ -20,6 +21,7 @@ def job_state(
     thermal: ThermalModel,
     progress: Callable[[str], None] = lambda path: None,
     moved: State | None = None,
+    heated: Mapping[str, HeatedBody] | None = None,
 ) -> State:
     """The perturbed state that a job describes.
 
@@ -27,15 +29,18 @@ def job_state(
         job: its perturbation, checked by ``scenes.specs.job.check_nodes``.
         thermal: of its instrument.
         progress: called with the path of each body whose thermo-elastic solution begins.
-        moved: the state without its heat, where it is known; None for all that the job says.
+        moved: the state without its linear temperatures, where it is known; None for all that the job says.
+        heated: what its tables of temperatures are, where it is known.
 
     Raises:
         InputError: a temperature at or below 0 K, or one at which a glass's index is not known; a table of nodes that
             does not describe its body.
     """
-    fields = job.fields()
+    heated = heated_bodies(job, thermal) if heated is None else heated
+    fields = with_heat(job.fields(), heated)
     if moved is None:
-        moved = on_deformed(thermal.instrument, deformations_of(job, thermal.instrument), motions_of(job))
+        deformed = deformations_of(job, thermal.instrument)
+        moved = on_deformed(thermal.instrument, deformed, motions_of(job), heated)
     try:
         thermal.check(fields)
         return thermal.state(fields, moved, progress)
@@ -53,12 +58,20 @@ def deformations_of(job: JobSpec, instrument: Instrument) -> dict[str, NodalDefo
     return {path: deformed_face(instrument, job, path, table) for path, table in named.items()}
 
 
-def on_deformed(instrument: Instrument, deformed: Mapping[str, NodalDeformation], moved: State) -> State:
-    """The motions of a state on top of its bodies' deformations."""
-    if not deformed:
-        return moved
+def on_deformed(
+    instrument: Instrument,
+    deformed: Mapping[str, NodalDeformation],
+    moved: State,
+    heated: Mapping[str, HeatedBody] | None = None,
+) -> State:
+    """The motions of a state on top of its bodies' deformations, by tables of nodes and by what is not linear of tables
+    of temperatures.
+    """
     bodies = {body.path: body for body in instrument.assembly.tree.bodies}
-    return compose({path: face.motion() for path, face in deformed.items()}, moved, bodies)
+    own = {path: face.motion() for path, face in deformed.items()}
+    for warm in (heated or {}).values():
+        moved = compose(warm.state(own), moved, bodies) if warm.faces else moved
+    return compose(own, moved, bodies) if own else moved
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:

@@ -32,9 +32,11 @@ class Finishes:
     """Finish of every kind of surface.
 
     Attributes:
-        mirror: optical side of the mirrors and metallised faces; mirror_back: their back.
+        mirror: optical side of the mirrors; mirror_back: their back.
+        metallised: mirror faces of glass bodies, None for that of the mirrors.
         coated, bare, ground: faces of glass bodies, see ``Coating``.
         detector: light-sensitive faces; board: what carries them.
+        baffle: of baffles, None for each one's own.
     """
 
     mirror: Finish = MIRROR
@@ -44,11 +46,13 @@ class Finishes:
     ground: Finish = GROUND
     detector: Finish = SILICON
     board: Finish = BLACK
+    baffle: Finish | None = None
+    metallised: Finish | None = None
 
     def of(self, coating: Coating) -> Finish:
         """The finish of a glass face."""
         return {
-            Coating.MIRROR: self.mirror,
+            Coating.MIRROR: self.mirror if self.metallised is None else self.metallised,
             Coating.TRANSMITTING: self.coated,
             Coating.TOTAL: self.bare,
             Coating.GROUND: self.ground,
@@ -244,8 +248,8 @@ def _elements_on(
     return out
 
 
-def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies) -> list[SceneSurface]:
-    """The surfaces of baffles, named ``<name>/<number>``."""
+def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies, baffle: Finish | None = None) -> list[SceneSurface]:
+    """The surfaces of baffles, named ``<name>/<number>``, with a finish for all or each its own."""
     out = []
     for number, plate in enumerate(plates):
         vertices, triangles, _ = sheet_mesh(plane(), plate.outline)
@@ -258,8 +262,8 @@ def plate_surfaces(plates: Iterable[Plate], placed: PlacedBodies) -> list[SceneS
                 plane(),
                 vertices,
                 triangles,
-                plate.finish,
-                plate.finish,
+                plate.finish if baffle is None else baffle,
+                plate.finish if baffle is None else baffle,
                 apertures=(plate.outline,),
             )
         )

@@ -105,7 +105,7 @@ def build_scenery(
         more, grids = _focal_plane(instrument, camera, placed, finishes, whole_focal_planes)
         surfaces += more
         detectors += grids
-    surfaces += plate_surfaces((*instrument.baffles, *baffles), placed)
+    surfaces += plate_surfaces((*instrument.baffles, *baffles), placed, finishes.baffle)
     return Scenery(tuple(surfaces), tuple(detectors))
 
 

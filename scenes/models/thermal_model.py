@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose, triple
 from optics.geometry.solid import Solid, solid_mesh
+from optics.geometry.surface import Surface
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
 from optics.materials.material import Material, material
@@ -38,6 +39,10 @@ TERMS = 15
 
 Response = Mapping[str, tuple[FaceChange, FaceChange, FaceChange]]
 """Body of a face -> what a gradient of 1 K/m along each axis of the solid's frame does to it."""
+
+
+Held = tuple[ElasticBody, Kinematic]
+"""Finite elements and what holds them."""
 
 
 class TemperatureError(ValueError):
@@ -224,14 +229,75 @@ class ThermalModel:
             self._responses[path] = solve(path)
         return self._responses[path]
 
-    def _solid_response(self, path: str) -> Response:
-        faces = {
+    @property
+    def solids(self) -> Mapping[str, Solid]:
+        """Path -> glass body or block."""
+        return self._solids
+
+    def is_mirror(self, path: str) -> bool:
+        """Whether a body is a camera's mirror."""
+        return path in self._mirrors
+
+    def surface(self, face: str) -> Surface:
+        """Nominal shape of the optical face of a body."""
+        return next(e.surface for e in self.instrument.assembly.elements.values() if e.body == face)
+
+    def extent(self, path: str) -> np.ndarray:
+        """Points of a body between which its temperature lies, (P, 3), metres, in its frame."""
+        return self._extent(path)
+
+    def face_radii(self, path: str) -> dict[str, float]:
+        """Body of an optical face of a mirror or a solid -> radius of the disk of its figure's terms, metres."""
+        return {face: self.surface(face).figure_disk(own).radius for face, (own, _) in self.faces_of(path).items()}
+
+    def index_path(self, path: str, field: Temperature, rest: float) -> float:
+        """Largest optical path that a temperature of ``rest`` kelvin beside a linear field may be worth in a body's
+        glass, metres: there and back along its longest side; 0 for what is not glass.
+        """
+        if path not in self._solids or not self._solids[path].transparent:
+            return 0.0
+        here = self.reference + field.change
+        slope = glass(self._solids[path].material).dn_dt(self.instrument.spec.monitor.wavelength, here)
+        return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self._extent(path), axis=0)))
+
+    def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:
+        """Body of an optical face -> its aperture and its nominal place in the frame of a mirror or a solid."""
+        if path in self._mirrors:
+            camera, name = self._mirrors[path]
+            return {path: (self.instrument.cameras[camera].apertures[name], Pose())}
+        return {
             element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
             for element in self.instrument.assembly.elements.values()
             if self._owner(element.body) == path and element.aperture is not None
         }
-        if len(self._pieces(path)) > 1:
-            return self._face_changes(path, [self._free(path, axis) for axis in range(3)], faces)
+
+    def elastic(self, path: str, cells: int = CELLS, spacing: float = SPACING) -> Held | None:
+        """Finite elements of a mirror or a solid in its own frame, and the three points that hold it.
+
+        Args:
+            path: of the body.
+            cells: across a mirror.
+            spacing: longest edge in a solid, metres.
+
+        Returns:
+            None for a body that has none: one without a shape, or of several pieces.
+        """
+        if path in self._mirrors:
+            camera, name = self._mirrors[path]
+            model = self.instrument.cameras[camera]
+            surface, aperture = model.surfaces[name], model.apertures[name]
+            side = behind(model, name)
+            outline = self._mirror_outline(path)
+            low, high = outline.min(axis=0), outline.max(axis=0)
+            thickness = THICKNESS * float(max(high[:2] - low[:2]))
+            back = high[2] + 0.5 * thickness if side > 0 else low[2] - 0.5 * thickness
+            x, y = aperture.centre
+            radius = 0.25 * float(min(high[:2] - low[:2]))
+            support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
+            mesh = mirror_mesh(surface, aperture, thickness, side, cells)
+            return ElasticBody(mesh, self.materials[path]), Kinematic(support)
+        if path not in self._solids or len(self._pieces(path)) > 1:
+            return None
         corners = solid_mesh(self._solids[path], self._placed).mesh.vertices
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
@@ -239,13 +305,16 @@ class ThermalModel:
         a, b = np.argsort(half)[:0:-1][:2]
         arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
         support = middle + _within(corners, middle, arms) * arms
-        elastic = ElasticBody(polyhedron_mesh(corners, SPACING), self.materials[path])
-        return self._face_changes(path, self._unit_gradients(path, elastic, support), faces)
+        return ElasticBody(polyhedron_mesh(corners, spacing), self.materials[path]), Kinematic(support)
+
+    def _solid_response(self, path: str) -> Response:
+        held = self.elastic(path)
+        if held is None:
+            return self._face_changes(path, [self._free(path, axis) for axis in range(3)])
+        return self._face_changes(path, self._unit_gradients(path, *held))
 
     def _mirror_response(self, path: str) -> Response:
-        camera, name = self._mirrors[path]
-        aperture = self.instrument.cameras[camera].apertures[name]
-        return self._face_changes(path, self.mirror_displacements(path), {path: (aperture, Pose())})
+        return self._face_changes(path, self.mirror_displacements(path))
 
     def mirror_displacements(self, path: str) -> Sequence[Displacement]:
         """Displacements of a mirror's material, in its frame, by a gradient of 1 K/m along x, y and z of it, the
@@ -254,40 +323,36 @@ class ThermalModel:
         Args:
             path: of the mirror.
         """
-        camera, name = self._mirrors[path]
-        model = self.instrument.cameras[camera]
-        surface, aperture = model.surfaces[name], model.apertures[name]
-        side = behind(model, name)
-        outline = self._mirror_outline(path)
-        low, high = outline.min(axis=0), outline.max(axis=0)
-        thickness = THICKNESS * float(max(high[:2] - low[:2]))
-        back = high[2] + 0.5 * thickness if side > 0 else low[2] - 0.5 * thickness
-        x, y = aperture.centre
-        radius = 0.25 * float(min(high[:2] - low[:2]))
-        support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
-        elastic = ElasticBody(mirror_mesh(surface, aperture, thickness, side, CELLS), self.materials[path])
-        return self._unit_gradients(path, elastic, support)
+        held = self.elastic(path)
+        assert held is not None
+        return self._unit_gradients(path, *held)
 
-    def _unit_gradients(self, path: str, elastic: ElasticBody, support: np.ndarray) -> Sequence[Displacement]:
+    def _unit_gradients(self, path: str, elastic: ElasticBody, support: Kinematic) -> Sequence[Displacement]:
         about = self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0))
-        loads = [_unit_load(a, np.array(about)) for a in range(3)]
-        return elastic.solve_many(loads, Kinematic(support))
+        return elastic.solve_many([_unit_load(a, np.array(about)) for a in range(3)], support)
 
     def _free(self, path: str, axis: int) -> Formula:
         """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""
         about = self._bodies[path].pivots[_mount(self._bodies[path])]
         return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
 
-    def _face_changes(
-        self, path: str, solved: Sequence[Displaced], faces: Mapping[str, tuple[Aperture, Pose]]
-    ) -> Response:
+    def _face_changes(self, path: str, solved: Sequence[Displaced]) -> Response:
         """What displacements by unit gradients along x, y, z do to a body's faces."""
-        surfaces = {e.body: e.surface for e in self.instrument.assembly.elements.values()}
-        out = {}
-        for body, (aperture, pose) in faces.items():
-            x, y, z = (face_change(d, surfaces[body], aperture, pose, TERMS) for d in solved)
-            out[body] = (x, y, z)
-        return out
+        changes = [self.changes(path, displaced) for displaced in solved]
+        return {face: (changes[0][face], changes[1][face], changes[2][face]) for face in changes[0]}
+
+    def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
+        """What a displacement of a mirror's or a solid's material does to its optical faces.
+
+        Args:
+            path: of the body.
+            displaced: in its frame.
+            terms: highest Noll index of the figures.
+        """
+        return {
+            face: face_change(displaced, self.surface(face), aperture, pose, terms)
+            for face, (aperture, pose) in self.faces_of(path).items()
+        }
 
     def _mirror_outline(self, path: str) -> np.ndarray:
         camera, name = self._mirrors[path]

@@ -2,17 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
-from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import (
     DEFAULT_PIVOT,
     NO_MOTION,
@@ -20,18 +17,24 @@ from scenes.specs.course import (
     Rotation,
     ScaleChange,
     Shift,
-    TemperatureChange,
-    TemperatureGradient,
     Term,
 )
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
+from scenes.specs.job_tables import (
+    Deformation,
+    FinishesSpec,
+    PlainTemperature,
+    TableTemperature,
+    TableTemperatureSpec,
+    TemperatureSpec,
+    checked,
+    checked_finishes,
+)
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
-from scenes.yaml.node_table import DECKS_NEED, INPUT_DECKS, MESHES, TABLES, digest_of, read_nodes
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
-from scenes.yaml.yaml_file import is_file
 
 
 def target_names() -> tuple[str, ...]:
@@ -66,28 +69,6 @@ ACTIONS = ("rotate", "shift", "figure", "scale", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
 
 
-class TemperatureSpec(Spec):
-    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r.
-
-    Attributes:
-        change: at the body's origin, kelvin.
-        gradient: in the body's own frame, K/m.
-    """
-
-    change: TemperatureChange = 0.0
-    gradient: TemperatureGradient = NO_MOTION
-
-    @property
-    def field(self) -> Temperature:
-        """The field."""
-        return Temperature(self.change, self.gradient)
-
-
-def _uniform(value: Any) -> Any:
-    """`temperature: 2 K` means a uniform change."""
-    return {"change": value} if isinstance(value, str | int | float) else value
-
-
 class PlainPerturbationSpec(Spec):
     """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and
     for a mirror or a prism's face a figure error.
@@ -106,7 +87,7 @@ class PlainPerturbationSpec(Spec):
     pivot: Name = DEFAULT_PIVOT
     figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
-    temperature: Annotated[TemperatureSpec, BeforeValidator(_uniform)] = TemperatureSpec()
+    temperature: PlainTemperature = TemperatureSpec()
 
     def uses(self) -> tuple[str, ...]:
         """Which of rotate, shift, figure, scale and temperature do something."""
@@ -115,44 +96,14 @@ class PlainPerturbationSpec(Spec):
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
             "scale": self.scale != 0.0,
-            "temperature": self.temperature != TemperatureSpec(),
+            "temperature": self.temperature.warms,
         }
         return tuple(name for name, does in done.items() if does)
 
 
-class DeformationSpec(Spec):
-    """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
-
-    Attributes:
-        table: CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med)
-            that has displacements at its nodes; relative to this file.
-        frame: path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
-        terms: highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
-        unit: of a mesh, whose file has none.
-        field: name of the displacements in a mesh; needed when it has several vectors at its nodes.
-        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
-    """
-
-    table: Reference
-    frame: Reference | None = None
-    terms: Annotated[Whole, Field(ge=3, le=zernike.MAX_NOLL)] = TERMS
-    unit: Literal["m", "mm", "um"] | None = None
-    field: Text | None = None
-    sha256: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = None
-
-
-def _named(value: Any) -> Any:
-    """`deformation: m1.csv` names the table alone."""
-    return {"table": value} if isinstance(value, str) else value
-
-
-Deformation = Annotated[DeformationSpec, BeforeValidator(_named)]
-"""With its keys, or the table's name alone."""
-
-
 class PerturbationSpec(PlainPerturbationSpec):
-    """What happens to one body of a job's instrument: also, for a mirror or a prism's face, the displaced nodes of a
-    finite-element program. The other motions come on top of these.
+    """What happens to one body of a job's instrument: also temperatures at nodes and, for a mirror or a prism's face,
+    displaced nodes of a finite-element program. The other motions come on top of these.
 
     Attributes:
         rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
@@ -160,16 +111,24 @@ class PerturbationSpec(PlainPerturbationSpec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        temperature: uniform change as `2 K`, or with a gradient.
-        deformation: the table of nodes, or a mesh; None for none.
+        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes.
+        deformation: the table of displaced nodes, or a mesh; None for none.
     """
 
+    temperature: TableTemperature = TableTemperatureSpec()
     deformation: Deformation | None = None
 
     @classmethod
     def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
         """Perturbations of another file's as a job has them."""
-        return FrozenMap({path: cls.model_construct(**dict(what)) for path, what in perturb.items()})
+        return FrozenMap(
+            {
+                path: cls.model_construct(
+                    **{**dict(what), "temperature": TableTemperatureSpec.model_construct(**dict(what.temperature))}
+                )
+                for path, what in perturb.items()
+            }
+        )
 
     def uses(self) -> tuple[str, ...]:
         """Which of the actions do something, deformation the last."""
@@ -188,9 +147,11 @@ class StraySpec(Spec):
 
     Attributes:
         paths: from every source.
+        finishes: measured BSDFs and coatings of surfaces in place of the built-in finishes.
     """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
+    finishes: FinishesSpec | None = None
 
 
 def _switch(value: Any) -> Any:
@@ -310,61 +271,34 @@ class JobSpec(Spec):
 
     def fields(self, time: int | None = None) -> dict[str, Temperature]:
         """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
-        out = {path: what.temperature.field for path, what in self.perturb.items() if "temperature" in what.uses()}
+        out = {path: what.temperature.linear for path, what in self.perturb.items() if "temperature" in what.uses()}
         if self.course is not None and time is not None:
             for path, added in self.course.fields(time).items():
                 out[path] = out.get(path, Temperature()) + added
         return out
 
 
-def _checked(owner: Spec, key: KeyPath, spec: DeformationSpec) -> DeformationSpec:
-    """The same with the table's full path and checksum, when it can be read.
-
-    Args:
-        owner: the specification that names it, which knows its file.
-        key: of the deformation in there.
-        spec: as read.
-
-    Raises:
-        InputError: no such table, one that is not right, or another one than the checksum says.
-    """
-    path = (Path(owner.source.file).parent / spec.table).absolute()
-    place = (*key, "table")
-    if not is_file(path):
-        kinds = names_text((*TABLES, *MESHES))
-        raise owner.error(f"no such file: {path}", place, allowed=f"a file ({kinds}), relative to this one")
-    ending = path.suffix.lower()
-    if ending in INPUT_DECKS:
-        text = f"a {ending} file has no displacements that can be read here"
-        raise owner.error(text, place, found=spec.table, allowed=DECKS_NEED)
-    if ending not in (*TABLES, *MESHES):
-        meant = nearest(ending, (*TABLES, *MESHES))
-        text = "neither a table nor a mesh that is known"
-        allowed = names_text((*TABLES, *MESHES))
-        raise owner.error(text, place, found=spec.table, allowed=allowed, suggestion=meant)
-    if ending in TABLES:
-        wrong = next((name for name in ("unit", "field") if getattr(spec, name) is not None), None)
-        if wrong is not None:
-            text = f"a table has its units in its heads and no {wrong} beside them"
-            raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
-    elif spec.unit is None:
-        raise owner.error("a mesh's file does not say its unit", place, found=spec.table, allowed="unit: mm beside it")
-    read_nodes(path, spec.unit, spec.field, spec.sha256)
-    return spec.model_copy(update={"table": str(path), "sha256": digest_of(path)})
-
-
-def with_deformations(job: JobSpec) -> JobSpec:
-    """The job with the full paths and checksums of the tables that deform its bodies.
+def with_tables(job: JobSpec) -> JobSpec:
+    """The job with the full paths and checksums of its tables: of nodes that deform or warm its bodies, of finishes.
 
     Raises:
         InputError: a table that cannot be read or is not the one of the checksum.
     """
-    changed = {
-        path: what.model_copy(update={"deformation": _checked(job, ("perturb", path, "deformation"), what.deformation)})
-        for path, what in job.perturb.items()
-        if what.deformation is not None
-    }
-    return job.model_copy(update={"perturb": FrozenMap({**job.perturb, **changed})}) if changed else job
+    changed = {}
+    for path, what in job.perturb.items():
+        update: dict[str, Any] = {}
+        if what.deformation is not None:
+            update["deformation"] = checked(job, ("perturb", path, "deformation"), what.deformation)
+        if what.temperature.table is not None:
+            update["temperature"] = checked(job, ("perturb", path, "temperature"), what.temperature)
+        if update:
+            changed[path] = what.model_copy(update=update)
+    whole: dict[str, Any] = {"perturb": FrozenMap({**job.perturb, **changed})} if changed else {}
+    stray = job.render.stray
+    if stray is not None and stray.finishes is not None:
+        finishes = checked_finishes(job, ("render", "stray", "finishes"), stray.finishes)
+        whole["render"] = job.render.model_copy(update={"stray": stray.model_copy(update={"finishes": finishes})})
+    return job.model_copy(update=whole) if whole else job
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
-from scenes.specs.job import JobSpec, with_deformations
+from scenes.specs.job import JobSpec, with_tables
 from scenes.specs.orbit_angle import OrbitAngleSpec
 from scenes.specs.orbit_calibration import OrbitCalibrationSpec
 from scenes.specs.orbit_scene import LineImageSpec
@@ -53,7 +53,7 @@ def load_job(path: str | Path) -> JobSpec:
         InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
             fault.
     """
-    job = with_deformations(with_table(validate(JobSpec, read_yaml(path))))
+    job = with_tables(with_table(validate(JobSpec, read_yaml(path))))
     instrument_path(job)
     return job
 

@@ -10,7 +10,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
-from scenes.specs.job import JobSpec, TargetsSpec, with_deformations
+from scenes.specs.job import JobSpec, TargetsSpec, with_tables
 from scenes.specs.load import (
     find_disturbances,
     instrument_path,
@@ -179,7 +179,7 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
             raise resolved.error(text, ("line_detectors",), allowed=allowed)
     source = resolved.source
     job = cast(JobSpec, resolved.job.with_source(Source(source.file, source.lines, ("job",))))
-    changed: dict[str, Spec] = {"job": with_deformations(job)}
+    changed: dict[str, Spec] = {"job": with_tables(job)}
     if resolved.disturbances is not None:
         changed["disturbances"] = resolved.disturbances.with_source(
             Source(source.file, source.lines, ("disturbances",))

@@ -17,7 +17,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
-from scenes.yaml.units import Kind, parse_quantity, unit_ratio
+from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_text
 
 LARGEST_TABLE = 1 << 30
@@ -38,6 +38,7 @@ class Column:
         needed: whether a table without it is refused.
         least, most: of its numbers, both allowed, SI units.
         whole: whether its numbers are whole.
+        bare: whether the unit may be missing, and numbers are then in the SI unit.
     """
 
     name: str
@@ -47,11 +48,12 @@ class Column:
     least: float = _LEAST
     most: float = _MOST
     whole: bool = False
+    bare: bool = False
 
     @property
     def head(self) -> str:
         """An example of its head."""
-        return self.name if self.kind is None else f"{self.name} [{self.kind.units[0]}]"
+        return self.name if self.kind is None or self.bare else f"{self.name} [{self.kind.units[0]}]"
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
     cells = list(zip(*body, strict=True))
     numbers = np.array(lines[1:])
     values = {
-        column.name: _values(file, numbers, rows[0][k].strip(), column, cells[k], factor) for column, k, factor in found
+        column.name: _values(file, numbers, rows[0][k].strip(), column, cells[k], scale) for column, k, scale in found
     }
     heads = {column.name: rows[0][k].strip() for column, k, _ in found}
     return Table(file, numbers, FrozenMap(heads), FrozenMap(values))
@@ -164,10 +166,10 @@ def _rows(file: str, text: str) -> tuple[list[int], list[list[str]]]:
 
 def _heads(
     file: str, line: int, heads: Sequence[str], columns: Sequence[Column], allowed: str
-) -> list[tuple[Column, int, float]]:
-    """The columns that stand in the file, where, and what their numbers are multiplied by."""
+) -> list[tuple[Column, int, _Scale]]:
+    """The columns that stand in the file, where, and how their numbers become SI ones."""
     known = {column.name: column for column in columns}
-    found: list[tuple[Column, int, float]] = []
+    found: list[tuple[Column, int, _Scale]] = []
     for k, head in enumerate(heads):
         text = head.strip()
         match = _HEAD.fullmatch(text)
@@ -181,7 +183,7 @@ def _heads(
         column = known[name]
         if any(column is other for other, _, _ in found):
             raise InputError(Issue("another column holds the same", file, line, (text,)))
-        found.append((column, k, _factor(file, line, text, column, match["unit"])))
+        found.append((column, k, _scale(file, line, text, column, match["unit"])))
     missing = next((c for c in columns if c.needed and not any(c is other for other, _, _ in found)), None)
     if missing is not None:
         have = names_text([head.strip() for head in heads])
@@ -189,25 +191,35 @@ def _heads(
     return found
 
 
-def _factor(file: str, line: int, head: str, column: Column, unit: str | None) -> float:
+_Scale = tuple[float, float]
+"""Factor and offset from a head's unit to the SI unit: SI = factor * (number + offset). Degrees Celsius alone have an
+offset."""
+
+
+def _scale(file: str, line: int, head: str, column: Column, unit: str | None) -> _Scale:
     """From the unit of a head to the SI unit."""
     if column.kind is None:
         if unit is not None:
             raise InputError(Issue("this column has no unit", file, line, (head,), shown(unit), repr(column.head)))
-        return 1.0
+        return 1.0, 0.0
+    if column.bare and unit is None:
+        return 1.0, 0.0
     if not unit:
         raise InputError(Issue("a head without a unit", file, line, (head,), allowed=repr(column.head)))
     try:
-        parse_quantity(f"1 {unit.strip()}", column.kind)
-        return unit_ratio(unit.strip(), column.kind.si)
+        one = parse_quantity(f"1 {unit.strip()}", column.kind)
+        if column.kind == TEMPERATURE and one > 2.0:
+            return 1.0, parse_quantity(f"0 {unit.strip()}", column.kind)
+        return unit_ratio(unit.strip(), column.kind.si), 0.0
     except Problem as problem:
         allowed = names_text(column.kind.units)
         issue = Issue(problem.problem, file, line, (head,), problem.found, allowed, problem.suggestion)
         raise InputError(issue) from None
 
 
-def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequence[str], factor: float) -> np.ndarray:
+def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequence[str], scale: _Scale) -> np.ndarray:
     """SI numbers, or names, of a column."""
+    factor, offset = scale
 
     def wrong(row: int, problem: str, allowed: str | None = None) -> InputError:
         return InputError(Issue(problem, file, int(lines[row]), (head,), shown(cells[row].strip()), allowed))
@@ -226,8 +238,7 @@ def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequ
     odd = next((k for k, cell in enumerate(cells) if "_" in cell), None)
     if odd is not None:  # Python takes 1_000 for a number
         raise wrong(odd, "not a number", "a number")
-    # Degrees Celsius are the one unit with an offset; no table has absolute temperatures.
-    numbers = numbers * factor
+    numbers = (numbers + offset if offset else numbers) * factor
     for bad, problem in (
         (~np.isfinite(numbers), "not a finite number"),
         ((numbers < column.least) | (numbers > column.most), "out of range"),
@@ -235,7 +246,7 @@ def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequ
     ):
         if np.any(bad):
             row = int(np.argmax(bad))
-            raise wrong(row, problem, _range(column, factor) if problem == "out of range" else "a number")
+            raise wrong(row, problem, _range(column, scale) if problem == "out of range" else "a number")
     return numbers
 
 
@@ -247,8 +258,9 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _range(column: Column, factor: float) -> str:
-    low, high = column.least / factor, column.most / factor
+def _range(column: Column, scale: _Scale) -> str:
+    factor, offset = scale
+    low, high = column.least / factor - offset, column.most / factor - offset
     if np.isinf(high):
         return f"at least {low:g}"
     return f"at most {high:g}" if np.isinf(low) else f"{low:g} to {high:g}"

@@ -1,19 +1,22 @@
-"""Displaced nodes of finite-element programs from CSV files, and from meshes by meshio."""
+"""Nodes of finite-element programs, with displacements or temperatures, from CSV files, and from meshes by meshio."""
 
 import contextlib
 import hashlib
 import io
 import re
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import LEAST_NODES
-from scenes.yaml.csv_table import LARGEST_TABLE, Column, read_table
+from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
-from scenes.yaml.units import LENGTH, unit_ratio
+from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_ratio
 from scenes.yaml.yaml_file import is_file
 
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
@@ -24,12 +27,28 @@ COLUMNS = (
     Column("node", text=True, needed=False),
 )
 """Of a table; the nodes' own numbers say nothing here."""
+ABSOLUTE, CHANGE = "T", "dT"
+HOTTEST = 2000.0
+"""Kelvin: no node is hotter, and none changes by more."""
+HEAT_COLUMNS = (
+    *COLUMNS[:3],
+    Column(ABSOLUTE, TEMPERATURE, needed=False, least=0.0, most=HOTTEST),
+    Column(CHANGE, TEMPERATURE_DIFFERENCE, needed=False, least=-HOTTEST, most=HOTTEST),
+    COLUMNS[-1],
+)
+"""Of a table of temperatures: absolute ones, or changes from the instrument's."""
+LONGEST_READING, LONGEST_PER_BYTE = 10.0, 2e-6
+"""Seconds for a mesh, and for each of its bytes: ten times what whole files take."""
+READINGS = ("change", "K", "degC")
+"""What the temperatures of a mesh, whose file has no heads, may be."""
+ZERO_CELSIUS = 273.15
 MOST_NODES = 1_000_000
 TABLES = (".csv", ".tsv", ".txt")
 MESHES = FrozenMap({".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".med": "med"})
 """Ending of a mesh's file -> its format in meshio: those that carry displacements of the nodes, all in one file."""
 INPUT_DECKS = (".inp", ".bdf", ".nas", ".fem", ".dat", ".cdb", ".ans", ".rst", ".op2", ".f06", ".odb")
 """Input of NASTRAN, ANSYS and Abaqus has no results, and their own result files are not read."""
+HEAT_DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'T [degC]', or a .vtu file"
 DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'dx [mm]', 'dy [mm]', 'dz [mm]', or a .vtu file"
 
 
@@ -41,10 +60,25 @@ class DisplacedNodes:
     moves: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class WarmNodes:
+    """Nodes and their temperatures.
+
+    Attributes:
+        points: metres, (N, 3), in the frame that the specification names.
+        values: kelvin, (N,).
+        absolute: whether they are absolute temperatures, and not changes from the instrument's.
+    """
+
+    points: np.ndarray
+    values: np.ndarray
+    absolute: bool
+
+
 def read_nodes(
     path: str | Path, unit: str | None = None, field: str | None = None, sha256: str | None = None
 ) -> DisplacedNodes:
-    """The nodes of a table or a mesh.
+    """The displaced nodes of a table or a mesh.
 
     Args:
         path: of the file; its ending says what it is.
@@ -55,71 +89,160 @@ def read_nodes(
     Raises:
         InputError: it cannot be read, with the line and the column of a table, or is not the one of the checksum.
     """
-    if sha256 is not None and is_file(Path(path)) and (digest := digest_of(Path(path))) != sha256:
-        text = "not the table that was used: its checksum is another"
-        raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
+    _checked(Path(path), sha256)
     if Path(path).suffix.lower() in MESHES:
-        return _of_mesh(Path(path), unit or "m", field)
-    table = read_table(path, COLUMNS, LEAST_NODES)
-    if len(table.lines) > MOST_NODES:
-        allowed = f"at most {MOST_NODES}: those of the optical surface alone"
-        raise InputError(Issue(f"{len(table.lines)} nodes", str(path), int(table.lines[MOST_NODES]), allowed=allowed))
+        points, moves = _of_mesh(Path(path), unit or "m", field, "vectors", DECKS_NEED)
+        moves = moves * unit_ratio(unit or "m", LENGTH.si)
+        _within(str(path), moves, FARTHEST, "displacements", "up to 100 m")
+        return DisplacedNodes(points, moves)
+    table = _table(path, COLUMNS)
     points, moves = table.stacked(*PLACES), table.stacked(*MOVES)
-    first: dict[bytes, int] = {}
-    for row, place in enumerate(points):
-        other = first.setdefault(place.tobytes(), row)
-        if other != row and np.any(moves[other] != moves[row]):
-            text = f"another displacement of the node that line {table.lines[other]} has"
-            raise table.error(row, "", text, allowed="one load case in a table, every node once")
+    _one_load_case(table, points, moves, "displacement")
     return DisplacedNodes(points, moves)
 
 
-def _of_mesh(path: Path, unit: str, field: str | None) -> DisplacedNodes:
-    """The nodes of a mesh by meshio, whose readers end in any exception."""
+def read_temperatures(
+    path: str | Path,
+    unit: str | None = None,
+    field: str | None = None,
+    reading: str | None = None,
+    sha256: str | None = None,
+) -> WarmNodes:
+    """The temperatures of a table's or a mesh's nodes.
+
+    Args:
+        path: of the file; its ending says what it is.
+        unit: of a mesh's coordinates.
+        field: name of the temperatures in a mesh, None for its only numbers.
+        reading: of a mesh: what they are, one of `READINGS`.
+        sha256: checksum that the file must have, None for any.
+
+    Raises:
+        InputError: as ``read_nodes``.
+    """
+    _checked(Path(path), sha256)
+    if Path(path).suffix.lower() in MESHES:
+        points, values = _of_mesh(Path(path), unit or "m", field, "temperatures", HEAT_DECKS_NEED)
+        values = values + (ZERO_CELSIUS if reading == "degC" else 0.0)
+        absolute = reading in ("K", "degC")
+        _within(str(path), values[:, None], HOTTEST, "a temperature", f"up to {HOTTEST:g} K")
+        if absolute and np.any(values < 0.0):
+            number = int(np.argmax(values < 0.0))
+            text = f"node number {number} (from 0) is colder than absolute zero"
+            raise InputError(Issue(text, str(path), found=shown(float(values[number])), allowed="values: change"))
+        return WarmNodes(points, values, absolute)
+    table = _table(path, HEAT_COLUMNS)
+    given = [name for name in (ABSOLUTE, CHANGE) if name in table]
+    if len(given) != 1:
+        text = "absolute temperatures and changes" if given else "no temperatures"
+        allowed = "either 'T [degC]' (or 'T [K]'), absolute, or 'dT [K]', changes from the instrument's temperature"
+        raise InputError(Issue(text, str(path), int(table.lines[0]) - 1, allowed=allowed))
+    points, values = table.stacked(*PLACES), table[given[0]]
+    _one_load_case(table, points, values[:, None], "temperature")
+    return WarmNodes(points, values, given[0] == ABSOLUTE)
+
+
+def _checked(path: Path, sha256: str | None) -> None:
+    if sha256 is not None and is_file(path) and (digest := digest_of(path)) != sha256:
+        text = "not the table that was used: its checksum is another"
+        raise InputError(Issue(text, str(path), found=digest, allowed=f"sha256 {sha256}, as the job says"))
+
+
+def _table(path: str | Path, columns: tuple[Column, ...]) -> Table:
+    table = read_table(path, columns, LEAST_NODES)
+    if len(table.lines) > MOST_NODES:
+        allowed = f"at most {MOST_NODES}: those of the optical surface alone"
+        raise InputError(Issue(f"{len(table.lines)} nodes", str(path), int(table.lines[MOST_NODES]), allowed=allowed))
+    return table
+
+
+def _one_load_case(table: Table, points: np.ndarray, values: np.ndarray, what: str) -> None:
+    """Refuse a node that has two values (N, K)."""
+    first: dict[bytes, int] = {}
+    for row, place in enumerate(points):
+        other = first.setdefault(place.tobytes(), row)
+        if other != row and np.any(values[other] != values[row]):
+            text = f"another {what} of the node that line {table.lines[other]} has"
+            raise table.error(row, "", text, allowed="one load case in a table, every node once")
+
+
+def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes of a mesh, metres, (N, 3), and their vectors (N, 3) or temperatures (N,) as they stand in it, by meshio,
+    whose readers end in any exception.
+    """
     import meshio  # only a job with a mesh waits for it
 
     file = str(path)
+    if not is_file(path):
+        raise InputError(Issue("no such file", file, allowed="a mesh"))
     if path.stat().st_size > LARGEST_TABLE:
         raise InputError(Issue("too large", file, allowed="at most 1 GB"))
     try:
-        # it prints its complaints, and leaves the program for some
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            mesh = meshio.read(file, file_format=MESHES[path.suffix.lower()])
+        mesh = _in_time(path, lambda: meshio.read(file, file_format=MESHES[path.suffix.lower()]))
         points = np.asarray(mesh.points, np.float64)
-        vectors = {
+        shapes = [(len(points), 3)] if what == "vectors" else [(len(points),), (len(points), 1)]
+        fields = {
             str(name): np.asarray(values, np.float64)
             for name, values in mesh.point_data.items()
-            if np.shape(values) == (len(points), 3)
+            if np.shape(values) in shapes
         }
+    except InputError:
+        raise
     except (Exception, SystemExit) as error:
         reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
         raise InputError(Issue(f"meshio cannot read this mesh: {reason}", file)) from None
-    if field is None and len(vectors) != 1:
-        text = "no vectors at its nodes" if not vectors else "several vectors at its nodes"
-        remedy = DECKS_NEED if not vectors else "field: one of " + names_text(sorted(vectors))
-        raise InputError(Issue(text, file, found=names_text(sorted(vectors)) or None, allowed=remedy))
-    name = field if field is not None else next(iter(vectors))
-    if name not in vectors:
-        known = sorted(vectors)
-        issue = Issue("no such vectors at its nodes", file, None, (), shown(name), names_text(known) or "none")
-        raise InputError(issue if nearest(name, known) is None else _suggesting(issue, nearest(name, known)))
-    factor = unit_ratio(unit, LENGTH.si)
-    points, moves = points * factor, vectors[name] * factor
+    if field is None and len(fields) != 1:
+        text = f"no {what} at its nodes" if not fields else f"several {what} at its nodes"
+        remedy = need if not fields else "field: one of " + names_text(sorted(fields))
+        raise InputError(Issue(text, file, found=names_text(sorted(fields)) or None, allowed=remedy))
+    name = field if field is not None else next(iter(fields))
+    if name not in fields:
+        known = sorted(fields)
+        text = f"no such {what} at its nodes"
+        raise InputError(Issue(text, file, None, (), shown(name), names_text(known) or "none", nearest(name, known)))
+    points = points * unit_ratio(unit, LENGTH.si)
     if points.ndim != 2 or points.shape[1] != 3 or not LEAST_NODES <= len(points) <= MOST_NODES:
         raise InputError(
             Issue(f"nodes of shape {points.shape}", file, allowed=f"{LEAST_NODES} to {MOST_NODES} in space")
         )
-    for values, what in ((points, "coordinates"), (moves, "displacements")):
-        bad = ~np.all(np.isfinite(values) & (np.abs(values) <= FARTHEST), axis=1)
-        if np.any(bad):
-            number = int(np.argmax(bad))
-            text = f"node number {number} (from 0) has {what} out of range"
-            raise InputError(Issue(text, file, found=shown(values[number].tolist()), allowed="up to 100 m"))
-    return DisplacedNodes(points, moves)
+    _within(file, points, FARTHEST, "coordinates", "up to 100 m")
+    return points, fields[name] if what == "vectors" else fields[name].reshape(len(points))
 
 
-def _suggesting(issue: Issue, suggestion: str | None) -> Issue:
-    return Issue(issue.problem, issue.file, issue.line, issue.key, issue.found, issue.allowed, suggestion)
+def _in_time(path: Path, read: Callable[[], Any]) -> Any:
+    """What a reader of meshes returns or raises; refused when it takes longer than any mesh of that size.
+
+    With a count of nodes that is not that of the file some readers go on for hours. A thread that does so is left
+    behind: the program's end does not wait for it.
+    """
+    ended: dict[str, Any] = {}
+
+    def run() -> None:
+        try:
+            ended["value"] = read()
+        except BaseException as error:
+            ended["error"] = error
+
+    thread = threading.Thread(target=run, daemon=True)
+    # readers print their complaints, and leave the program for some
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        thread.start()
+        thread.join(LONGEST_READING + path.stat().st_size * LONGEST_PER_BYTE)
+    if thread.is_alive():
+        text = "meshio does not come to an end with this mesh"
+        raise InputError(Issue(text, str(path), allowed="a whole file, whose counts are those of its nodes and cells"))
+    if "error" in ended:
+        raise ended["error"]
+    return ended["value"]
+
+
+def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str) -> None:
+    """Refuse numbers (N, K) of nodes that are not finite or too large."""
+    bad = ~np.all(np.isfinite(values) & (np.abs(values) <= most), axis=1)
+    if np.any(bad):
+        number = int(np.argmax(bad))
+        text = f"node number {number} (from 0) has {what} out of range"
+        raise InputError(Issue(text, file, found=shown(values[number].tolist()), allowed=allowed))
 
 
 def digest_of(path: Path) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 
 TOLERANCE = 1e-12
 """Relative: some thousand roundings of float64, which another order of the same sums can bring about."""
+OF_THE_WHOLE = ("relative_error",)
+"""Keys of what is left of a balance of light: the rounding of its sums, which go by threads, is one of the whole, 1."""
 BITWISE, CLOSE, DIFFERENT = "equal bitwise", "equal to 1e-12", "different"
 ABSENT = "absent"
 
@@ -108,7 +110,7 @@ def _walk(old: Any, new: Any, place: str, limits: tuple[float, float], found: li
             if key not in old or key not in new:
                 found.append(Difference(below, old.get(key, ABSENT), new.get(key, ABSENT)))
             else:
-                _walk(old[key], new[key], below, limits, found)
+                _walk(old[key], new[key], below, (tolerance, max(scale, 1.0) if key in OF_THE_WHOLE else scale), found)
     elif isinstance(old, list) and isinstance(new, list):
         for k in range(max(len(old), len(new))):
             below = f"{place}[{k}]"

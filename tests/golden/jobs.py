@@ -144,6 +144,7 @@ ALL = (
     _job("render_course", f"twin.render {RUN % 'course'} --json"),
     _job("render_stray", f"twin.render {RUN % 'stray'}"),
     _job("render_deformed", f"twin.render {RUN % 'deformed'} --quiet"),
+    _job("render_warmed", f"twin.render {RUN % 'warmed'} --quiet"),
     _job("render_refused", f"twin.render {RUN % 'bad'}"),
     _job("recover", "twin.recover {here}/frames.yaml --out {out} --json", prepare=_frames),
     _job("uncertainty", "twin.uncertainty gf7_pair --states 4 --seed 5 --out {out}"),

@@ -117,3 +117,13 @@ def test_a_figure_that_the_trace_does_not_know_is_refused(backend) -> None:
 
     with pytest.raises(ValueError, match="no figure of type Bump"):
         run(backend, build(Stage(plane().with_figure(Bump()))), np.zeros((1, 3)), Z[None])  # type: ignore[arg-type]
+
+
+def test_a_grid_on_the_samples_of_another() -> None:
+    """On finer samples the spline is itself to fourth order of them, and it stays what it was on its own."""
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 31), np.linspace(-0.4, 0.4, 25))
+    grid = GridFigure(1e-8 * np.cos(6.0 * x) * np.cos(5.0 * y), (-0.5, 0.5, -0.4, 0.4))
+    np.testing.assert_allclose(grid.sampled_as(grid).values, grid.values, rtol=0, atol=1e-22)
+    finer = grid.sampled_as(GridFigure(np.zeros((97, 121)), (-0.5, 0.5, -0.4, 0.4)))
+    u, v = np.random.default_rng(1).uniform(-0.35, 0.35, (2, 200))
+    np.testing.assert_allclose(finer.sag(u, v), grid.sag(u, v), rtol=0, atol=1e-12)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from scenes.models.deformed_faces import deformed_face
-from scenes.specs.job import DeformationSpec, JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.job import JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
@@ -158,42 +159,6 @@ def test_what_is_wrong_with_a_table_is_told_by_its_line(tmp_path, nodes, change,
     (issue,) = caught.value.issues
     assert (Path(issue.file).name, issue.line) == ("m1.csv", line)
     assert found in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "kind", ["csv", *(pytest.param(k, marks=pytest.mark.slow) for k in ("vtu", "vtk", "med", "msh"))]
-)
-def test_mutated_files_are_read_or_refused(tmp_path, nodes, gf7_pair, kind: str) -> None:
-    place = tmp_path / f"m1.{kind}"
-    few = nodes[::3]
-    if kind == "csv":
-        table(place, few)
-    else:
-        mesh = meshio.Mesh(few[:, :3], [("triangle", np.array([[0, 1, 9]]))], point_data={"U": few[:, 3:]})
-        mesh.write(place, **({"file_format": "gmsh"} if kind == "msh" else {}))
-    content = place.read_bytes()
-    rng = np.random.default_rng(6)
-    files = []
-    for _ in range(60):
-        data = bytearray(content)
-        for _ in range(int(rng.integers(1, 4))):
-            at = int(rng.integers(0, len(data)))
-            match int(rng.integers(0, 4)):
-                case 0:
-                    data[at] = int(rng.integers(0, 256))
-                case 1:
-                    del data[at : at + int(rng.integers(1, 200))]
-                case 2:
-                    data[at:at] = b"<!-- \x00 9e99,;\n"
-                case _:
-                    data = data[: at + 1]
-        place.write_bytes(bytes(data))
-        try:
-            read_nodes(place, unit=None if kind == "csv" else "m")
-        except InputError as error:
-            files.append(error.issues[0].file)
-    assert len(files) > 15
-    assert set(files) == {str(place)}
 
 
 def test_files_that_are_not_there_or_not_tables(tmp_path, nodes) -> None:

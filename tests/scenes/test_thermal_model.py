@@ -400,8 +400,8 @@ def written(folder: Path, text: str) -> Path:
 def test_temperatures_in_yaml_read_back_bit_for_bit(tmp_path) -> None:
     text = HEAD + "  base: {temperature: 2 K}\n  base/forward/M1: " + LONG + "\n"
     job = load_job(written(tmp_path, text))
-    assert job.perturb["base"].temperature.field == Temperature(2.0)
-    assert job.perturb["base/forward/M1"].temperature.field == Temperature(2.0, (0.0, 0.02, -0.5))
+    assert job.perturb["base"].temperature.linear == Temperature(2.0)
+    assert job.perturb["base/forward/M1"].temperature.linear == Temperature(2.0, (0.0, 0.02, -0.5))
     assert job.perturb["base"].uses() == ("temperature",)
     assert job.perturb["base/forward/M1"].uses() == ("shift", "temperature")
     resolved = resolve_job(job)

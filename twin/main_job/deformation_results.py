@@ -1,20 +1,14 @@
-"""What the tables of displaced nodes were found to be: numbers and warnings, and where a run keeps the tables."""
+"""What the tables of displaced nodes were found to be: numbers and warnings."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from pathlib import PurePath
 from typing import Any
 
 from analysis.units import ARCSEC
-from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import PRINTED, SEEN, NodalDeformation
-from scenes.specs.job import JobSpec
-from scenes.specs.resolved import ResolvedJob
+from twin.main_job.job_tables import table_names
 from twin.main_job.render_results import RenderRun
-
-FOLDER = "deformation"
-"""In the run folder: the tables of the job, so that config.yaml there repeats the run."""
 
 
 def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
@@ -22,36 +16,11 @@ def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
     return run.experiment.deformed(run.resolved.job)
 
 
-def table_names(job: JobSpec) -> Mapping[str, str]:
-    """Body -> name of its table in the run folder."""
-    return FrozenMap(
-        {
-            path: f"{FOLDER}/{path.replace('/', '_')}{PurePath(what.deformation.table).suffix.lower()}"
-            for path, what in job.perturb.items()
-            if what.deformation is not None
-        }
-    )
-
-
-def config_text(resolved: ResolvedJob) -> str:
-    """Text of the run folder's config.yaml, which names the tables beside it."""
-    names = table_names(resolved.job)
-    if not names:
-        return resolved.to_yaml()
-    perturb = dict(resolved.job.perturb)
-    for path, name in names.items():
-        spec = perturb[path].deformation
-        assert spec is not None
-        moved = spec.model_copy(update={"table": name})
-        perturb[path] = perturb[path].model_copy(update={"deformation": moved})
-    job = resolved.job.model_copy(update={"perturb": FrozenMap(perturb)})
-    return resolved.model_copy(update={"job": job}).to_yaml()
-
-
 def deformation_numbers(run: RenderRun) -> dict[str, Any]:
     """Contents of deformation.json."""
     names = table_names(run.resolved.job)
-    return {"bodies": {path: {"table": names[path], **_numbers(face)} for path, face in faces_of(run).items()}}
+    faces = faces_of(run).items()
+    return {"bodies": {path: {"table": names[path, "deformation"], **_numbers(face)} for path, face in faces}}
 
 
 def _numbers(face: NodalDeformation) -> dict[str, Any]:

@@ -14,6 +14,8 @@ from scenes.specs.course import moment
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.assumptions import assumed
 from twin.main_job.deformation_results import faces_of
+from twin.main_job.finish_section import finish_section
+from twin.main_job.heat_section import heat_section
 from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings, load_drawing
 from twin.main_job.render_files import write_results
 from twin.main_job.render_job import render_job
@@ -85,12 +87,13 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     session.advance(WRITE, 0, 1)
     beside.start(drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state)))
     write_results(run, folder)
-    deformed = _deformed(run)
+    made = (_deformed(run), heat_section(run), finish_section(run))
+    tables = tuple(section for section in made if section is not None)
     further = further_sections("render", run)
     drawn = beside.results()
     for name, file in ((IRRADIANCE, "irradiance.nc"), (SCENE, "scene.glb"), (SUMMARY, "summary.png")):
         folder.write_bytes(file, drawn[name])
-    sections = (*((deformed,) if deformed else ()), drawn[LIMITS], *further)
+    sections = (*tables, drawn[LIMITS], *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problem = ""
     if picture:

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scenes.specs.channel import Channel
-from twin.main_job.deformation_results import config_text, deformation_numbers, faces_of, table_names
+from twin.main_job.deformation_results import deformation_numbers, faces_of
+from twin.main_job.heat_section import heat_numbers, heated_of
+from twin.main_job.job_tables import config_text, finish_names, finish_tables, table_names
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
@@ -45,10 +47,12 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
     folder.write_text("config.yaml", config_text(run.resolved))
-    for path, name in table_names(run.resolved.job).items():
-        given = run.resolved.job.perturb[path].deformation
-        assert given is not None
+    for (path, kind), name in table_names(run.resolved.job).items():
+        given = getattr(run.resolved.job.perturb[path], kind)
         folder.write_bytes(name, Path(given.table).read_bytes())
+    finishes = finish_tables(run.resolved.job)
+    for key, name in finish_names(run.resolved.job).items():
+        folder.write_bytes(name, Path(finishes[key].table).read_bytes())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
@@ -70,6 +74,8 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
         _write_targets(run.targets, folder)
     if faces_of(run):
         _write_numbers(folder, "deformation", deformation_numbers(run))
+    if heated_of(run):
+        _write_numbers(folder, "temperature", heat_numbers(run))
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
 

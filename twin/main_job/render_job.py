@@ -14,6 +14,7 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_model import Instrument
+from scenes.models.measured_finishes import measured_finishes
 from scenes.models.obstruction import find_obstructions
 from scenes.specs.channel import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
@@ -170,8 +171,10 @@ def render_job(
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
+            *(text for path, body in experiment.heated(resolved.job).items() for text in body.warnings(path)),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
+            *(stray.measured.warnings() if stray is not None and stray.measured is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
             *(quality.warnings if quality is not None else ()),
@@ -206,18 +209,24 @@ def _stray(
     """Stray light before and after the perturbation.
 
     Raises:
-        InputError: no light comes back to a CCD.
+        InputError: no light comes back to a CCD, or a table of a finish is not one for this instrument.
     """
     assert resolved.job.render.stray is not None
     paths = resolved.job.render.stray.paths
     sources = len(experiment.path.channels) * paths
     try:
-        before = stray_light(experiment, {}, paths, seed, lambda done, _: advance(STRAY, done, 2 * sources))
+        measured = measured_finishes(resolved)
+        finishes = None if measured is None else measured.finishes
+
+        def first(done: int, _: int) -> None:
+            advance(STRAY, done, 2 * sources)
+
+        before = stray_light(experiment, {}, paths, seed, first, finishes)
         taken = find_obstructions(experiment.instrument, experiment.backend)
         if not state:
-            return StrayPair(before, before, taken)
+            return StrayPair(before, before, taken, measured)
         say = partial(_second_half, advance, sources)
-        return StrayPair(before, stray_light(experiment, state, paths, seed, say), taken)
+        return StrayPair(before, stray_light(experiment, state, paths, seed, say, finishes), taken, measured)
     except NominalPathLost as error:
         raise _too_large(resolved, str(error)) from error
 

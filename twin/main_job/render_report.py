@@ -11,7 +11,7 @@ import cv2
 from markupsafe import Markup
 
 from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
-from twin.main_job.deformation_results import config_text
+from twin.main_job.job_tables import config_text
 from twin.main_job.render_drawings import APART, drawings
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_tables import report_tables, setup_tables

@@ -16,6 +16,7 @@ from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
+from scenes.models.measured_finishes import MeasuredFinishes
 from scenes.models.obstruction import Obstruction
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.monitor_reading import MonitorReading
@@ -33,16 +34,18 @@ PROGRAM = "twin.render"
 
 @dataclass(frozen=True, eq=False)
 class StrayPair:
-    """Stray light of the nominal and of the perturbed instrument, and which prisms stand in whose beam."""
+    """Stray light of the nominal and the perturbed instrument, which prisms stand in whose beam, measured finishes."""
 
     before: StrayLight
     after: StrayLight
     obstructions: tuple[Obstruction, ...]
+    measured: MeasuredFinishes | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of stray.json."""
         taken = [{"body": o.body, "beam": o.beam, "share": o.share, "used": o.used} for o in self.obstructions]
-        return {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
+        out = {"before": self.before.to_dict(), "after": self.after.to_dict(), "obstructions": taken}
+        return out if self.measured is None else {**out, "finishes": self.measured.to_dict()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,9 +90,11 @@ def _perturbations(run: RenderRun) -> list[dict[str, str]]:
     for path in dict.fromkeys((*motions, *fields)):
         motion = motions.get(path, Motion())
         parts = [_motion_text(motion)] if _motion_text(motion) or path not in fields else []
-        parts += [_heat_text(fields[path])] if path in fields else []
+        warm = path in job.perturb and job.perturb[path].temperature.table is not None
+        parts += [_heat_text(fields[path])] if path in fields and not (warm and fields[path] == Temperature()) else []
         deformed = job.perturb[path].deformation if path in job.perturb else None
         parts = [*filter(None, parts), "deformed by a table of nodes"] if deformed is not None else parts
+        parts = [*filter(None, parts), "warmed by a table of nodes"] if warm else parts
         out.append({"node": path, "motion": "; ".join(parts), "pivot": motion.pivot})
     return out
 
@@ -100,7 +102,8 @@ def _perturbations(run: RenderRun) -> list[dict[str, str]]:
 def _heated(run: RenderRun) -> int:
     """How many bodies have another temperature than nominal, faces of prisms not counted."""
     job = run.resolved.job
-    fields = run.experiment.thermal.fields(job.fields(None if run.series is None else run.series.shown))
+    time = None if run.series is None else run.series.shown
+    fields = run.experiment.thermal.fields(run.experiment.fields(job, time))
     return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
 
 

@@ -20,15 +20,19 @@ from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
+from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
+from scenes.models.heated_bodies import HeatedBody, heated_body, with_heat
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of, on_deformed
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.channel import SIDES
-from scenes.specs.job import DeformationSpec, JobSpec
+from scenes.specs.course import NO_MOTION
+from scenes.specs.job import JobSpec
+from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
@@ -59,6 +63,7 @@ class MonitorExperiment:
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
+        self._heated: dict[tuple[str, TableTemperatureSpec], HeatedBody] = {}
         self._patterns: dict[int, FixedPattern] = {}
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
@@ -96,15 +101,40 @@ class MonitorExperiment:
         Raises:
             InputError: a temperature at or below 0 K, or one at which a glass's index is not known.
         """
-        return job_state(job, self.thermal, progress, self.motions(job))
+        return job_state(job, self.thermal, progress, self.motions(job), self.heated(job))
 
     def motions(self, job: JobSpec, time: int | None = None) -> State:
-        """The state that a job describes without its heat: ``motions_of`` on top of its bodies' deformations.
+        """The state that a job describes without its ``fields``: ``motions_of`` on top of its bodies' deformations.
 
         Raises:
             InputError: a table of nodes that does not describe its body.
         """
-        return on_deformed(self.instrument, self.deformed(job), motions_of(job, time))
+        return on_deformed(self.instrument, self.deformed(job), motions_of(job, time), self.heated(job))
+
+    def fields(self, job: JobSpec, time: int | None = None) -> dict[str, Temperature]:
+        """Linear temperatures of a job's bodies, those of its tables added, at time number ``time`` of its course.
+
+        Raises:
+            InputError: a table of temperatures that does not describe its body.
+        """
+        return with_heat(job.fields(time), self.heated(job))
+
+    def heated(self, job: JobSpec) -> Mapping[str, HeatedBody]:
+        """Body -> what the table of temperatures is that warms it; kept, since many states may have the same.
+
+        Raises:
+            InputError: a table that does not describe its body.
+        """
+        out = {}
+        for path, what in job.perturb.items():
+            spec = what.temperature
+            if spec.table is not None:
+                # change and gradient beside the table are not its own
+                key = path, spec.model_copy(update={"change": 0.0, "gradient": NO_MOTION})
+                if key not in self._heated:
+                    self._heated[key] = heated_body(self.thermal, job, path, spec)
+                out[path] = self._heated[key]
+        return out
 
     def deformed(self, job: JobSpec) -> Mapping[str, NodalDeformation]:
         """Body -> what the table of nodes is that deforms it; kept, since many states may have the same.

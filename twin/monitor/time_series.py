@@ -143,7 +143,7 @@ def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
     course = _course(job)
     out = []
     for k, time in enumerate(course.times):
-        fields = job.fields(k)
+        fields = experiment.fields(job, k)
         try:
             experiment.thermal.check(fields)
         except TemperatureError as error:

@@ -18,7 +18,7 @@ from optics.geometry.surface import along, level, newton_step
 from optics.materials import finish
 from optics.numerics.backend import Backend
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
-from twin.path_tracing.shading import Leaving, nearest_face, spread
+from twin.path_tracing.shading import Leaving, TableDraw, nearest_face, spread
 from twin.path_tracing.sinks import Arrival, Sinks, record
 from twin.path_tracing.tables import (
     APERTURE,
@@ -49,6 +49,7 @@ class Features:
         form: what the surfaces' shapes consist of.
         glass: there are glass bodies.
         branching: some finish does more than one thing with light that goes on.
+        measured: some finish has a table, of its coating or of its scattering.
         roulette: weak paths are ended at random.
         keep_nominal: detections of the nominal family are recorded as well.
         log: the events of every path are written down.
@@ -57,6 +58,7 @@ class Features:
     form: SurfaceForm
     glass: bool
     branching: bool
+    measured: bool = False
     roulette: bool = False
     keep_nominal: bool = False
     log: bool = False
@@ -219,10 +221,22 @@ def _step(
         row = ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
         f = tables.finish(row, met)
         reflected, transmitted, diffused = f[0], f[1], f[3]
+        incidence = dr.abs(cosine)
         if glass:
-            incidence = dr.abs(cosine)
             after = dr.select(inside, 1.0, g[INDEX])
             bent = finish.cosine_after(incidence, before, after)
+        marks: list[Any] = []
+        if features.measured:
+            assert tables.measured is not None
+            marks = tables.measured.of(row, met)
+            # a coating is measured from the side of air
+            coat = tables.measured.shares(marks, dr.select(inside, bent, incidence) if glass else incidence, met)
+            reflected = dr.select(marks[0] > 0.5, coat[0], reflected)
+            transmitted = dr.select(marks[0] > 0.5, coat[1], transmitted)
+            scattered = tables.measured.total(marks, incidence, met)
+            reflected = dr.select(marks[2] > 0.5, scattered, reflected)
+            f[4] = dr.select(marks[1] > 0.5, dr.minimum(scattered / dr.maximum(reflected, 1e-300), 1.0), f[4])
+        if glass:
             total = bent <= 0.0
             bare, opaque = f[2] > 0.5, (f[2] <= 0.5) & (transmitted <= 0.0)
             plain = finish.reflectance(incidence, before, after)
@@ -264,7 +278,8 @@ def _step(
                 medium = dr.select(met & through, dr.select(inside, 0, own), medium)
                 out_index = dr.select(medium != 0, g[INDEX], 1.0)
             leaving = Leaving(turned, normal, out_index, event, onward, cosine, diffusing)
-            turned, event, onward, rng = spread(backend, rng, met, f[4:8], limits.scatter_floor, leaving)
+            drawn = None if not marks else TableDraw(tables.measured, marks, incidence)
+            turned, event, onward, rng = spread(backend, rng, met, f[4:8], limits.scatter_floor, leaving, drawn)
             stray = dr.select(met & (event >= int(Event.DIFFUSE)), 1, stray)
         else:
             onward = weight * going_on

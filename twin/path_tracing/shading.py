@@ -57,8 +57,28 @@ class Leaving:
     diffusing: Any
 
 
+@dataclass(frozen=True, eq=False)
+class TableDraw:
+    """Measured scattering of the surfaces that paths leave.
+
+    Attributes:
+        tables: of the scene; marks: of the paths' finishes.
+        cosine: of incidence.
+    """
+
+    tables: Any
+    marks: Sequence[Any]
+    cosine: Any
+
+
 def spread(
-    backend: Backend, rng: Any, met: Any, lobe: Sequence[Any], floor: Any, leaving: Leaving
+    backend: Backend,
+    rng: Any,
+    met: Any,
+    lobe: Sequence[Any],
+    floor: Any,
+    leaving: Leaving,
+    drawn: TableDraw | None = None,
 ) -> tuple[Any, Any, Any, Any]:
     """Draw the direction of light that is diffused or scattered into the lobe around the specular direction.
 
@@ -69,6 +89,7 @@ def spread(
         lobe: share, scale, exponent, kind.
         floor: smallest probability of drawing from a lobe that there is.
         leaving: the paths as they would go on without.
+        drawn: measured scattering, None where there is none; ``lobe`` then has its share.
 
     Returns:
         Direction, event, weight, and rng.
@@ -80,7 +101,10 @@ def spread(
     scattering = met & ~leaving.diffusing & (rng.next_float64() < chance)
     plain = met & ~leaving.diffusing & ~scattering
     weight = dr.select(scattering, leaving.weight * share / chance, leaving.weight)
-    weight = dr.select(plain, leaving.weight * (1.0 - share) / (1.0 - chance), weight)
+    # no path stays plain where all is scattered
+    # a table may scatter all
+    left = 1.0 - chance if drawn is None else dr.maximum(1.0 - chance, 1e-300)
+    weight = dr.select(plain, leaving.weight * (1.0 - share) / left, weight)
 
     def turn(direction: Any, event: Any, rng: Any) -> tuple[Any, Any, Any]:
         u, v, keep = rng.next_float64(), rng.next_float64(), rng.next_float64()
@@ -103,6 +127,12 @@ def spread(
         rest = index * index - dr.dot(along, along)
         kept = (kept | leaving.diffusing) & (rest > 0.0)
         new = dr.normalize(along + dr.sqrt(dr.maximum(rest, 0.0)) * side)
+        if drawn is not None:
+            table = (drawn.marks[1] > 0.5) & ~leaving.diffusing
+            four = (keep, u, v, rng.next_float64())
+            by_table = drawn.tables.draw(drawn.marks, drawn.cosine, direction, side, four, table)
+            new = dr.select(table, by_table, new)
+            kept |= table
         scattered = dr.select(
             event == int(Event.TRANSMIT), backend.UInt(int(Event.SCATTER_THROUGH)), int(Event.SCATTER)
         )

@@ -15,6 +15,7 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.waves.diffraction import Grid, image
+from scenes.models.scene_surface import Finishes
 from scenes.specs.channel import Channel, prism_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.families import Event, Touch, family_name
@@ -92,6 +93,7 @@ def stray_light(
     paths: int,
     seed: int,
     progress: Callable[[int, int], None] | None = None,
+    finishes: Finishes | None = None,
 ) -> StrayLight:
     """Trace the stray light of all channels in one state.
 
@@ -101,13 +103,15 @@ def stray_light(
         paths: of every source.
         seed: of the random numbers.
         progress: told the paths done and in all.
+        finishes: what surfaces do with light, None for the built-in ones.
 
     Raises:
         NominalPathLost: too few paths, or the perturbation moves a beam off.
     """
     from scipy.signal import fftconvolve  # takes long, and most jobs trace no stray light
 
-    traced = trace_stray(experiment.instrument, experiment.backend, state, paths, seed, progress=progress)
+    instrument = experiment.instrument
+    traced = trace_stray(instrument, experiment.backend, state, paths, seed, finishes=finishes, progress=progress)
     spots = diffraction_spots(experiment)
     raw = np.stack([traced.photons[f"{c.key}/area_ccd"] for c in experiment.path.channels])
     spread = np.stack([fftconvolve(light, spot, mode="same") for light, spot in zip(raw, spots, strict=True)])

@@ -17,6 +17,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
 from scenes.models.scene_surface import SceneSurface
 from scenes.models.scenery import Scenery
+from twin.path_tracing.finish_tables import FinishTables, upload_finishes
 
 BLOCK = 4
 BLOCKS = 8
@@ -98,6 +99,7 @@ class SceneTables:
         detectors: (detectors * 8) pixels per metre in x and y, columns, rows, first pixel.
         nominal: (detectors,) signature of the nominal family.
         pixels: of all detectors together.
+        measured: tables of measured finishes, None where there are none.
     """
 
     rows: Any
@@ -114,6 +116,7 @@ class SceneTables:
     nominal: Any
     pixels: Any
     block: Any
+    measured: FinishTables | None = None
 
     def geometry(self, surface: Any, active: Any) -> list[Any]:
         """The row of each path's surface, ``ROW`` numbers."""
@@ -224,6 +227,7 @@ def upload(backend: Backend, scenery: Scenery, nominal: Mapping[str, int]) -> Sc
         dr.uint64_array_t(backend.Float)(signatures),
         backend.UInt(place),
         import_module(f"drjit.{backend.name}.ad").Array4f64,
+        upload_finishes(backend, surfaces),
     )
     dr.make_opaque(out.kind, out.body_first, out.body_faces, out.nominal, out.pixels)
     return out

@@ -63,7 +63,8 @@ class PathTracer:
         return Features(
             form=SurfaceForm.of(surfaces),
             glass=any(s.solid is not None for s in surfaces),
-            branching=any(f.bare or f.transmission or f.diffuse or f.scatter for f in finishes),
+            branching=any(f.bare or f.transmission or f.diffuse or f.scatter or f.table for f in finishes),
+            measured=any(f.coating or f.table for f in finishes),
             roulette=self.sampling.roulette > 0.0,
             keep_nominal=keep_nominal,
             log=log,

@@ -57,6 +57,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "motions": "in the body's own nominal axes, rotate before shift, both about its origin",
             "figure": "sag along the surface's +z where the node now stands, Noll's terms, rms over the disk",
         },
+        "temperature": {
+            "linear": "change at the body's origin, gradient in its own nominal axes",
+            "faces": "in the face's own nominal axes about its origin, beyond the linear field; figure: sag along z, "
+            "Noll's terms, rms over the disk",
+        },
         "stray": {"sources": "shares of light, of no frame", "detector": "by the name of the channel"},
         "quality": {"fields": "shares of half the line, +1 at its left end, +Y of the focal plane"},
         "mtf": {

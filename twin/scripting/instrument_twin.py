@@ -17,7 +17,7 @@ from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import CENTROIDS, recover
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
-from scenes.specs.job import JobSpec, NodeInfo, check_nodes, with_deformations
+from scenes.specs.job import JobSpec, NodeInfo, check_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
 from scenes.specs.load import load_camera as read_camera
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
@@ -294,7 +294,7 @@ class InstrumentTwin:
         source = self.resolved.job.source
         job = validate(JobSpec, YamlFile("", dict(plain), {})).with_source(source)
         assert isinstance(job, JobSpec)
-        job = with_deformations(job)
+        job = with_tables(job)
         if job.render.target_images and self.resolved.line_detectors is None:
             return InstrumentTwin(resolve_job(job), self._bench)
         return InstrumentTwin(self.resolved.model_copy(update={"job": job}), self._bench)

@@ -8,7 +8,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.job import JobSpec, PerturbationSpec, TemperatureSpec
+from scenes.specs.job import JobSpec, PerturbationSpec
+from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
@@ -110,7 +111,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "pivot": what.pivot,
         "figure": dict(what.figure),
         "scale": what.scale,
-        "temperature": {"change": heat.change, "gradient": list(heat.gradient)},
+        "temperature": {**dict(heat), "gradient": list(heat.gradient)},
         "deformation": what.deformation,
     }
 
@@ -122,7 +123,7 @@ def _copy(parts: Mapping[str, Any]) -> dict[str, Any]:
         "rotate": list(parts["rotate"]),
         "shift": list(parts["shift"]),
         "figure": dict(parts["figure"]),
-        "temperature": {"change": heat["change"], "gradient": list(heat["gradient"])},
+        "temperature": {**heat, "gradient": list(heat["gradient"])},
     }
 
 
@@ -141,7 +142,7 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         pivot=parts["pivot"],
         figure=FrozenMap(parts["figure"]),
         scale=parts["scale"],
-        temperature=TemperatureSpec.model_construct(change=heat["change"], gradient=tuple(heat["gradient"])),
+        temperature=TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
         deformation=parts["deformation"],
     )
 

@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
@@ -220,6 +221,11 @@ def _refuse_names(study: StudySpec, place: KeyPath) -> None:
     if "deformation" in place:
         text = "a table of displaced nodes is part of the base, and a study does not vary it"
         raise Problem(text, key_text(place), "another key of perturb: rotate, shift, scale, figure or temperature")
+    if "finishes" in place and place[-1] in ("table", "sha256"):
+        raise Problem("a table of a finish is part of the base, and a study does not vary it", key_text(place))
+    if "temperature" in place[:-1] and place[-1] in HEAT_KEYS:
+        text = "a table of temperatures is part of the base, and a study does not vary it"
+        raise Problem(text, key_text(place), "change or gradient, which are added to the table")
 
 
 def _unset(tree: Tree, factor: FactorSpec) -> list[KeyPath]:

@@ -1,0 +1,336 @@
+"""Tables that jobs name: temperatures and displaced nodes of bodies, and measured finishes for stray light (BSDFs and
+coatings in place of the built-in ones).
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
+
+from optics.geometry import zernike
+from optics.numerics.frozen_map import FrozenMap
+from optics.thermal.heat import Temperature
+from optics.thermal.nodal_deformation import TERMS
+from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradient
+from scenes.yaml.bsdf_file import ENDING, read_bsdf
+from scenes.yaml.coating_file import read_coating
+from scenes.yaml.errors import KeyPath, Problem, names_text, nearest
+from scenes.yaml.node_table import (
+    DECKS_NEED,
+    HEAT_DECKS_NEED,
+    INPUT_DECKS,
+    MESHES,
+    TABLES,
+    digest_of,
+    read_nodes,
+    read_temperatures,
+)
+from scenes.yaml.quantity import Quantity
+from scenes.yaml.spec import Reference, Spec, Text, Whole
+from scenes.yaml.units import SCALE
+from scenes.yaml.yaml_file import is_file
+
+Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+MeshUnit = Literal["m", "mm", "um"]
+HEAT_KEYS = ("table", "frame", "values", "unit", "field", "sha256")
+"""Of a temperature: those that say which table and how it is read."""
+
+
+class TemperatureSpec(Spec):
+    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r.
+
+    Attributes:
+        change: at the body's origin, kelvin.
+        gradient: in the body's own frame, K/m.
+    """
+
+    change: TemperatureChange = 0.0
+    gradient: TemperatureGradient = NO_MOTION
+
+    @property
+    def linear(self) -> Temperature:
+        """The linear field."""
+        return Temperature(self.change, self.gradient)
+
+    @property
+    def warms(self) -> bool:
+        """Whether it changes anything."""
+        return self.change != 0.0 or any(self.gradient)
+
+
+class TableTemperatureSpec(TemperatureSpec):
+    """A change of a body's temperature: change + gradient . r, to which a table of nodes is added.
+
+    Attributes:
+        change: at the body's origin, kelvin.
+        gradient: in the body's own frame, K/m.
+        table: CSV file with the columns x, y, z and T (absolute, `T [degC]` or `T [K]`) or dT (`dT [K]`, changes from
+            the instrument's temperature), or a mesh (.vtu, .vtk, .msh, .med) with temperatures at its nodes; relative
+            to this file.
+        frame: path of the body in whose nominal frame the nodes are told; by default the warmed one.
+        values: of a mesh: whether its numbers are changes in kelvin (`change`) or absolute temperatures (`K`, `degC`).
+        unit: of a mesh's coordinates, whose file has none.
+        field: name of the temperatures in a mesh; needed when it has several numbers at its nodes.
+        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
+    """
+
+    table: Reference | None = None
+    frame: Reference | None = None
+    values: Literal["change", "K", "degC"] | None = None
+    unit: MeshUnit | None = None
+    field: Text | None = None
+    sha256: Checksum | None = None
+
+    @property
+    def warms(self) -> bool:
+        """Whether it changes anything."""
+        return super().warms or self.table is not None
+
+    @model_validator(mode="after")
+    def _says_of_a_table(self) -> "TableTemperatureSpec":
+        wrong = next((key for key in HEAT_KEYS[1:] if self.table is None and getattr(self, key) is not None), None)
+        if wrong is not None:
+            raise Problem(f"{wrong} says how a table is read, and there is none", None, "table: FILE", within=(wrong,))
+        return self
+
+
+def _uniform(value: Any) -> Any:
+    """`temperature: 2 K` means a uniform change."""
+    return {"change": value} if isinstance(value, str | int | float) else value
+
+
+def _uniform_or_table(value: Any) -> Any:
+    """`temperature: 2 K` means a uniform change, `temperature: m1.csv` a table."""
+    if isinstance(value, str) and Path(value).suffix.lower() in (*TABLES, *MESHES, *INPUT_DECKS):
+        return {"table": value}
+    return _uniform(value)
+
+
+PlainTemperature = Annotated[TemperatureSpec, BeforeValidator(_uniform)]
+"""With its keys, or the uniform change alone."""
+TableTemperature = Annotated[TableTemperatureSpec, BeforeValidator(_uniform_or_table)]
+"""With its keys, or the uniform change or the table's name alone."""
+
+
+class DeformationSpec(Spec):
+    """Displaced nodes of a finite-element program, on a mirror's optical surface or a face.
+
+    Attributes:
+        table: CSV file with the columns x, y, z, dx, dy and dz, units in its heads, or a mesh (.vtu, .vtk, .msh, .med)
+            that has displacements at its nodes; relative to this file.
+        frame: path of the body in whose nominal frame nodes and displacements are told; by default the deformed one.
+        terms: highest Zernike term of the figure, by Noll's numbering; a grid holds the rest.
+        unit: of a mesh, whose file has none.
+        field: name of the displacements in a mesh; needed when it has several vectors at its nodes.
+        sha256: checksum of the table, which is filled in when it is read: another table is then refused.
+    """
+
+    table: Reference
+    frame: Reference | None = None
+    terms: Annotated[Whole, Field(ge=3, le=zernike.MAX_NOLL)] = TERMS
+    unit: MeshUnit | None = None
+    field: Text | None = None
+    sha256: Checksum | None = None
+
+
+def _named(value: Any) -> Any:
+    """`deformation: m1.csv` or `bsdf: m1.bsdf` names the table alone."""
+    return {"table": value} if isinstance(value, str) else value
+
+
+Deformation = Annotated[DeformationSpec, BeforeValidator(_named)]
+"""With its keys, or the table's name alone."""
+
+TableSpec = TypeVar("TableSpec", DeformationSpec, TableTemperatureSpec)
+
+
+def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
+    """The same with the table's full path and checksum, when it can be read.
+
+    Args:
+        owner: the specification that names it, which knows its file.
+        key: of the deformation or the temperature in there.
+        spec: as read, with a table.
+
+    Raises:
+        InputError: no such table, one that is not right, or another one than the checksum says.
+    """
+    heat = isinstance(spec, TableTemperatureSpec)
+    assert spec.table is not None
+    path = (Path(owner.source.file).parent / spec.table).absolute()
+    place = (*key, "table")
+    if not is_file(path):
+        kinds = names_text((*TABLES, *MESHES))
+        raise owner.error(f"no such file: {path}", place, allowed=f"a file ({kinds}), relative to this one")
+    ending = path.suffix.lower()
+    if ending in INPUT_DECKS:
+        text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that can be read here"
+        raise owner.error(text, place, found=spec.table, allowed=HEAT_DECKS_NEED if heat else DECKS_NEED)
+    if ending not in (*TABLES, *MESHES):
+        meant = nearest(ending, (*TABLES, *MESHES))
+        text = "neither a table nor a mesh that is known"
+        allowed = names_text((*TABLES, *MESHES))
+        raise owner.error(text, place, found=spec.table, allowed=allowed, suggestion=meant)
+    of_meshes = ("unit", "field", "values") if heat else ("unit", "field")
+    if ending in TABLES:
+        wrong = next((name for name in of_meshes if getattr(spec, name) is not None), None)
+        if wrong is not None:
+            text = f"a table has its units in its heads and no {wrong} beside them"
+            raise owner.error(text, (*key, wrong), allowed=f"no {wrong}")
+    elif spec.unit is None:
+        raise owner.error("a mesh's file does not say its unit", place, found=spec.table, allowed="unit: mm beside it")
+    elif isinstance(spec, TableTemperatureSpec) and spec.values is None:
+        text = "a mesh's file does not say whether its temperatures are changes or absolute"
+        raise owner.error(text, place, found=spec.table, allowed="values: change, K or degC beside it")
+    if isinstance(spec, TableTemperatureSpec):
+        read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
+    else:
+        read_nodes(path, spec.unit, spec.field, spec.sha256)
+    return spec.model_copy(update={"table": str(path), "sha256": digest_of(path)})
+
+
+Share = Annotated[float, Quantity(SCALE, smallest="0 percent", largest="100 percent")]
+
+
+class FinishTableSpec(Spec):
+    """A table of a finish.
+
+    Attributes:
+        table: the file, relative to this one.
+        sha256: its checksum, which is filled in when it is read: another table is then refused.
+    """
+
+    table: Reference
+    sha256: Checksum | None = None
+
+
+FinishTable = Annotated[FinishTableSpec, BeforeValidator(_named)]
+
+
+class FinishSpec(Spec):
+    """A measured finish of one kind of surface; what it does not say stays as built in.
+
+    Attributes:
+        bsdf: Zemax's tabular BSDF of the reflected light (.bsdf), in place of the scatter lobe: shares of the incident
+            light, which come out of what is reflected.
+        coating: CSV file with the columns wavelength, angle, R and, if need be, T (or Rs and Rp, Ts and Tp).
+        reflectance: share that is reflected, specular and scattered together.
+    """
+
+    bsdf: FinishTable | None = None
+    coating: FinishTable | None = None
+    reflectance: Share | None = None
+
+    @model_validator(mode="after")
+    def _says_something_once(self) -> "FinishSpec":
+        if self.bsdf is None and self.coating is None and self.reflectance is None:
+            raise Problem("a finish that says nothing", "no keys", "bsdf, coating or reflectance")
+        if self.coating is not None and self.reflectance is not None:
+            text = "a coating's table has the reflectance"
+            raise Problem(text, "both coating and reflectance", "one of them", within=("reflectance",))
+        return self
+
+
+def _by_ending(value: Any) -> Any:
+    """`mirror: m1.bsdf` is a BSDF, `mirror: silver.csv` a coating."""
+    if not isinstance(value, str):
+        return value
+    ending = Path(value).suffix.lower()
+    if ending not in (ENDING, *TABLES):
+        allowed = f"the name of a BSDF ({ENDING}) or of a coating ({names_text(TABLES)}), or keys bsdf, coating"
+        raise Problem("not a table of a finish", value, allowed)
+    return {"bsdf" if ending == ENDING else "coating": value}
+
+
+Finish = Annotated[FinishSpec, BeforeValidator(_by_ending)]
+
+ALLOWS: Mapping[str, tuple[str, ...]] = FrozenMap(
+    {
+        "mirror": ("bsdf", "coating", "reflectance"),
+        "black": ("bsdf",),
+        "coated": ("coating",),
+        "detector": ("bsdf", "coating", "reflectance"),
+    }
+)
+"""Kind of surface -> what may be measured of it."""
+
+
+class FinishesSpec(Spec):
+    """Measured finishes, by kind of surface.
+
+    Attributes:
+        mirror: of the cameras' mirrors; metallised faces of prisms keep theirs.
+        black: of the backs of mirrors, boards and baffles: with a table nothing else comes back from them.
+        coated: of faces of glass that light goes through, from outside and inside.
+        detector: of CCDs; what is not reflected is recorded.
+    """
+
+    mirror: Finish | None = None
+    black: Finish | None = None
+    coated: Finish | None = None
+    detector: Finish | None = None
+
+    @model_validator(mode="after")
+    def _allowed(self) -> "FinishesSpec":
+        if not self.given:
+            raise Problem("no finish", "no keys", names_text(ALLOWS))
+        for kind, spec in self.given.items():
+            named = [what for what in FinishSpec.model_fields if getattr(spec, what) is not None]
+            wrong = next((what for what in named if what not in ALLOWS[kind]), None)
+            if wrong is not None:
+                text = f"{kind} surfaces do not take a {wrong} here"
+                raise Problem(text, None, names_text(ALLOWS[kind]), within=(kind, wrong))
+        return self
+
+    @property
+    def given(self) -> dict[str, FinishSpec]:
+        """Kind -> finish, of those that are given."""
+        return {kind: spec for kind in ALLOWS if (spec := getattr(self, kind)) is not None}
+
+    @property
+    def tables(self) -> dict[tuple[str, str], FinishTableSpec]:
+        """Kind and what is measured -> table."""
+        both = ((kind, what, getattr(spec, what)) for kind, spec in self.given.items() for what in ("bsdf", "coating"))
+        return {(kind, what): table for kind, what, table in both if table is not None}
+
+    def with_tables(self, tables: Mapping[tuple[str, str], FinishTableSpec]) -> "FinishesSpec":
+        """The same with other tables, kind and what is measured -> table."""
+        changed = dict(self.given)
+        for (kind, what), table in tables.items():
+            changed[kind] = changed[kind].model_copy(update={what: table})
+        return self.model_copy(update=dict(changed))
+
+
+def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesSpec:
+    """The same with the tables' full paths and checksums, when they can be read.
+
+    Args:
+        owner: the specification that names them, which knows its file.
+        key: of the finishes in there.
+        spec: as read.
+
+    Raises:
+        InputError: no such table, one that is not right, or another one than the checksum says.
+    """
+    out = {}
+    for (kind, what), table in spec.tables.items():
+        place = (*key, kind, what)
+        path = (Path(owner.source.file).parent / table.table).absolute()
+        if not is_file(path):
+            raise owner.error(f"no such file: {path}", place, allowed="a file, relative to this one")
+        ending = path.suffix.lower()
+        right = (ENDING,) if what == "bsdf" else TABLES
+        if ending not in right:
+            text = f"not the ending of a {what}'s table"
+            raise owner.error(text, place, found=table.table, allowed=names_text(right))
+        digest = digest_of(path)
+        if table.sha256 is not None and digest != table.sha256:
+            text = "not the table that was used: its checksum is another"
+            raise owner.error(text, place, found=digest, allowed=f"sha256 {table.sha256}")
+        if what == "bsdf":
+            read_bsdf(path)
+        else:
+            read_coating(path)
+        out[kind, what] = table.model_copy(update={"table": str(path), "sha256": digest})
+    return spec.with_tables(out)

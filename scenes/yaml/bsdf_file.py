@@ -1,0 +1,227 @@
+"""Tabular BSDF data in Zemax's text format (.bsdf), as scatterometers write it.
+
+    Source  Measured
+    Symmetry  PlaneSymmetrical
+    SpectralContent  Monochrome
+    ScatterType  BRDF
+    SampleRotation  1
+    0
+    AngleOfIncidence  2
+    0  45
+    ScatterAzimuth  3
+    0  90  180
+    ScatterRadial  4
+    0  5  30  90
+    Monochrome
+    DataBegin
+    TIS 0.04
+    1.2E-01  ...        one row for each azimuth, one number for each radial angle
+    DataEnd
+
+Angles are in degrees, azimuth and radial angle about the specular direction (``optics.materials.scatter_table``); lines
+that are empty or begin with # are left out. Numbers of one list may go on in the next line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from optics.materials.scatter_table import ScatterTable
+from scenes.yaml.errors import InputError, Issue, nearest, shown
+from scenes.yaml.yaml_file import read_text
+
+ENDING = ".bsdf"
+LARGEST = 64 << 20
+"""Bytes of a file at most."""
+MOST_ANGLES = {"SampleRotation": 360, "AngleOfIncidence": 181, "ScatterAzimuth": 721, "ScatterRadial": 2000}
+TIS_TOLERANCE = 0.25
+"""Relative, by which the TIS that a file states may differ from the integral of its table: rough lists of angles do."""
+WORDS = {
+    "Source": ("Measured",),
+    "Symmetry": ("PlaneSymmetrical", "ASymmetrical", "ASymmetrical4D"),
+    "SpectralContent": ("Monochrome", "XYZ"),
+    "ScatterType": ("BRDF", "BTDF"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredScatter:
+    """What a file holds.
+
+    Attributes:
+        table: the BSDF.
+        stated: total integrated scatter as the file states it, one for each of the table's angles of incidence.
+    """
+
+    table: ScatterTable
+    stated: tuple[float, ...]
+
+
+class _Lines:
+    """The lines of a file that say something, one after the other."""
+
+    def __init__(self, file: str, text: str) -> None:
+        self.file = file
+        self.rows = [
+            (number, line.replace(",", " ").replace(";", " ").split())
+            for number, line in enumerate(text.splitlines(), 1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
+        self.rows = [(number, cells) for number, cells in self.rows if cells]
+        self.at = 0
+
+    @property
+    def line(self) -> int:
+        """Number of the line that comes next, or of the last one."""
+        return self.rows[min(self.at, len(self.rows) - 1)][0] if self.rows else 1
+
+    def error(self, problem: str, key: str = "", found: object = None, allowed: str | None = None) -> InputError:
+        text = None if found is None else shown(found)
+        return InputError(Issue(problem, self.file, self.line, (key,) if key else (), text, allowed))
+
+    def next(self, key: str, allowed: str | None = None) -> list[str]:
+        """Cells of the line that comes next, which is still to be passed."""
+        if self.at >= len(self.rows):
+            raise self.error("the file ends too early", key, None, allowed or f"a line that begins with {key}")
+        return self.rows[self.at][1]
+
+    def word(self, key: str) -> str:
+        """The word that stands behind a key, in the spelling of the format."""
+        cells = self._keyed(key)
+        known = {word.lower(): word for word in WORDS[key]}
+        if len(cells) != 2 or cells[1].lower() not in known:
+            found = " ".join(cells[1:])
+            meant = nearest(found, WORDS[key])
+            issue = Issue(
+                "not a value of this line", self.file, self.line, (key,), shown(found), ", ".join(WORDS[key]), meant
+            )
+            raise InputError(issue)
+        self.at += 1
+        return known[cells[1].lower()]
+
+    def angles(self, key: str) -> np.ndarray:
+        """A list of angles behind its number, radians."""
+        cells = self._keyed(key)
+        most = MOST_ANGLES[key]
+        plain = len(cells) == 2 and cells[1].isascii() and cells[1].isdigit() and len(cells[1]) < 7
+        count = int(cells[1]) if plain else 0
+        if not 1 <= count <= most:
+            raise self.error("not a number of angles", key, " ".join(cells[1:]), f"1 to {most}")
+        line = self.at
+        self.at += 1
+        degrees = np.array(self.numbers(count, key, -360.0, 360.0))
+        if not np.all(np.diff(degrees) > 0.0):
+            self.at = line + 1
+            raise self.error("the angles do not ascend", key, None, "ascending angles in degrees, each once")
+        return np.radians(degrees)
+
+    def numbers(self, count: int, key: str, least: float, most: float) -> list[float]:
+        """So many numbers, of this line and those that follow."""
+        out: list[float] = []
+        while len(out) < count:
+            for cell in self.next(key, f"{count - len(out)} more numbers"):
+                value = _number(cell)
+                if value is None or not least <= value <= most:
+                    what = "not a number" if value is None else "out of range"
+                    allowed = f"{count} numbers, of which this is the {len(out) + 1}th" if value is None else None
+                    raise self.error(what, key, cell, allowed or f"{least:g} to {most:g}")
+                if len(out) == count:
+                    raise self.error("more numbers than angles", key, cell, f"{count} numbers")
+                out.append(value)
+            self.at += 1
+        return out
+
+    def _keyed(self, key: str) -> list[str]:
+        cells = self.next(key)
+        if cells[0].lower() != key.lower():
+            found = " ".join(cells)[:60]
+            raise self.error("another line is expected here", key, found, f"a line that begins with {key}")
+        return cells
+
+
+def _number(cell: str) -> float | None:
+    """A finite number, None for anything else."""
+    if "_" in cell:
+        return None
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def read_bsdf(path: str | Path) -> MeasuredScatter:
+    """The table of a file.
+
+    Raises:
+        InputError: it cannot be read or is not such a table, or one that is not taken here, with the line.
+    """
+    file = str(path)
+    lines = _Lines(file, read_text(path, "a BSDF file", LARGEST, (ENDING,)))
+    lines.word("Source")
+    symmetry = lines.word("Symmetry")
+    if lines.word("SpectralContent") != "Monochrome":
+        lines.at -= 1
+        allowed = "Monochrome: a monitor has one wavelength"
+        raise lines.error("a table of three colours", "SpectralContent", "XYZ", allowed)
+    if lines.word("ScatterType") != "BRDF":
+        lines.at -= 1
+        raise lines.error("light scattered on its way through", "ScatterType", "BTDF", "BRDF: of what reflects")
+    rotations = lines.angles("SampleRotation")
+    if len(rotations) > 1:
+        text = "scattering that changes as the sample is turned"
+        raise lines.error(text, "SampleRotation", len(rotations), "1: surfaces here have no direction of their own")
+    incidence = lines.angles("AngleOfIncidence")
+    azimuth = lines.angles("ScatterAzimuth")
+    radial = lines.angles("ScatterRadial")
+    line = lines.line
+    if symmetry != "PlaneSymmetrical" and len(azimuth) > 1 and azimuth[-1] < 2.0 * np.pi * (1.0 - 1e-9):
+        closed = azimuth[0] == 0.0 and 2.0 * np.pi - azimuth[-1] <= 1.5 * float(np.max(np.diff(azimuth)))
+        if not closed:
+            allowed = "0 to 360 degrees; the last may be missing"
+            raise lines.error("azimuths that leave a part of the turn out", "ScatterAzimuth", None, allowed)
+    for word in ("Monochrome", "DataBegin"):
+        cells = lines.next(word)
+        if [cell.lower() for cell in cells] != [word.lower()]:
+            raise lines.error("another line is expected here", word, " ".join(cells)[:60], f"the line {word}")
+        lines.at += 1
+    stated, blocks = [], []
+    for _ in incidence:
+        cells = lines.next("TIS")
+        value = _number(cells[1]) if len(cells) == 2 and cells[0].lower() == "tis" else None
+        if value is None or not 0.0 <= value <= 1.0:
+            allowed = f"TIS and a share of 0 to 1 before the values of each of {len(incidence)} angles of incidence"
+            raise lines.error("not a TIS", "TIS", " ".join(cells)[:60], allowed)
+        stated.append((lines.line, value))
+        lines.at += 1
+        blocks.append([lines.numbers(len(radial), "ScatterRadial", 0.0, 1e15) for _ in azimuth])
+    cells = lines.next("DataEnd")
+    if [cell.lower() for cell in cells] != ["dataend"]:
+        raise lines.error("more data than angles", "DataEnd", " ".join(cells)[:60], "the line DataEnd")
+    lines.at += 1
+    if lines.at < len(lines.rows):
+        raise lines.error("lines behind the data", "DataEnd", " ".join(lines.rows[lines.at][1])[:60], "nothing more")
+    values = np.array(blocks)
+    if symmetry != "PlaneSymmetrical" and len(azimuth) > 1 and azimuth[-1] < 2.0 * np.pi * (1.0 - 1e-9):
+        azimuth, values = np.append(azimuth, 2.0 * np.pi), np.concatenate([values, values[:, :1]], axis=1)
+    try:
+        table = ScatterTable(incidence, azimuth, radial, values)
+    except ValueError as error:
+        raise InputError(Issue(f"not a BSDF: {error}", file, line)) from None
+    _agrees(file, table, stated)
+    return MeasuredScatter(table, tuple(value for _, value in stated))
+
+
+def _agrees(file: str, table: ScatterTable, stated: Sequence[tuple[int, float]]) -> None:
+    """Refuse a table that scatters another share than its file states."""
+    for (line, value), angle in zip(stated, table.incidence, strict=True):
+        total = table.total(float(angle))
+        if abs(total - value) > TIS_TOLERANCE * max(total, value):
+            text = f"the table scatters {total:.4g} of the light at {np.degrees(angle):g} deg and not what is stated"
+            allowed = f"the integral of f cos over the hemisphere, to {100 * TIS_TOLERANCE:.0f} %"
+            raise InputError(Issue(text, file, line, ("TIS",), shown(value), allowed))
