@@ -9,8 +9,8 @@ Usage: bash setup.sh [--test] [--help]
 
 Makes a virtual environment in .venv, installs the space camera twin and what it needs into it, and checks that it works.
 
-  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against) and what builds the
-           documentation (Sphinx)
+  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against), what builds the
+           documentation (Sphinx) and what writes Parquet
   --help   this text
 
 Needs Python 3.11 or newer with its venv module, and libatomic.so.1. As root on Debian or Ubuntu the last two are installed when
@@ -22,7 +22,7 @@ TEXT
 extras=""
 for argument in "$@"; do
     case "$argument" in
-        --test) extras="[test,oracles,docs]" ;;
+        --test) extras="[test,oracles,docs,parquet]" ;;
         -h | --help) usage; exit 0 ;;
         *) echo "setup.sh: unknown option $argument" >&2; usage >&2; exit 2 ;;
     esac
@@ -79,7 +79,7 @@ fi
 # installed again. An installation for the tests serves everything else as well.
 stamp=".venv/installed"
 state="$({ cat pyproject.toml; .venv/bin/python -VV; pwd; } | sha256sum | cut -d' ' -f1)"
-if grep -qsxF -e "$state$extras" -e "$state[test,oracles,docs]" "$stamp"; then
+if grep -qsxF -e "$state$extras" -e "$state[test,oracles,docs,parquet]" "$stamp"; then
     say "everything is installed already"
 else
     say "installing (some minutes on a slow line)"
