@@ -54,9 +54,10 @@ def main(
     """
 
     def read() -> Manifest:
-        from twin.export.export_run import FRAMES, NONE, TABLES, read_source
+        from twin.export.export_run import FRAMES, NONE, read_source
+        from twin.run.data_table import TABLE_FORMATS
 
-        for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, TABLES)):
+        for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
             if value not in allowed:
                 near = nearest(value, allowed)
                 meant = f"; did you mean {near!r}?" if near else ";"

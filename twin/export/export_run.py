@@ -23,14 +23,12 @@ from twin.run.procedure import Advance
 from twin.run.report import Report, Section
 from twin.run.run_folder import MANIFEST, Manifest, RunFolder, read_manifest
 
-__all__ = ["FRAMES", "KIND", "NONE", "TABLES", "Exported", "ExportedFile", "export", "export_report", "read_source"]
+__all__ = ["FRAMES", "KIND", "NONE", "Exported", "ExportedFile", "export", "export_report", "read_source"]
 
 KIND = "files"
 NONE = "none"
 FRAMES = ("fits", NONE)
 """What may become of frames."""
-TABLES = (*TABLE_FORMATS, NONE)
-"""What may become of tables."""
 EXPECTED = {"irradiance.nc": "expected_photons", "course.nc": "expected_photons_course"}
 """Expected images of a run -> name of their file."""
 _IMAGES = "images/"
@@ -122,7 +120,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
         source: the run's folder.
         manifest: of it.
         frames: one of ``FRAMES``.
-        tables: one of ``TABLES``.
+        tables: of ``TABLE_FORMATS``, or none.
         folder: open.
         advance: shows how far it is.
 

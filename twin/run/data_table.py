@@ -32,7 +32,7 @@ FITS_UNITS: Mapping[str, str] = FrozenMap(
 """Unit as the program writes it -> as FITS 4.0 does, of those that FITS has."""
 ASCII_SIGNS: Mapping[str, str] = FrozenMap(
     {"Δ": "d ", "σ": "sigma", "χ²": "chi2", "µ": "u", "\N{GREEK SMALL LETTER MU}": "u", "α": "alpha", "β": "beta"}
-    | {"γ": "gamma", "°": "deg", "″": "arcsec", "±": "+-", "×": "x", "\N{MINUS SIGN}": "-", "…": "..."}
+    | {"γ": "gamma", "°": "deg", "±": "+-", "×": "x", "\N{MINUS SIGN}": "-", "…": "..."}
 )
 """Signs of reports -> what stands for them where only ASCII may stand."""
 
