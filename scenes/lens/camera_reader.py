@@ -9,15 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optics.geometry.aperture import Circle, Ellipse, Rectangle
 from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface_edge import Edge, Polygon, Ray
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
 from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
 from scenes.lens.shapes import facing
 from scenes.models.camera_design import camera_file
@@ -32,8 +34,10 @@ LARGEST_TILT = math.radians(45.0)
 SAME = 1e-9
 """Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
 the same code: what is left is the rounding of poses and numbers."""
+_LARGEST_EDGE = 100.0
+"""Metres; beyond that an edge is none."""
 _SINGLE_FIELD = math.radians(0.05)
-_RIM = 12
+_RIM, _FINE_RIM = 12, 720
 _LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
 _LETTER = {Interaction.REFLECT: "M", Interaction.REFRACT: "L", Interaction.PASS: "P"}
 
@@ -133,7 +137,7 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
     text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
     notes.append(Note(0, "line CCD", text))
-    model = _derived(lens, plain, backend)
+    model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, taken, notes, backend)
     difference, rays = _compared(lens, origin, model, backend)
     if not difference < SAME:
         raise lens.error(
@@ -179,23 +183,24 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
     stop, kept, count = "", [], dict.fromkeys(_LETTER.values(), 0)
     for k, surface in enumerate(lens.surfaces[:-1]):
         idle = surface.interaction is Interaction.PASS
-        if idle and k != lens.stop:
-            notes.append(Note(surface.line, surface.name, "a plane with an edge alone: not carried"))
+        if idle and k != lens.stop and not (surface.every_edge and surface.surface.is_plane):
+            notes.append(Note(surface.line, surface.name, "a surface that does nothing: not carried"))
             continue
         kept.append(surface)
         letter = _LETTER[surface.interaction]
         count[letter] += 1
-        name = "STOP" if idle else f"{letter}{count[letter]}"
+        name = "STOP" if idle and k == lens.stop else f"{letter}{count[letter]}"
         if k == lens.stop:
             stop = name
-        if surface.aperture is not None and k != lens.stop:
-            text = "its aperture is not carried: a camera's clear apertures follow from its beams"
-            notes.append(Note(surface.line, surface.name, text))
-        elif surface.aperture is not None:
-            text = "the stop's aperture is not carried: it is the disk that the entrance pupil asks for"
-            notes.append(Note(surface.line, surface.name, text))
+            if surface.aperture is not None:
+                text = "the stop's outer edge is not carried: it is the disk that the entrance pupil asks for"
+                notes.append(Note(surface.line, surface.name, text))
+                surface = _without_rim(surface)
         taken[name] = surface.name
         out[name] = _written(lens, facing(surface))
+    if lens.image.every_edge:
+        text = "the image's edge is not carried: it ends the field, and stops no light within"
+        notes.append(Note(lens.image.line, lens.image.name, text))
     if not any(s.interaction is not Interaction.PASS for s in kept):
         raise lens.error("nothing in this file reflects or refracts light", lens.surfaces[0].line)
     bare = replace(lens, surfaces=(*kept, lens.image), stop=list(taken).index(stop))
@@ -221,10 +226,64 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     terms = _terms(lens, surface, shape)
     if terms:
         out["sag"] = terms
+    edges = [_edge(edge) for edge in surface.every_edge if _size(edge) < _LARGEST_EDGE]
+    if edges:
+        out["edges"] = edges
     if surface.interaction in _LIGHT:
         out["light"] = _LIGHT[surface.interaction]
     if surface.interaction is Interaction.REFRACT:
         out["index"] = surface.index
+    return out
+
+
+def _without_rim(surface: LensSurface) -> LensSurface:
+    """A stop without its outer edge; the hole in it stays."""
+    rim = surface.aperture
+    hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
+    return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
+
+
+def _size(edge: Edge) -> float:
+    """Largest number of an edge, metres."""
+    shape = edge.shape
+    numbers = [*shape.centre]
+    match shape:
+        case Circle():
+            numbers.append(shape.radius)
+        case Ray():
+            numbers.append(shape.width)
+        case Polygon():
+            numbers += [value for corner in shape.corners for value in corner]
+        case _:
+            numbers += [shape.half_x, shape.half_y]
+    return max(map(abs, numbers))
+
+
+def _edge(edge: Edge) -> dict[str, Any]:
+    """An edge as a camera's file has it."""
+    shape = edge.shape
+    kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
+
+    def metres(*values: float) -> Any:
+        written = [format_quantity(float(value), LENGTH) for value in values]
+        return written if len(written) > 1 else written[0]
+
+    out: dict[str, Any] = {"blocks" if edge.blocks else "clear": kind}
+    if any(shape.centre):
+        out["centre"] = metres(*shape.centre)
+    match shape:
+        case Circle(radius, _, inner):
+            out["radius"] = metres(radius)
+            if inner:
+                out["inner"] = metres(inner)
+        case Ray(width, _):
+            out["width"] = metres(width)
+        case Polygon(corners, _):
+            out["corners"] = [metres(*corner) for corner in corners]
+        case _:
+            out["half"] = metres(shape.half_x, shape.half_y)
+    if edge.turn and not isinstance(shape, Circle | Polygon):
+        out["turn"] = format_quantity(math.remainder(edge.turn, 2.0 * math.pi), ANGLE)
     return out
 
 
@@ -320,30 +379,81 @@ def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
     return float(1.0 / np.sqrt(np.abs(np.linalg.det(matrix.direction_by_position[0]))))
 
 
-def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:
-    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays."""
-    spec = model.spec
-    bare = model.bare_assembly(apertures=False)
-    names = model.mirrors
-    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    rim = float(model.apertures[spec.stop].bounds[1]) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    fields = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
-    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> Rays:
+    """Rays of fields x fields directions over the whole field through points (N, 2) of the stop, in its radii."""
+    spec, names = model.spec, model.mirrors
+    to_stop = assemble(model.bare_assembly(apertures=False), [names[: names.index(spec.stop) + 1]])
+    shares = np.linspace(-1.0, 1.0, fields)
+    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x in shares for y in shares])
     try:
-        launch = collimated(backend, to_stop, directions, np.concatenate([np.zeros((1, 2)), rim]))
+        launch = collimated(backend, to_stop, directions, float(model.apertures[spec.stop].bounds[1]) * stop)
     except (AimError, BeamMissedError) as error:
         raise lens.error(f"no light of the whole field comes through: {str(error).partition(';')[0]}") from error
     heading = np.broadcast_to(directions[:, None], launch.shape)
-    rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
-    places = []
+    return make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
+
+
+def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> list[np.ndarray]:
+    """Where rays as of ``_beams`` meet each mirror, (rays, 3), in its own frame."""
+    rays = _beams(model, lens, stop, fields, backend)
+    every = range(len(model.mirrors))
+    traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=every)
+    return [traced.hit(k)[0] for k in every]
+
+
+def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:
+    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays."""
+    bare = model.bare_assembly(apertures=False)
+    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    stop = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(turn), np.sin(turn)], axis=-1)])
+    rays = _beams(model, lens, stop, 3, backend)
+    places, through = [], np.ones(9 * len(stop), dtype=bool)
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
-        traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
+        every = range(len(model.mirrors)) if assembly is bare else ()
+        traced = trace(backend, assemble(assembly, [sequence]), rays, keep=every, world=True)
         position, _, path, valid = traced.numpy(traced.world)
-        if not valid.all():
+        if assembly is bare and model.edges:
+            # light that an edge stops need not come on
+            through &= model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
+        if not valid[0][through].all() or not through.any():
             raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
-        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
+        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1)[through])
     return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
+
+
+def _without_idle_edges(
+    model: CameraModel,
+    lens: Prescription,
+    plain: dict[str, Any],
+    taken: dict[str, str],
+    notes: list[Note],
+    backend: Backend,
+) -> CameraModel:
+    """The camera without clear apertures that stop no light of its field."""
+    if not model.edges:
+        return model
+    turn = 2.0 * np.pi * np.arange(_FINE_RIM) / _FINE_RIM
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    met = _met(model, lens, rim, 5, backend)
+    idle = 0
+    for name, edges in model.edges.items():
+        place = met[model.mirrors.index(name)]
+        needed = [
+            edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner > 0.0)
+            or not bool(np.all(edge.passes(place[:, 0], place[:, 1])))
+            for edge in edges
+        ]  # fmt: skip
+        idle += needed.count(False)
+        surface = plain["mirrors"][name]
+        surface["edges"] = [edge for edge, kept in zip(surface["edges"], needed, strict=True) if kept]
+        if not surface["edges"]:
+            del surface["edges"]
+            if surface.get("light") == "passes" and name != model.spec.stop:
+                del plain["mirrors"][name], taken[name]
+    if not idle:
+        return model
+    notes.append(Note(0, "clear apertures", f"{idle} of them stop no light of the field: not carried"))
+    return _derived(lens, plain, backend)
 
 
 def camera_text(made: ReadCamera, lens: Prescription) -> str:

@@ -8,6 +8,7 @@ from math import comb
 
 import numpy as np
 
+from optics.geometry import surface_edge
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
@@ -181,6 +182,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         pose=surface.pose @ over,
         surface=Surface(-shape.curvature, shape.conic, even, figure, tuple(terms)),
         aperture=edge,
+        edges=tuple(map(surface_edge.turned_over, surface.edges)),
     )
 
 

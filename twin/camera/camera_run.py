@@ -165,7 +165,8 @@ def run_camera(
     field = field_grid(ERROR_GRID)
     beams = FieldBeams.trace(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5)
     errors = beams.errors(FocalPlane.of(camera)).reshape(field.shape[:2])
-    sharp = float(errors.max()) < MOST_WAVES
+    # a pupil that edges cut has no smooth function, so no MTF
+    sharp = float(errors.max()) < MOST_WAVES and not optics.model.edges
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
