@@ -406,15 +406,14 @@ def _compared(lens: Prescription, origin: Prescription, model: CameraModel, back
     bare = model.bare_assembly(apertures=False)
     turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
     stop = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(turn), np.sin(turn)], axis=-1)])
-    rays = _beams(model, lens, stop, 3, backend)
-    places, through = [], np.ones(9 * len(stop), dtype=bool)
+    rays, places, through = _beams(model, lens, stop, 3, backend), [], np.ones(9 * len(stop), dtype=bool)
+    if model.edges:
+        # light that an edge stops need not come on
+        met = _met(model, lens, stop, 3, backend)
+        through &= model.uncut(lambda name: met[model.mirrors.index(name)])
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
-        every = range(len(model.mirrors)) if assembly is bare else ()
-        traced = trace(backend, assemble(assembly, [sequence]), rays, keep=every, world=True)
+        traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
         position, _, path, valid = traced.numpy(traced.world)
-        if assembly is bare and model.edges:
-            # light that an edge stops need not come on
-            through &= model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
         if not valid[0][through].all() or not through.any():
             raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
         places.append(np.concatenate([position[0], path[0, :, None]], axis=-1)[through])

@@ -56,11 +56,13 @@ def prescription_of(model: CameraModel) -> Prescription:
 def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
     """Clear aperture of a surface, the line and the glass of no file, and its further edges."""
     edges = model.edges.get(name, ())
-    if name != model.spec.stop and edges and not edges[0].blocks and not edges[0].turn:
-        first = edges[0].shape
-        if isinstance(first, Aperture):
-            return first, 0, "", edges[1:]
-    return model.apertures[name], 0, "", edges
+    if name == model.spec.stop or not edges:
+        return model.apertures[name], 0, "", edges
+    first = edges[0].shape
+    if not edges[0].blocks and not edges[0].turn and isinstance(first, Aperture):
+        return first, 0, "", edges[1:]
+    # what stands in the file, and not the box about the beams
+    return None, 0, "", edges
 
 
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:

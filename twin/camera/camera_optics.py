@@ -311,6 +311,10 @@ class CameraOptics:
             fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
+            rms = float(fit.rms)
+            if cut is not None:
+                # over a part of the disk the terms share tilt among them; what is level there was taken out above
+                rms = float(np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
             phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
             out.append(
                 Wavefront(
@@ -320,7 +324,7 @@ class CameraOptics:
                     y=axis,
                     map=table,
                     coefficients=fit.coefficients,
-                    rms=float(fit.rms),
+                    rms=rms,
                     peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
                     residual=float(fit.residual_rms),
                     strehl=float(np.abs(phasor) ** 2),

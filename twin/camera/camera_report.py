@@ -236,8 +236,8 @@ def _mtf(run: CameraRun) -> Section:
         if run.optics.model.edges:
             why = (
                 f"No MTF is told of a camera with edges beside its stop ({', '.join(run.optics.model.edges)}): the "
-                "pupil that they cut is no smooth function. Wavefront errors over the field, best focus and refocusing "
-                "are of the whole stop; maps, spots and light lost are of what the edges leave."
+                "pupil that they cut is no smooth function. Wavefronts, spots and focus are of the light that they "
+                "leave."
             )
         return Section("MTF", (why,))
     rows: list[list[Cell]] = []
