@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optics.geometry.aperture import Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Circle
 from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
-from optics.geometry.surface_edge import Edge, Polygon, Ray
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
@@ -21,7 +20,7 @@ from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
 from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
-from scenes.lens.shapes import facing
+from scenes.lens.shapes import edge_entry, edge_size, facing, without_rim
 from scenes.models.camera_design import camera_file
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
@@ -138,12 +137,29 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
     notes.append(Note(0, "line CCD", text))
     model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, taken, notes, backend)
-    difference, rays = _compared(lens, origin, model, backend)
+    compared = _compared(lens, origin, model, backend)
+    if compared is None:
+        return camera_of(_round_field(lens), name, backend, width)
+    difference, rays = compared
     if not difference < SAME:
         raise lens.error(
             "the camera would not trace as this prescription does", None, f"{difference:.2g} m apart", "1 nm"
         )
     return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
+
+
+def _round_field(lens: Prescription) -> Prescription:
+    """The prescription with a round field in place of one whose corners edges leave dark.
+
+    Raises:
+        InputError: its field is round already.
+    """
+    x, y = np.array(lens.fields).T
+    if np.all(x == 0.0) or np.all(y == 0.0):
+        raise lens.error("edges leave no light at the end of the field", allowed="a smaller field, or other edges")
+    largest = float(np.max(np.hypot(x, y)))
+    note = Note(0, "field", "edges leave no light between the ends of its axes: taken to be round")
+    return replace(lens, fields=((0.0, -largest), (0.0, 0.0), (0.0, largest))).with_notes(note)
 
 
 def _check(lens: Prescription) -> None:
@@ -195,7 +211,7 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
             if surface.aperture is not None:
                 text = "the stop's outer edge is not carried: it is the disk that the entrance pupil asks for"
                 notes.append(Note(surface.line, surface.name, text))
-                surface = _without_rim(surface)
+                surface = without_rim(surface)
         taken[name] = surface.name
         out[name] = _written(lens, facing(surface))
     if lens.image.every_edge:
@@ -226,64 +242,13 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     terms = _terms(lens, surface, shape)
     if terms:
         out["sag"] = terms
-    edges = [_edge(edge) for edge in surface.every_edge if _size(edge) < _LARGEST_EDGE]
+    edges = [edge_entry(edge) for edge in surface.every_edge if edge_size(edge) < _LARGEST_EDGE]
     if edges:
         out["edges"] = edges
     if surface.interaction in _LIGHT:
         out["light"] = _LIGHT[surface.interaction]
     if surface.interaction is Interaction.REFRACT:
         out["index"] = surface.index
-    return out
-
-
-def _without_rim(surface: LensSurface) -> LensSurface:
-    """A stop without its outer edge; the hole in it stays."""
-    rim = surface.aperture
-    hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
-    return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
-
-
-def _size(edge: Edge) -> float:
-    """Largest number of an edge, metres."""
-    shape = edge.shape
-    numbers = [*shape.centre]
-    match shape:
-        case Circle():
-            numbers.append(shape.radius)
-        case Ray():
-            numbers.append(shape.width)
-        case Polygon():
-            numbers += [value for corner in shape.corners for value in corner]
-        case _:
-            numbers += [shape.half_x, shape.half_y]
-    return max(map(abs, numbers))
-
-
-def _edge(edge: Edge) -> dict[str, Any]:
-    """An edge as a camera's file has it."""
-    shape = edge.shape
-    kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
-
-    def metres(*values: float) -> Any:
-        written = [format_quantity(float(value), LENGTH) for value in values]
-        return written if len(written) > 1 else written[0]
-
-    out: dict[str, Any] = {"blocks" if edge.blocks else "clear": kind}
-    if any(shape.centre):
-        out["centre"] = metres(*shape.centre)
-    match shape:
-        case Circle(radius, _, inner):
-            out["radius"] = metres(radius)
-            if inner:
-                out["inner"] = metres(inner)
-        case Ray(width, _):
-            out["width"] = metres(width)
-        case Polygon(corners, _):
-            out["corners"] = [metres(*corner) for corner in corners]
-        case _:
-            out["half"] = metres(shape.half_x, shape.half_y)
-    if edge.turn and not isinstance(shape, Circle | Polygon):
-        out["turn"] = format_quantity(math.remainder(edge.turn, 2.0 * math.pi), ANGLE)
     return out
 
 
@@ -401,22 +366,36 @@ def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, 
     return [traced.hit(k)[0] for k in every]
 
 
-def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:
-    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays."""
+def _compared(
+    lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend
+) -> tuple[float, int] | None:
+    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays; None
+    where edges leave a field dark.
+    """
     bare = model.bare_assembly(apertures=False)
     turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    stop = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(turn), np.sin(turn)], axis=-1)])
-    rays, places, through = _beams(model, lens, stop, 3, backend), [], np.ones(9 * len(stop), dtype=bool)
-    if model.edges:
-        # light that an edge stops need not come on
-        met = _met(model, lens, stop, 3, backend)
-        through &= model.uncut(lambda name: met[model.mirrors.index(name)])
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    # of a cut beam middle and rim may be missing
+    stop = np.concatenate([np.zeros((1, 2)), *([0.75 * rim, 0.9 * rim] if model.edges else []), rim])
+    rays, places, comes = _beams(model, lens, stop, 3, backend), [], []
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
         traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
         position, _, path, valid = traced.numpy(traced.world)
-        if not valid[0][through].all() or not through.any():
-            raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
-        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1)[through])
+        places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
+        comes.append(valid[0])
+    through = comes[0]
+    if model.edges:
+        # light that an edge stops need not come on, but some of every field has to
+        met = _met(model, lens, stop, 3, backend)
+        through = through & model.uncut(lambda name: met[model.mirrors.index(name)])
+        if not np.any(through.reshape(9, -1), axis=-1).all():
+            return None
+        lost = not np.array_equal(*comes)
+    else:
+        lost = not (comes[0].all() and comes[1].all())
+    if lost:
+        raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
+    places = [place[through] for place in places]
     return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
 
 

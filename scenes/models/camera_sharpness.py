@@ -96,6 +96,7 @@ class FieldBeams:
 
         Raises:
             AimError, BeamMissedError: light of a field does not come through.
+            InputError: edges stop all of it.
         """
         spec, nodes = model.spec, quadrature.disk(rings)
         bare = model.bare_assembly(apertures=False)
@@ -116,6 +117,13 @@ class FieldBeams:
         if model.edges:
             valid = valid[0] & model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
             lit = valid.reshape(shape)[:, 1:]
+            dark = np.flatnonzero(~np.any(lit, axis=-1))
+            if dark.size:
+                found = (
+                    f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields that were tried"
+                )
+                key = ("mirrors", next(iter(model.edges)), "edges")
+                raise spec.error("edges leave no light", key, found=found, allowed="a smaller field, or wider edges")
         require_some(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
         way = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])

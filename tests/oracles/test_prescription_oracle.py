@@ -156,7 +156,7 @@ VIGNETTED = {
     "HSC/HSC_old.yaml": (750e-9, 8.2, (0.75,)),
     "LSST/LSST_r.yaml": (622e-9, 8.36, (0.0, 1.0, 1.75)),
     "LSST/LSST_r_baffles.yaml": (622e-9, 8.36, (0.0, 1.75)),
-    "DECam/DECam.yaml": (700e-9, 3.942, (0.0, 1.0)),
+    "DECam/DECam.yaml": (700e-9, 4.01, (0.0, 1.0)),
 }
 """File -> wavelength and pupil, metres, and fields from the axis, degrees."""
 

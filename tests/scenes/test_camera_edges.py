@@ -2,12 +2,18 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import twin.camera.__main__
+from optics.geometry.aperture import Circle
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
+from optics.geometry.surface_edge import Edge
+from optics.raytrace.assembly import Interaction
 from scenes.lens.__main__ import read_prescription
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
@@ -195,3 +201,38 @@ def test_clear_apertures_that_stop_nothing_are_left_out(backend, tmp_path: Path)
     made = camera_of(read_prescription(path), "gf7", backend)
     made.camera.require_mirrors("a camera of an instrument")
     assert any("2 of them stop no light of the field" in str(note) for note in made.notes)
+
+
+@pytest.mark.parametrize(
+    "edge", ["{blocks: circle, radius: 1 m}", "{clear: circle, radius: 2 mm, centre: [149 mm, 0 mm]}"]
+)
+def test_a_field_that_edges_leave_dark_is_refused_by_name(edge, tmp_path: Path) -> None:
+    file = tmp_path / "dark.yaml"
+    file.write_text(BARE.replace("  M1: {", f"  M1: {{edges: [{edge}], "), "utf-8")
+    done = invoke(twin.camera.__main__.app, file, "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    assert "dark.yaml:" in done.stderr
+    assert "mirrors.M1.edges: edges leave no light" in " ".join(done.stderr.split())
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_field_with_dark_corners_is_taken_to_be_round(backend, tmp_path: Path) -> None:
+    """Fields on both axes, and an edge near the image that lets through no more than the circle of them."""
+    spec = camera(CAMERA.replace("field: {x: 0.1 deg, y: 0.1 deg}", "field: {x: 0.7 deg, y: 0.7 deg}"))
+    path = tmp_path / "round.yaml"
+    path.write_text(batoid_text(prescription_of(derive_camera(spec, backend)))[0], "utf-8")
+    half = np.radians(1.0)
+    axes = ((0.0, 0.0), (half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half))
+    lens = replace(read_prescription(path, (), 650e-9), fields=axes)
+    # 0.1 m before the image light of 1 deg is 52 mm from the axis, and that of its corners 74 mm
+    there, edge = Pose(np.eye(3), np.array([0.0, 0.0, 0.2])), (Edge(Circle(0.06)),)
+    field_stop = LensSurface("field", there, Surface(), Interaction.PASS, edges=edge)
+    lens = replace(lens, surfaces=(*lens.surfaces[:-1], field_stop, lens.image))
+    made = camera_of(lens, "round", backend, Width(0.3))
+    assert made.camera.field.x == pytest.approx(half / np.sqrt(2.0), rel=1e-9)
+    assert any("taken to be round" in str(note) for note in made.notes)
+    smaller = replace(
+        lens, surfaces=(*lens.surfaces[:-2], replace(field_stop, edges=(Edge(Circle(0.01)),)), lens.image)
+    )
+    with pytest.raises(InputError, match="edges leave no light at the end of the field"):
+        camera_of(smaller, "round", backend, Width(0.3))
