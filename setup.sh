@@ -9,9 +9,9 @@ Usage: bash setup.sh [--test | --live] [--help]
 
 Makes a virtual environment in .venv, installs the space camera twin and what it needs into it, and checks that it works.
 
-  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against) and what builds the
-           documentation (Sphinx)
-  --live   also install what serves the live twin, python -m twin.live; --test has it
+  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against), what builds the
+           documentation (Sphinx), what writes Parquet and what --live installs
+  --live   also install what serves the live twin, python -m twin.live
   --help   this text
 
 Needs Python 3.11 or newer with its venv module, and libatomic.so.1. As root on Debian or Ubuntu the last two are installed when
@@ -24,7 +24,7 @@ extras=""
 for argument in "$@"; do
     case "$argument" in
         --live) extras="[live]" ;;
-        --test) extras="[test,oracles,docs,live]" ;;
+        --test) extras="[test,oracles,docs,live,parquet]" ;;
         -h | --help) usage; exit 0 ;;
         *) echo "setup.sh: unknown option $argument" >&2; usage >&2; exit 2 ;;
     esac
@@ -81,7 +81,7 @@ fi
 # installed again. An installation for the tests serves everything else as well.
 stamp=".venv/installed"
 state="$({ cat pyproject.toml; .venv/bin/python -VV; pwd; } | sha256sum | cut -d' ' -f1)"
-if grep -qsxF -e "$state$extras" -e "$state[test,oracles,docs,live]" "$stamp"; then
+if grep -qsxF -e "$state$extras" -e "$state[test,oracles,docs,live,parquet]" "$stamp"; then
     say "everything is installed already"
 else
     say "installing (some minutes on a slow line)"

@@ -1,5 +1,5 @@
-"""Make docs/live.webp, the picture of docs/live.md: the live twin while two knobs are dragged. Needs Chromium and the extras
-`test` and `live`. Run it from anywhere: python docs/draw_live.py
+"""Make docs/live.webp, the picture of docs/live.md: the live twin while two knobs are dragged. Run it from anywhere:
+python docs/draw_live.py. It needs Chromium and the extras `test` and `live`.
 """
 
 from __future__ import annotations

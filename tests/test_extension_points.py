@@ -21,6 +21,7 @@ import xarray as xr
 import yaml
 from scipy import stats
 
+import twin.export.__main__
 import twin.render
 import twin.validate
 from analysis.monitor import recovery
@@ -894,6 +895,21 @@ def test_an_unknown_name_is_told_as_one_of_a_fixed_list_is(model: Any, text: str
     with pytest.raises(InputError) as caught:
         validate(model, parse_yaml(text))
     assert str(caught.value).endswith(said)
+
+
+@extends("twin.run.data_table.TABLE_FORMATS")
+def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names and units of the columns alone: chosen by its name, written for every table and listed."""
+    text = "; ".join
+    form: Callable[[Any], bytes] = lambda table: text(f"{c.name} in {c.unit}" for c in table.columns).encode()  # noqa: E731
+    add(monkeypatch, "twin.run.data_table.TABLE_FORMATS", "heads", form)
+    study_folder(tmp_path, "monte_carlo")
+    done = invoke(twin.export.__main__.app, tmp_path / "run", "--tables", "heads", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert "m2z in um; m2x in um" in (tmp_path / "out/tables/study.heads").read_text("utf-8")
+    assert {"tables/study.heads", "tables/numbers.heads"} == {
+        one["file"] for one in read(tmp_path / "out", "files")["files"]
+    }
 
 
 @extends(FORMATS)

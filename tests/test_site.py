@@ -170,7 +170,8 @@ def test_every_node_stands_in_the_reference(gf7_pair) -> None:
 def test_every_command_and_every_option_stands_in_the_reference() -> None:
     page = command_page()
     assert {"twin.render", "twin.lab", "twin.orbit", "twin.study", "twin.design", "twin.validate", "twin.doctor",
-            "twin.uncertainty", "twin.live", "twin.recover", "analysis.mtf", "scenes.schema"} <= set(programs())  # fmt: skip
+            "twin.uncertainty", "twin.live", "twin.recover", "analysis.mtf",
+            "scenes.schema"} <= set(programs())  # fmt: skip
     for program in programs():
         assert f"## `{program}`" in page
         for words, command in commands(program).items():

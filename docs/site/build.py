@@ -18,9 +18,8 @@ HERE = Path(__file__).resolve().parent
 NOTEBOOKS = ("start", "my_camera", "heat", "targets_mtf", "orbit_calibration", "trade_study")
 GUIDES = (
     *("live", "monitor", "monitor_layout", "monitor_design", "disturbances", "finite_elements", "stray_light"),
-    *("measured_frames",),
-    *("camera", "prescriptions", "laboratory", "measured_laboratory"),
-    *("orbit", "measured_orbit", "orbit_files", "studies"),
+    *("measured_frames", "coming_from", "camera", "prescriptions", "laboratory", "measured_laboratory"),
+    *("orbit", "measured_orbit", "orbit_files", "studies", "export"),
 )
 MEANING = ("conventions", "glossary")
 PROGRAM = ("architecture",)

@@ -257,8 +257,12 @@ def _distance(p: Any, d: Any, surface: SurfaceNumbers, table: Any, differentiabl
         discriminant = b * b - a * e
         ok = discriminant >= 0.0
         root = dr.sqrt(dr.select(ok, discriminant, 1.0))
-        # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and never cancels there
-        t = e / (dr.copysign(root, d.z) - b)
+        # of the two crossings the one on the vertex sheet: the denominator keeps d.z's sign and does not cancel, but
+        # for rays that start beyond the centre, or near the other sheet of a hyperboloid; there the root's other form
+        # does not
+        turn = dr.copysign(root, d.z)
+        near = b * turn > 0.0
+        t = dr.select(near, -(b + turn) / dr.select(near, a, 1.0), e / dr.select(near, 1.0, turn - b))
         if surface.is_conic:
             return t, ok & (q * c * dr.fma(t, d.z, p.z) < 1.0)
     numbers = surface

@@ -15,13 +15,14 @@ import numpy as np
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-from optics.geometry.aperture import Aperture
+from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface_edge import Edge, EdgeShape, Polygon, Ray
 from optics.geometry.zernike import MAX_NOLL
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription
-from scenes.lens.shapes import clear, even_asphere, turned_over
+from scenes.lens.shapes import even_asphere, turned_over
 from scenes.lens.statements import Source, decoded, read_bytes
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 
@@ -34,6 +35,14 @@ LARGEST_FILE = 100_000
 MOST_SURFACES = 2000
 
 
+_XY = ("xs", "ys")
+_OBSCURATIONS = {
+    "Circle": ("radius", "x", "y"),
+    "Annulus": ("outer", "inner", "x", "y"),
+    "Rectangle": ("width", "height", "x", "y", "theta"),
+    "Ray": ("width", "theta", "x", "y"),
+    "Polygon": _XY,
+}
 _OF_OPTICS = frozenset(
     "type name surface coordSys inMedium outMedium medium items obscuration backDist sphereRadius pupilSize "
     "pupilObscuration R_outer R_inner parent stopSurface".split()
@@ -128,8 +137,10 @@ class _Reader:
                 self._add(given, key, pose, how, after)
             case "Detector":
                 self._add(given, key, pose, Interaction.PASS, before)
+            case "Baffle" if "obscuration" in given:
+                self._add(given, key, pose, Interaction.PASS, before)
             case "Baffle" | "Interface":
-                text = f"{given.get('name', kind)}: does nothing to rays but stop some: not carried"
+                text = f"{given.get('name', kind)}: does nothing to rays: not carried"
                 self.notes.append(Note(self.line(key), kind, text))
             case _:
                 known = "CompoundOptic, Lens, Mirror, RefractiveInterface, Detector, Baffle, Interface"
@@ -143,11 +154,17 @@ class _Reader:
         name = next(n for n in (name, *(f"{name}_{k}" for k in range(2, MOST_SURFACES + 2))) if n not in taken)
         below = (*key, "surface")
         shape = self.shape(self.mapping(given.get("surface"), below), below)
-        edge = None
+        edges: tuple[Edge, ...] = ()
         if "obscuration" in given:
             below = (*key, "obscuration")
-            edge = self.aperture(self.mapping(given["obscuration"], below), below, name)
-        surface = LensSurface(name, pose, shape, how, index / self.ambient, edge, self.line(key))
+            edges = self.edges(self.mapping(given["obscuration"], below), below, name)
+        clear, rest = None, edges
+        if edges and not edges[0].blocks and not edges[0].turn and isinstance(edges[0].shape, Aperture):
+            clear, rest = edges[0].shape, edges[1:]
+        if given.get("type") == "Baffle" and not (shape.is_plane and edges):
+            self.notes.append(Note(self.line(key), name, "a baffle that is no plane, or without an edge: not carried"))
+            return
+        surface = LensSurface(name, pose, shape, how, index / self.ambient, clear, self.line(key), edges=rest)
         # the world turns over, and each surface's own frame with it
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": _OVER @ pose})))
 
@@ -283,26 +300,41 @@ class _Reader:
                 known = "ConstMedium, TableMedium, SellmeierMedium, SumitaMedium, Air"
                 raise self.error((*key, "type"), "a medium that is not known here", kind, known)
 
-    def aperture(self, given: Mapping[str, Any], key: KeyPath, name: str) -> Aperture | None:
-        """A clear aperture; obscurations and outlines that are none are noted."""
-        kind = given.get("type")
+    def edges(self, given: Mapping[str, Any], key: KeyPath, name: str, depth: int = 0) -> tuple[Edge, ...]:
+        """What an obscuration cuts; clear apertures first. What has no place here is noted."""
+        kind = str(given.get("type"))
+        if kind == "ObscUnion" and depth == 0:
+            found: list[Edge] = []
+            for k, item in enumerate(self.listed(given.get("items"), (*key, "items"))):
+                below = (*key, "items", k)
+                found += self.edges(self.mapping(item, below), below, name, 1)
+            return tuple(sorted(found, key=lambda edge: edge.blocks))
+        known = {f"{way}{shape}": keys for shape, keys in _OBSCURATIONS.items() for way in ("Clear", "Obsc")}
+        if kind not in known:
+            self.notes.append(Note(self.line(key), kind, f"the obscuration of {name} is not carried"))
+            return ()
+        self._only(given, key, known)
         x, y = self.number(given, "x", key, 0.0), self.number(given, "y", key, 0.0)
-        if str(kind).startswith("Clear"):
-            sizes = {"ClearCircle": ("radius",), "ClearAnnulus": ("outer", "inner")}
-            plain = {name: (*of, "x", "y") for name, of in sizes.items()}
-            self._only(given, key, {**plain, "ClearRectangle": ("width", "height", "x", "y", "theta")})
+        shape: EdgeShape
         try:
-            if kind == "ClearCircle":
-                return clear(self.number(given, "radius", key), centre=(x, y))
-            if kind == "ClearAnnulus":
-                return clear(self.number(given, "outer", key), self.number(given, "inner", key), centre=(x, y))
-            if kind == "ClearRectangle" and not self.number(given, "theta", key, 0.0):
-                half = 0.5 * self.number(given, "width", key), 0.5 * self.number(given, "height", key)
-                return clear(rectangle=half, centre=(x, y))
+            match kind[5:] if kind.startswith("Clear") else kind[4:]:
+                case "Circle":
+                    shape = Circle(self.number(given, "radius", key), (x, y))
+                case "Annulus":
+                    shape = Circle(self.number(given, "outer", key), (x, y), self.number(given, "inner", key))
+                case "Rectangle":
+                    half = 0.5 * self.number(given, "width", key), 0.5 * self.number(given, "height", key)
+                    shape = Rectangle(*half, (x, y))
+                case "Ray":
+                    shape = Ray(self.number(given, "width", key), (x, y))
+                case _:
+                    xs, ys = ([self.number({n: v}, n, key) for v in self.listed(given.get(n), (*key, n))] for n in _XY)
+                    if len(xs) != len(ys):
+                        raise self.error(key, "a polygon with other numbers of xs and ys", f"{len(xs)} and {len(ys)}")
+                    shape = Polygon(tuple(zip(xs, ys, strict=True)))
         except ValueError as error:
             raise self.error(key, str(error)) from None
-        self.notes.append(Note(self.line(key), str(kind), f"the obscuration of {name} is not carried"))
-        return None
+        return (Edge(shape, kind.startswith("Obsc"), self.number(given, "theta", key, 0.0)),)
 
 
 def _air(um: float, pressure: float, temperature: float, water: float) -> float:
@@ -332,13 +364,15 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     reader.optic(system, ("opticalSystem",), Pose(), reader.ambient, reader.ambient)
     if len(reader.surfaces) < 2:
         raise reader.error(("opticalSystem",), "too few surfaces", len(reader.surfaces), "optics and a detector")
-    # batoid aims at a surface before the telescope; here the stop is the first surface
+    # batoid aims at a surface before the telescope; here the stop is the first surface that does something
+    acts = [k for k, surface in enumerate(reader.surfaces) if surface.interaction is not Interaction.PASS]
+    stop = acts[0] if acts else 0
     notes = [*reader.notes, Note(0, "", "no stop in the light's way: taken to be the first surface")]
     if reader.ambient != 1.0:
         notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
-    name = str(system.get("name", "")) or Path(path).stem
+    name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
     return Prescription(
-        name, str(path), tuple(reader.surfaces), 0, wavelength, (wavelength,), (), "none", None, math.inf, tuple(notes)
+        name, str(path), surfaces, stop, wavelength, (wavelength,), (), "none", None, math.inf, tuple(notes)
     )
 
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
+from optics.geometry.surface_edge import Edge, Polygon, Ray
 from optics.raytrace.assembly import Interaction
 from scenes.lens.camera_writer import rounded
 from scenes.lens.prescription import LensSurface, Note, Prescription
@@ -42,10 +43,13 @@ def batoid_text(lens: Prescription) -> tuple[str, tuple[Note, ...]]:
         if surface.interaction is Interaction.REFRACT:
             index = surface.index
         item["outMedium"] = index
-        edge = _obscuration(over.aperture)
-        if edge is not None and item["type"] != "Interface":
-            item["obscuration"] = edge
-        elif over.aperture is not None:
+        cuts = over.every_edge
+        if item["type"] == "Interface" and cuts and k != lens.stop:
+            item["type"] = "Baffle"
+        parts = [part for edge in cuts if (part := _obscuration(edge)) is not None]
+        if parts and item["type"] != "Interface":
+            item["obscuration"] = parts[0] if len(parts) == 1 else {"type": "ObscUnion", "items": parts}
+        if len(parts) < len(cuts) or (cuts and item["type"] == "Interface"):
             notes.append(Note(0, surface.name, "its aperture is not carried"))
         if item["type"] == "Interface":
             item.pop("inMedium"), item.pop("outMedium")
@@ -113,13 +117,22 @@ def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
     return {"type": "Sum", "items": [base, {"type": "Zernike", "coef": listed, "R_outer": radius, "R_inner": 0.0}]}
 
 
-def _obscuration(aperture: Aperture | None) -> dict[str, Any] | None:
-    match aperture:
-        case Circle(radius, (x, y), inner):
+def _obscuration(edge: Edge) -> dict[str, Any] | None:
+    """What cuts the light; None for what batoid does not know."""
+    way, shape = "Obsc" if edge.blocks else "Clear", edge.shape
+    x, y = shape.centre
+    turn = {"theta": edge.turn} if edge.turn else {}
+    match shape:
+        case Circle(radius, _, inner):
             if inner:
-                return {"type": "ClearAnnulus", "inner": inner, "outer": radius, "x": x, "y": y}
-            return {"type": "ClearCircle", "radius": radius, "x": x, "y": y}
-        case Rectangle(half_x, half_y, (x, y)):
-            return {"type": "ClearRectangle", "width": 2.0 * half_x, "height": 2.0 * half_y, "x": x, "y": y}
-        case Ellipse() | None:
+                return {"type": f"{way}Annulus", "inner": inner, "outer": radius, "x": x, "y": y}
+            return {"type": f"{way}Circle", "radius": radius, "x": x, "y": y}
+        case Rectangle(half_x, half_y):
+            return {"type": f"{way}Rectangle", "width": 2.0 * half_x, "height": 2.0 * half_y, "x": x, "y": y, **turn}
+        case Ray(width):
+            return {"type": f"{way}Ray", "width": width, "x": x, "y": y, **turn}
+        case Polygon(corners):
+            xs, ys = ([float(value) for value in axis] for axis in zip(*corners, strict=True))
+            return {"type": f"{way}Polygon", "xs": xs, "ys": ys}
+        case Ellipse():
             return None

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optics.geometry.aperture import Circle
 from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
@@ -17,9 +18,9 @@ from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
 from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
-from scenes.lens.shapes import facing
+from scenes.lens.shapes import edge_entry, edge_size, facing, without_rim
 from scenes.models.camera_design import camera_file
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
@@ -32,8 +33,10 @@ LARGEST_TILT = math.radians(45.0)
 SAME = 1e-9
 """Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
 the same code: what is left is the rounding of poses and numbers."""
+_LARGEST_EDGE = 100.0
+"""Metres; beyond that an edge is none."""
 _SINGLE_FIELD = math.radians(0.05)
-_RIM = 12
+_RIM, _FINE_RIM = 12, 720
 _LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
 _LETTER = {Interaction.REFLECT: "M", Interaction.REFRACT: "L", Interaction.PASS: "P"}
 
@@ -133,13 +136,30 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
     plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
     text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
     notes.append(Note(0, "line CCD", text))
-    model = _derived(lens, plain, backend)
-    difference, rays = _compared(lens, origin, model, backend)
+    model = _without_idle_edges(_derived(lens, plain, backend), lens, plain, taken, notes, backend)
+    compared = _compared(lens, origin, model, backend)
+    if compared is None:
+        return camera_of(_round_field(lens), name, backend, width)
+    difference, rays = compared
     if not difference < SAME:
         raise lens.error(
             "the camera would not trace as this prescription does", None, f"{difference:.2g} m apart", "1 nm"
         )
     return ReadCamera(model.spec, taken, tuple(notes), difference, rays)
+
+
+def _round_field(lens: Prescription) -> Prescription:
+    """The prescription with a round field in place of one whose corners edges leave dark.
+
+    Raises:
+        InputError: its field is round already.
+    """
+    x, y = np.array(lens.fields).T
+    if np.all(x == 0.0) or np.all(y == 0.0):
+        raise lens.error("edges leave no light at the end of the field", allowed="a smaller field, or other edges")
+    largest = float(np.max(np.hypot(x, y)))
+    note = Note(0, "field", "edges leave no light between the ends of its axes: taken to be round")
+    return replace(lens, fields=((0.0, -largest), (0.0, 0.0), (0.0, largest))).with_notes(note)
 
 
 def _check(lens: Prescription) -> None:
@@ -179,23 +199,24 @@ def _surfaces(lens: Prescription, notes: list[Note]) -> tuple[dict[str, Any], st
     stop, kept, count = "", [], dict.fromkeys(_LETTER.values(), 0)
     for k, surface in enumerate(lens.surfaces[:-1]):
         idle = surface.interaction is Interaction.PASS
-        if idle and k != lens.stop:
-            notes.append(Note(surface.line, surface.name, "a plane with an edge alone: not carried"))
+        if idle and k != lens.stop and not (surface.every_edge and surface.surface.is_plane):
+            notes.append(Note(surface.line, surface.name, "a surface that does nothing: not carried"))
             continue
         kept.append(surface)
         letter = _LETTER[surface.interaction]
         count[letter] += 1
-        name = "STOP" if idle else f"{letter}{count[letter]}"
+        name = "STOP" if idle and k == lens.stop else f"{letter}{count[letter]}"
         if k == lens.stop:
             stop = name
-        if surface.aperture is not None and k != lens.stop:
-            text = "its aperture is not carried: a camera's clear apertures follow from its beams"
-            notes.append(Note(surface.line, surface.name, text))
-        elif surface.aperture is not None:
-            text = "the stop's aperture is not carried: it is the disk that the entrance pupil asks for"
-            notes.append(Note(surface.line, surface.name, text))
+            if surface.aperture is not None:
+                text = "the stop's outer edge is not carried: it is the disk that the entrance pupil asks for"
+                notes.append(Note(surface.line, surface.name, text))
+                surface = without_rim(surface)
         taken[name] = surface.name
         out[name] = _written(lens, facing(surface))
+    if lens.image.every_edge:
+        text = "the image's edge is not carried: it ends the field, and stops no light within"
+        notes.append(Note(lens.image.line, lens.image.name, text))
     if not any(s.interaction is not Interaction.PASS for s in kept):
         raise lens.error("nothing in this file reflects or refracts light", lens.surfaces[0].line)
     bare = replace(lens, surfaces=(*kept, lens.image), stop=list(taken).index(stop))
@@ -221,6 +242,9 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     terms = _terms(lens, surface, shape)
     if terms:
         out["sag"] = terms
+    edges = [edge_entry(edge) for edge in surface.every_edge if edge_size(edge) < _LARGEST_EDGE]
+    if edges:
+        out["edges"] = edges
     if surface.interaction in _LIGHT:
         out["light"] = _LIGHT[surface.interaction]
     if surface.interaction is Interaction.REFRACT:
@@ -320,30 +344,94 @@ def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
     return float(1.0 / np.sqrt(np.abs(np.linalg.det(matrix.direction_by_position[0]))))
 
 
-def _compared(lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend) -> tuple[float, int]:
-    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays."""
-    spec = model.spec
-    bare = model.bare_assembly(apertures=False)
-    names = model.mirrors
-    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    rim = float(model.apertures[spec.stop].bounds[1]) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    fields = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
-    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+def _beams(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> Rays:
+    """Rays of fields x fields directions over the whole field through points (N, 2) of the stop, in its radii."""
+    spec, names = model.spec, model.mirrors
+    to_stop = assemble(model.bare_assembly(apertures=False), [names[: names.index(spec.stop) + 1]])
+    shares = np.linspace(-1.0, 1.0, fields)
+    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x in shares for y in shares])
     try:
-        launch = collimated(backend, to_stop, directions, np.concatenate([np.zeros((1, 2)), rim]))
+        launch = collimated(backend, to_stop, directions, float(model.apertures[spec.stop].bounds[1]) * stop)
     except (AimError, BeamMissedError) as error:
         raise lens.error(f"no light of the whole field comes through: {str(error).partition(';')[0]}") from error
     heading = np.broadcast_to(directions[:, None], launch.shape)
-    rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
-    places = []
+    return make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
+
+
+def _met(model: CameraModel, lens: Prescription, stop: np.ndarray, fields: int, backend: Backend) -> list[np.ndarray]:
+    """Where rays as of ``_beams`` meet each mirror, (rays, 3), in its own frame."""
+    rays = _beams(model, lens, stop, fields, backend)
+    every = range(len(model.mirrors))
+    traced = trace(backend, assemble(model.bare_assembly(apertures=False), ["imaging"]), rays, keep=every)
+    return [traced.hit(k)[0] for k in every]
+
+
+def _compared(
+    lens: Prescription, origin: Prescription, model: CameraModel, backend: Backend
+) -> tuple[float, int] | None:
+    """Farthest distance at the image between rays of a prescription and of its camera, metres, and how many rays; None
+    where edges leave a field dark.
+    """
+    bare = model.bare_assembly(apertures=False)
+    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    # of a cut beam middle and rim may be missing
+    stop = np.concatenate([np.zeros((1, 2)), *([0.75 * rim, 0.9 * rim] if model.edges else []), rim])
+    rays, places, comes = _beams(model, lens, stop, 3, backend), [], []
     for assembly, sequence in ((bare, "imaging"), (origin.assembly(apertures=False), SEQUENCE)):
         traced = trace(backend, assemble(assembly, [sequence]), rays, world=True)
         position, _, path, valid = traced.numpy(traced.world)
-        if not valid.all():
-            raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
         places.append(np.concatenate([position[0], path[0, :, None]], axis=-1))
+        comes.append(valid[0])
+    through = comes[0]
+    if model.edges:
+        # light that an edge stops need not come on, but some of every field has to
+        met = _met(model, lens, stop, 3, backend)
+        through = through & model.uncut(lambda name: met[model.mirrors.index(name)])
+        if not np.any(through.reshape(9, -1), axis=-1).all():
+            return None
+        lost = not np.array_equal(*comes)
+    else:
+        lost = not (comes[0].all() and comes[1].all())
+    if lost:
+        raise lens.error("rays of the whole field do not come through", allowed="a smaller field or pupil")
+    places = [place[through] for place in places]
     return float(np.max(np.abs(places[0] - places[1]))), len(places[0])
+
+
+def _without_idle_edges(
+    model: CameraModel,
+    lens: Prescription,
+    plain: dict[str, Any],
+    taken: dict[str, str],
+    notes: list[Note],
+    backend: Backend,
+) -> CameraModel:
+    """The camera without clear apertures that stop no light of its field."""
+    if not model.edges:
+        return model
+    turn = 2.0 * np.pi * np.arange(_FINE_RIM) / _FINE_RIM
+    rim = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    met = _met(model, lens, rim, 5, backend)
+    idle = 0
+    for name, edges in model.edges.items():
+        place = met[model.mirrors.index(name)]
+        needed = [
+            edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner > 0.0)
+            or not bool(np.all(edge.passes(place[:, 0], place[:, 1])))
+            for edge in edges
+        ]  # fmt: skip
+        idle += needed.count(False)
+        surface = plain["mirrors"][name]
+        surface["edges"] = [edge for edge, kept in zip(surface["edges"], needed, strict=True) if kept]
+        if not surface["edges"]:
+            del surface["edges"]
+            if surface.get("light") == "passes" and name != model.spec.stop:
+                del plain["mirrors"][name], taken[name]
+    if not idle:
+        return model
+    notes.append(Note(0, "clear apertures", f"{idle} of them stop no light of the field: not carried"))
+    return _derived(lens, plain, backend)
 
 
 def camera_text(made: ReadCamera, lens: Prescription) -> str:

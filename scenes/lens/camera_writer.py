@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
 from optics.geometry.surface import plane
 from optics.geometry.tree import AT_REST, State
@@ -32,7 +34,7 @@ def prescription_of(model: CameraModel) -> Prescription:
             joined(model.surfaces[name]),
             LIGHT[mirror.light],
             behind[name],
-            model.apertures[name],
+            *_cut(model, name),
         )
         for name, mirror in spec.mirrors.items()
     ]
@@ -49,6 +51,18 @@ def prescription_of(model: CameraModel) -> Prescription:
         # the stop's own size: a pupil's diameter means another ray in every program
         Pupil("stop", float(model.apertures[spec.stop].bounds[1])),
     )
+
+
+def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
+    """Clear aperture of a surface, the line and the glass of no file, and its further edges."""
+    edges = model.edges.get(name, ())
+    if name == model.spec.stop or not edges:
+        return model.apertures[name], 0, "", edges
+    first = edges[0].shape
+    if not edges[0].blocks and not edges[0].turn and isinstance(first, Aperture):
+        return first, 0, "", edges[1:]
+    # what stands in the file, and not the box about the beams
+    return None, 0, "", edges
 
 
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:

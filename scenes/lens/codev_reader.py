@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture
+from optics.geometry.aperture import Aperture, Circle
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
+from optics.geometry.surface_edge import Edge
 from optics.raytrace.assembly import Interaction
 from scenes.lens.codev_statements import CodevSurface, CodevSystem, statements, take
 from scenes.lens.prescription import (
@@ -101,7 +102,7 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
             if stop >= 0:
                 raise source.error("a second stop", surface.line)
             stop = len(chain.surfaces)
-        idle = made.interaction is Interaction.PASS and made.aperture is None and made.surface.is_plane
+        idle = made.interaction is Interaction.PASS and not made.every_edge and made.surface.is_plane
         if not idle or surface.stop or last:
             chain.add(made)
         if surface.kind == "DAR":
@@ -160,18 +161,19 @@ def _made(
     source, medium = system.source, surface.medium.strip("'\"")
     shape = _shape(system, surface)
     try:
-        aperture = _aperture(system, surface)
+        aperture, blocked = _edges_of(surface)
     except ValueError as error:
         raise source.error(str(error), surface.line) from None
     if medium.upper() in ("REFL", "REFR_TIR", "TIRO"):
         if medium.upper() != "REFL":
             raise source.error("total reflection is not known here", surface.line, medium)
-        made = LensSurface(surface.name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, glass)
+        how = Interaction.REFLECT
+        made = LensSurface(surface.name, pose, shape, how, index, aperture, surface.line, glass, blocked)
         return made, index, glass
     behind = 1.0 if medium.upper() in ("", "AIR") else _index(source, surface, medium, wavelength, glasses)
     how = Interaction.PASS if behind == index else Interaction.REFRACT
     glass = "" if behind == 1.0 else medium
-    return LensSurface(surface.name, pose, shape, how, behind, aperture, surface.line, glass), behind, glass
+    return LensSurface(surface.name, pose, shape, how, behind, aperture, surface.line, glass, blocked), behind, glass
 
 
 def _index(source: Source, surface: CodevSurface, medium: str, wavelength: float, glasses: Glasses) -> float:
@@ -216,17 +218,17 @@ def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:
     return polynomial(even_asphere(surface.curvature / scale, conic, {}), scaled, radius)
 
 
-def _aperture(system: CodevSystem, surface: CodevSurface) -> Aperture | None:
+def _edges_of(surface: CodevSurface) -> tuple[Aperture | None, tuple[Edge, ...]]:
+    """Clear aperture, and the hole in it where it is not round."""
     sizes = surface.sizes
     centre = (surface.centre.get("ADX", 0.0), surface.centre.get("ADY", 0.0))
+    blocked = (Edge(Circle(surface.hole, centre), blocks=True),) if surface.hole else ()
     if "REX" in sizes or "REY" in sizes:
         wide = sizes.get("REX", sizes.get("REY", 0.0)), sizes.get("REY", sizes.get("REX", 0.0))
-        return clear(rectangle=wide, centre=centre)
+        return clear(rectangle=wide, centre=centre), blocked
     if "ELX" in sizes or "ELY" in sizes:
         wide = sizes.get("ELX", sizes.get("ELY", 0.0)), sizes.get("ELY", sizes.get("ELX", 0.0))
-        return clear(ellipse=wide, centre=centre)
+        return clear(ellipse=wide, centre=centre), blocked
     if "CIR" in sizes:
-        return clear(sizes["CIR"], surface.hole, centre=centre)
-    if surface.hole:
-        system.source.notes.append(Note(surface.line, surface.name, "a hole without an outer edge is not carried"))
-    return None
+        return clear(sizes["CIR"], surface.hole, centre=centre), ()
+    return None, blocked

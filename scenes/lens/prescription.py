@@ -10,6 +10,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
+from optics.geometry.surface_edge import Edge
 from optics.geometry.tree import Body, RigidTree
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
@@ -55,6 +56,7 @@ class LensSurface:
         interaction: reflects, refracts or lets pass.
         index: refractive index of what lies behind it for the light, at the prescription's wavelength.
         aperture: clear aperture, None for an unlimited one.
+        edges: what cuts light there beside the clear aperture: obscurations, vanes.
         line: where it begins in the file.
         glass: name of what lies behind it, empty for the medium of the object.
     """
@@ -67,6 +69,12 @@ class LensSurface:
     aperture: Aperture | None = None
     line: int = 0
     glass: str = ""
+    edges: tuple[Edge, ...] = ()
+
+    @property
+    def every_edge(self) -> tuple[Edge, ...]:
+        """The clear aperture among its edges."""
+        return (*(() if self.aperture is None else (Edge(self.aperture),)), *self.edges)
 
 
 @dataclass(frozen=True)

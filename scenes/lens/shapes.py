@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from math import comb
+from math import comb, pi, remainder
+from typing import Any
 
 import numpy as np
 
+from optics.geometry import surface_edge
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface_edge import Edge, Polygon, Ray
 from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
 from scenes.lens.prescription import LensSurface
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 LARGEST_ORDER = 10
 """Of polynomials and Zernike terms; beyond it monomials lose digits."""
@@ -181,6 +185,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         pose=surface.pose @ over,
         surface=Surface(-shape.curvature, shape.conic, even, figure, tuple(terms)),
         aperture=edge,
+        edges=tuple(map(surface_edge.turned_over, surface.edges)),
     )
 
 
@@ -197,3 +202,54 @@ def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
             pair = (2 * (n - k), 2 * k)
             out[pair] = out.get(pair, 0.0) + value * comb(n, k)
     return {pair: c for pair, c in out.items() if c != 0.0}
+
+
+def without_rim(surface: LensSurface) -> LensSurface:
+    """A stop without its outer edge; the hole in it stays."""
+    rim = surface.aperture
+    hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
+    return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
+
+
+def edge_size(edge: Edge) -> float:
+    """Largest number of an edge, metres."""
+    shape = edge.shape
+    numbers = [*shape.centre]
+    match shape:
+        case Circle():
+            numbers.append(shape.radius)
+        case Ray():
+            numbers.append(shape.width)
+        case Polygon():
+            numbers += [value for corner in shape.corners for value in corner]
+        case _:
+            numbers += [shape.half_x, shape.half_y]
+    return max(map(abs, numbers))
+
+
+def edge_entry(edge: Edge) -> dict[str, Any]:
+    """An edge as a camera's file has it."""
+    shape = edge.shape
+    kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
+
+    def metres(*values: float) -> Any:
+        written = [format_quantity(float(value), LENGTH) for value in values]
+        return written if len(written) > 1 else written[0]
+
+    out: dict[str, Any] = {"blocks" if edge.blocks else "clear": kind}
+    if any(shape.centre):
+        out["centre"] = metres(*shape.centre)
+    match shape:
+        case Circle(radius, _, inner):
+            out["radius"] = metres(radius)
+            if inner:
+                out["inner"] = metres(inner)
+        case Ray(width, _):
+            out["width"] = metres(width)
+        case Polygon(corners, _):
+            out["corners"] = [metres(*corner) for corner in corners]
+        case _:
+            out["half"] = metres(shape.half_x, shape.half_y)
+    if edge.turn and not isinstance(shape, Circle | Polygon):
+        out["turn"] = format_quantity(remainder(edge.turn, 2.0 * pi), ANGLE)
+    return out

@@ -11,9 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from optics.geometry.aperture import Aperture
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
+from optics.geometry.surface_edge import Edge, EdgeShape
 from optics.geometry.zernike import MAX_NOLL
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import (
@@ -58,10 +59,10 @@ _EDGES = {
     "SQAP": "rectangle",
     "ELAP": "ellipse",
     "OBSC": "hole",
-    "SQOB": "",
-    "ELOB": "",
+    "SQOB": "blocked rectangle",
+    "ELOB": "blocked ellipse",
 }
-"""Statement -> the aperture that it gives; other obscurations are not carried."""
+"""Statement -> the edge that it gives."""
 
 
 @dataclass
@@ -281,7 +282,7 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
             _break(source, chain, surface, scale)
         else:
             made, index, medium = _made(system, surface, chain.pose, index, medium, primary, glasses, k)
-            idle = made.interaction is Interaction.PASS and made.aperture is None and made.surface.is_plane
+            idle = made.interaction is Interaction.PASS and not made.every_edge and made.surface.is_plane
             if surface.stop:
                 if stop >= 0:
                     raise source.error("a second stop", surface.line)
@@ -359,19 +360,19 @@ def _made(
     shape = _shape(source, surface, system.scale)
     name = surface.name if surface.name.isidentifier() else f"S{k}"
     try:
-        aperture = _aperture(source, surface, system.scale)
+        aperture, blocked = _edges_of(source, surface, system.scale)
     except ValueError as error:
         line = max(s.line for s, _, _ in surface.edges.values())
         raise source.error(str(error), line) from None
     kind = surface.glass[0].upper() if surface.glass else ""
     if kind == "MIRROR":
-        made = LensSurface(name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, medium)
+        made = LensSurface(name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, medium, blocked)
         return made, index, medium
     behind, glass = 1.0, ""
     if kind:
         behind, glass = _index(source, surface, wavelength, glasses), surface.glass[0]
     how = Interaction.PASS if behind == index else Interaction.REFRACT
-    return LensSurface(name, pose, shape, how, behind, aperture, surface.line, glass), behind, glass
+    return LensSurface(name, pose, shape, how, behind, aperture, surface.line, glass, blocked), behind, glass
 
 
 def _index(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> float:
@@ -438,19 +439,21 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
     return shape
 
 
-def _aperture(source: Source, surface: _Surface, scale: float) -> Aperture | None:
-    """Clear aperture that the file states; a semi-diameter alone is a drawing's."""
-    edges, (cx, cy) = surface.edges, surface.centre
+def _edges_of(source: Source, surface: _Surface, scale: float) -> tuple[Aperture | None, tuple[Edge, ...]]:
+    """Clear aperture that the file states, and what it blocks; a semi-diameter alone is a drawing's."""
+    cx, cy = surface.centre
     centre = (cx * scale, cy * scale)
-    sizes = {what: (first * scale, second * scale) for what, (_, first, second) in edges.items()}
-    if "rectangle" in sizes or "ellipse" in sizes:
-        if "hole" in sizes:
-            source.note(edges["hole"][0], "an obscuration in an aperture that is not round is not carried")
-        return clear(rectangle=sizes.get("rectangle"), ellipse=sizes.get("ellipse"), centre=centre)
-    if "clear" in sizes:
+    sizes = {what: (first * scale, second * scale) for what, (_, first, second) in surface.edges.items()}
+    blocked: list[EdgeShape] = []
+    hole = sizes.get("hole", (0.0, 0.0))[1]
+    if "blocked rectangle" in sizes:
+        blocked.append(Rectangle(*sizes["blocked rectangle"], centre))
+    if "blocked ellipse" in sizes:
+        blocked.append(Ellipse(*sizes["blocked ellipse"], centre))
+    edge = clear(rectangle=sizes.get("rectangle"), ellipse=sizes.get("ellipse"), centre=centre)
+    if edge is None and "clear" in sizes:
         inner, outer = sizes["clear"]
-        hole = sizes["hole"][1] if "hole" in sizes else inner
-        return clear(outer, hole, centre=centre)
-    if "hole" in sizes:
-        source.note(edges["hole"][0], "an obscuration without an outer edge is not carried")
-    return None
+        edge = clear(outer, hole or inner, centre=centre)
+    elif hole:
+        blocked.append(Circle(hole, centre))
+    return edge, tuple(Edge(shape, blocks=True) for shape in blocked)

@@ -57,7 +57,7 @@ def zemax_text(lens: Prescription) -> str:
         others = [r for r in rest if r != "STOP"]
         far = "INFINITY" if math.isinf(thickness) else _number(thickness * MM)
         # a semi-diameter stands before the edge that it is the size of: readers take the edge as a change of it
-        edges = [r for r in others if r.split()[0] in ("DIAM", "CLAP", "SQAP", "ELAP", "OBDC")]
+        edges = [r for r in others if r.split()[0] in ("DIAM", "CLAP", "OBSC", "SQAP", "SQOB", "ELAP", "ELOB", "OBDC")]
         shape = [r for r in others if r not in edges]
         body = [*stop, f"TYPE {kind}", f"CURV {_number(curvature / MM)} 0 0 0 0", *shape, f"DISZ {far}", *edges]
         lines.append(f"SURF {number}")
@@ -72,7 +72,7 @@ def zemax_text(lens: Prescription) -> str:
         there = float(poses[k + 1].translation[2] - pose.translation[2]) if not last else 0.0
         out, back = _breaks(pose)
         kind, rest = _shape(lens, given)
-        rest = [f"COMM {given.name}", *rest, *_edges(given.aperture)]
+        rest = [f"COMM {given.name}", *rest, *_edges(lens, given)]
         if k == lens.stop:
             rest.append("STOP")
         if given.interaction is Interaction.REFLECT:
@@ -107,16 +107,30 @@ def _breaks(pose: Pose) -> tuple[list[str], list[str]]:
     return [*out, "PARM 6 0"], [*back, "PARM 6 1"]
 
 
-def _edges(aperture: Aperture | None) -> list[str]:
-    match aperture:
+def _edges(lens: Prescription, given: LensSurface) -> list[str]:
+    """Statements of what cuts the light: a clear aperture, an obscuration, or a disk with a hole."""
+    aperture, further = given.aperture, given.edges
+    if len(further) == 1 and isinstance(aperture, Circle) and not aperture.inner and further[0].blocks:
+        hole = further[0].shape
+        if isinstance(hole, Circle) and not hole.inner and hole.centre == aperture.centre:
+            aperture, further = Circle(aperture.radius, aperture.centre, hole.radius), ()
+    blocked = further[0].shape if len(further) == 1 and aperture is None and further[0].blocks else None
+    if further and (not isinstance(blocked, Aperture) or further[0].turn):
+        what = "edges beyond a clear aperture or an obscuration of its own"
+        raise _cannot(lens, given, what, "one circle, rectangle or ellipse, or a batoid YAML")
+    if isinstance(blocked, Circle) and blocked.inner:
+        raise _cannot(lens, given, "an obscuration with a hole", "one circle, rectangle or ellipse, or a batoid YAML")
+    match blocked or aperture:
         case None:
             return []
         case Circle(radius, centre, inner):
-            size, line = radius, f"CLAP {_number(inner * MM)} {_number(radius * MM)} 0"
+            size, line = radius, f"{'OBSC' if blocked else 'CLAP'} {_number(inner * MM)} {_number(radius * MM)} 0"
         case Rectangle(half_x, half_y, centre):
-            size, line = math.hypot(half_x, half_y), f"SQAP {_number(half_x * MM)} {_number(half_y * MM)} 0"
+            kind = "SQOB" if blocked else "SQAP"
+            size, line = math.hypot(half_x, half_y), f"{kind} {_number(half_x * MM)} {_number(half_y * MM)} 0"
         case Ellipse(half_x, half_y, centre):
-            size, line = max(half_x, half_y), f"ELAP {_number(half_x * MM)} {_number(half_y * MM)} 0"
+            kind = "ELOB" if blocked else "ELAP"
+            size, line = max(half_x, half_y), f"{kind} {_number(half_x * MM)} {_number(half_y * MM)} 0"
     lines = [f"DIAM {_number((size + math.hypot(*centre)) * MM)} 1 0 0 1", line]
     if any(centre):
         lines.append(f"OBDC {_number(centre[0] * MM)} {_number(centre[1] * MM)}")

@@ -9,8 +9,9 @@ to the image plane and toward the scene, X = Y x Z.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
+from optics.geometry.surface_edge import Edge
 from optics.geometry.tree import Body, RigidTree
 from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
@@ -68,6 +70,25 @@ class CameraModel:
     def mirrors(self) -> tuple[str, ...]:
         """Mirror names in the order of the light from the scene."""
         return tuple(self.spec.mirrors)
+
+    @cached_property
+    def edges(self) -> Mapping[str, tuple[Edge, ...]]:
+        """Mirror name -> what cuts light there beside the stop, of those that have it."""
+        given = {name: mirror.edges for name, mirror in self.spec.mirrors.items()}
+        return {name: tuple(edge.to_edge() for edge in edges) for name, edges in given.items() if edges}
+
+    def uncut(self, met: Callable[[str], np.ndarray]) -> np.ndarray | bool:
+        """Which rays all edges let through; True where there are none.
+
+        Args:
+            met: mirror name -> (..., 2 or 3) where rays meet it, in its own frame, metres of the nominal mirror.
+        """
+        through: np.ndarray | bool = True
+        for name, edges in self.edges.items():
+            place = met(name)
+            for edge in edges:
+                through = through & edge.passes(place[..., 0], place[..., 1])
+        return through
 
     @property
     def line_focal_length(self) -> float:
@@ -169,7 +190,9 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
 
     sight = -centre
     across = np.cross(LINE_AXIS, sight)
-    origin = mirror_pose(spec.mirrors[names[0]]).apply(traced.hit(0)[0, 0])
+    # baffles may stand before it
+    first = next(k for k, name in enumerate(names) if name == spec.stop or spec.mirrors[name].light != "passes")
+    origin = mirror_pose(spec.mirrors[names[first]]).apply(traced.hit(first)[0, 0])
     camera_frame = Pose(np.stack([across, LINE_AXIS, sight], axis=-1), origin)
     normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
@@ -245,13 +268,14 @@ def _apertures(
     launch = collimated(backend, to_stop, directions, rim)
     rays = make_rays(backend, launch.reshape(-1, 3), np.repeat(directions, _RIM_POINTS, axis=0))
     traced = trace(backend, imaging, rays, keep=range(len(spec.mirrors)))
-    require_some(traced.numpy()[3], f"camera {spec.name} at its field edges")
+    valid = traced.numpy()[3]
+    require_some(valid, f"camera {spec.name} at its field edges")
     out: dict[str, Aperture] = {}
     for i, name in enumerate(spec.mirrors):
         if name == spec.stop:
             out[name] = Circle(stop_radius)
             continue
-        points = traced.hit(i)[0, :, :2]
+        points = traced.hit(i)[0, valid[0], :2]
         low, high = points.min(axis=0) - spec.edge_margin, points.max(axis=0) + spec.edge_margin
         half, middle = 0.5 * (high - low), 0.5 * (high + low)
         out[name] = Rectangle(float(half[0]), float(half[1]), (float(middle[0]), float(middle[1])))

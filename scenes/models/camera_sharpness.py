@@ -75,6 +75,7 @@ class FieldBeams:
         path: optical path from the incoming wavefront, (F, 1 + N), metres.
         exit_pupil: from the camera's own image to its exit pupil, upstream, metres.
         room: from the last mirror along the chief ray to the camera's own image, (F,), metres.
+        lit: which of the N rays edges of surfaces let through, (F, N); None for all.
     """
 
     camera: CameraSpec
@@ -85,15 +86,17 @@ class FieldBeams:
     path: np.ndarray
     exit_pupil: float
     room: np.ndarray
+    lit: np.ndarray | None = None
 
     @classmethod
     def trace(
         cls, model: CameraModel, backend: Backend, fields: tuple[tuple[float, float], ...], rings: int
     ) -> FieldBeams:
-        """Trace them through the camera as designed; no aperture but the stop limits them.
+        """Trace them through the camera as designed; nothing but the stop and edges of surfaces limits them.
 
         Raises:
             AimError, BeamMissedError: light of a field does not come through.
+            InputError: edges stop all of it.
         """
         spec, nodes = model.spec, quadrature.disk(rings)
         bare = model.bare_assembly(apertures=False)
@@ -105,10 +108,22 @@ class FieldBeams:
         heading = np.broadcast_to(directions[:, None], launch.shape)
         rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
         last = len(model.mirrors) - 1
-        traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=(last,), world=True)
+        kept = {model.mirrors.index(name) for name in model.edges} | {last}
+        traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=kept, world=True)
         assert traced.world is not None
         position, direction, path, valid = traced.numpy(traced.world)
         shape = launch.shape[:2]
+        lit = None
+        if model.edges:
+            valid = valid[0] & model.uncut(lambda name: traced.hit(model.mirrors.index(name))[0])
+            lit = valid.reshape(shape)[:, 1:]
+            dark = np.flatnonzero(~np.any(lit, axis=-1))
+            if dark.size:
+                found = (
+                    f"field {field_text(spec, fields[dark[0]])}, {dark.size} of {len(fields)} fields that were tried"
+                )
+                key = ("mirrors", next(iter(model.edges)), "edges")
+                raise spec.error("edges leave no light", key, found=found, allowed="a smaller field, or wider edges")
         require_some(valid.reshape(shape), f"camera {spec.name}")
         position, direction = position.reshape(*shape, 3), direction.reshape(*shape, 3)
         way = position[:, 0] - model.mirror_pose(model.mirrors[last]).apply(traced.hit(last).reshape(*shape, 3)[:, 0])
@@ -121,7 +136,16 @@ class FieldBeams:
             path.reshape(shape),
             float(model.first_order.exit_pupil_distance[0]),
             np.sum(way * direction[:, 0], axis=-1),
+            lit,
         )
+
+    @property
+    def share(self) -> np.ndarray:
+        """Of the light that comes through, (N,), or (F, N) where edges stop some."""
+        if self.lit is None:
+            return self.nodes.share
+        share = self.nodes.share * self.lit
+        return np.asarray(share / np.sum(share, axis=-1, keepdims=True))
 
     def _away(self, plane: FocalPlane) -> np.ndarray:
         """From the camera's own image along each ray to a plane, (F, 1 + N), metres."""
@@ -134,22 +158,27 @@ class FieldBeams:
         return bool(np.all(self.room + self._away(plane)[:, 0] > 0.0))
 
     def wavefronts(self, plane: FocalPlane) -> np.ndarray:
-        """Wavefront errors about the images on a plane, piston and tilt out, (F, N), waves."""
+        """Wavefront errors about the images on a plane, piston and tilt out, (F, N), waves; 0 where no light comes."""
         away = self._away(plane)
         position, path = self.position + away[..., None] * self.direction, self.path + away
         to_sphere = path_to_sphere(position, self.direction, path, position[:, :1], self.exit_pupil)
         basis = zernike.basis(3, self.nodes.x, self.nodes.y)
         error = (to_sphere[:, :1] - to_sphere)[:, 1:] / self.camera.wavelength
+        if self.lit is not None:
+            return np.stack([_levelled(one, basis, share) for one, share in zip(error, self.share, strict=True)])
         # the first three terms are orthonormal over the disk, and the rule is exact for their products
         return np.asarray(error - (error * self.nodes.share) @ basis @ basis.T)
 
     def errors(self, plane: FocalPlane) -> np.ndarray:
         """Rms wavefront error at each field, (F,), waves."""
-        return np.asarray(np.sqrt(self.wavefronts(plane) ** 2 @ self.nodes.share))
+        squares = self.wavefronts(plane) ** 2
+        if self.lit is not None:
+            return np.asarray(np.sqrt(np.sum(squares * self.share, axis=-1)))
+        return np.asarray(np.sqrt(squares @ self.nodes.share))
 
     def best_plane(self, tilt: bool = False) -> FocalPlane:
         """The plane with the least mean square error over the fields; turned about x as well, if asked for."""
-        start, root = FocalPlane.of(self.camera), np.sqrt(self.nodes.share / len(self.fields))
+        start, root = FocalPlane.of(self.camera), np.sqrt(self.share / len(self.fields))
         middle = float(np.mean(self.position[:, 0, 1]))
 
         def moved(step: np.ndarray) -> FocalPlane:
@@ -168,6 +197,16 @@ class FieldBeams:
             slope = np.stack([(ahead - behind) / (2.0 * _DIFFERENCE) for ahead, behind in sides], axis=-1)
             step = step - np.linalg.lstsq(slope, residuals(step), rcond=None)[0]
         return moved(step)
+
+
+def _levelled(error: np.ndarray, basis: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Errors (N,) without the part of the basis (N, 3) by weighted least squares; 0 where the weight is."""
+    lit = share > 0.0
+    root = np.sqrt(share[lit])
+    terms, *_ = np.linalg.lstsq(basis[lit] * root[:, None], error[lit] * root, rcond=None)
+    out = np.zeros(len(error))
+    out[lit] = error[lit] - basis[lit] @ terms
+    return out
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from scenes.specs.instrument import (
     check_made,
     reflector_kinds,
 )
+from scenes.specs.surface_edge import SurfaceEdgeSpec
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Radius, Vector, Vector2, Wavelength
 from scenes.yaml.sag_terms import SagTerms
@@ -347,6 +348,7 @@ class MirrorSpec(Spec):
         light: what it does there, left out for a mirror; a plane that it passes is there to be the stop.
         index: refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it
             leaves the lens.
+        edges: what cuts light there beside the stop; several stop what any of them stops.
     """
 
     z: Length
@@ -358,6 +360,7 @@ class MirrorSpec(Spec):
     sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
+    edges: Annotated[tuple[SurfaceEdgeSpec, ...], Field(min_length=1, max_length=100)] | None = None
 
     @model_validator(mode="after")
     def _is_curved(self) -> "MirrorSpec":
@@ -478,9 +481,12 @@ class CameraSpec(Spec):
             on_axis: refuse mirrors that are flat, turned or off the parent axis, too.
 
         Raises:
-            InputError: it has a lens or a stop of its own; with the line.
+            InputError: it has a lens, a stop or edges of its own; with the line.
         """
         for name, mirror in self.mirrors.items():
+            if mirror.edges:
+                problem = f"{where} has no edges of its own: its clear apertures follow from its beams"
+                raise self.error(problem, ("mirrors", name, "edges"), allowed="no edges")
             if mirror.light is not None:
                 problem = f"{where} is made of mirrors alone"
                 raise self.error(problem, ("mirrors", name, "light"), found=mirror.light, allowed="mirrors")

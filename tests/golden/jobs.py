@@ -99,6 +99,12 @@ def _files(folder: Path) -> None:
     (folder / "match.yaml").write_text(dedent(text).lstrip().rstrip(" ") + "".join(images))
 
 
+def _course(folder: Path) -> None:
+    """The run folder of a small job with a course."""
+    words = ["twin.render", f"{JOBS}/course.yaml", "--out", str(folder / "course"), "--quiet"]
+    subprocess.run([sys.executable, "-m", *words], cwd=ROOT, check=True)
+
+
 @dataclass(frozen=True)
 class Job:
     """One command.
@@ -168,6 +174,7 @@ ALL = (
     _job("orbit_monitor", f"twin.orbit monitor {RUN % 'monitor'}"),
     _job("orbit_export", "twin.orbit export {here}/pass --out {out}", prepare=_pass),
     _job("orbit_export_traced", f"twin.orbit export {RUN % 'angle_gf7'}"),
+    _job("export", "twin.export {here}/course --out {out}", prepare=_course),
     _job("study_render", f"twin.study {RUN % 'study_render'} --workers 1"),
     _job("study_lab", f"twin.study {RUN % 'study_lab'} --workers 1 --quiet"),
     _job("study_orbit", f"twin.study {RUN % 'study_orbit'} --workers 2 --json"),

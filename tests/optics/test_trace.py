@@ -49,6 +49,25 @@ def test_ellipsoid_images_one_focus_on_the_other(backend, conic: float) -> None:
     np.testing.assert_allclose(path, abs(near + far), atol=3e-14)
 
 
+@pytest.mark.parametrize("apart", [0.0, 1e-15, 1e-12, -1e-9, 1e-6, -1e-3])
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_rays_from_the_other_sheet_of_a_hyperboloid_meet_the_one_with_the_vertex(backend, apart, sense) -> None:
+    """The secondary of a Cassegrain whose image is as far from it as the primary's focus is from the primary: the
+    primary's vertex lies on its other sheet.
+    """
+    radius, conic = -0.857142857142857, -3.44897959183673
+    other = 2.0 * radius / (1.0 + conic)
+    start = np.array([[0.0, 0.0, other + apart]] * 3 + [[0.03, -0.02, other + apart]])
+    heading = np.array([unit(0.0, 0.0, -1.0), unit(1.7e-3, 0.0, -1.0), unit(0.02, 0.01, -1.0), unit(0.0, 0.0, -1.0)])
+    hit, _, path, valid = run(backend, build(Stage(Surface(1.0 / radius, conic), PASS)), start, sense * heading)
+    assert valid.all()
+    x, y, z = hit.T
+    square = x * x + y * y
+    sag = square / radius / (1.0 + np.sqrt(1.0 - (1.0 + conic) * square / radius**2))
+    np.testing.assert_allclose(z, sag, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(start + path[:, None] * sense * heading, hit, rtol=0, atol=1e-15)
+
+
 def test_sphere_returns_light_to_its_centre(backend) -> None:
     radius = 3.0
     directions = np.column_stack([disk_points(200, 0.9), np.full(200, -1.0)])

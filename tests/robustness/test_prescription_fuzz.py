@@ -15,7 +15,7 @@ from scenes.lens.glass_catalogue import own_glasses, read_catalogue
 from scenes.lens.prescription import Prescription
 from scenes.lens.zemax_reader import read_zemax
 from scenes.yaml.errors import InputError, Issue
-from tests.robustness.mutate import BYTES, TOKENS
+from tests.robustness.mutate import spoilt
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA
 
 GLASSES = own_glasses()
@@ -28,56 +28,6 @@ KINDS: dict[str, tuple[tuple[bytes, ...], Callable[[Path], object]]] = {
 LONGEST = 30.0
 """Seconds for one file, on a machine that has other work, too: the largest YAML takes two, a pattern that goes astray
 minutes."""
-NASTY = (
-    "1e400",
-    "-1e308",
-    "nan",
-    "0",
-    "1e-320",
-    "S" * 300,
-    "\u202e",
-    "&",
-    "!",
-    ";",
-    "'",
-    '"',
-    "INFINITY",
-    "SURF 1",
-    "SI 0 0",
-)
-
-
-def spoilt(content: bytes, chance: random.Random) -> bytes:
-    """A file that is cut off, has other bytes or words, lines in another order, or another encoding."""
-    kind = chance.randrange(6)
-    if kind == 0:
-        return content[: chance.randrange(len(content))]
-    if kind == 1:
-        for _ in range(chance.choice((1, 2, 4))):
-            content = chance.choice(BYTES)(content, chance)
-        return content
-    wide = "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le" if b"\0" in content else "utf-8"
-    text = content.decode(wide)
-    if kind == 2:
-        lines = text.split("\n")
-        for _ in range(chance.randint(1, 4)):
-            at = chance.randrange(len(lines))
-            lines[at : at + 1] = chance.choice(([], [lines[at]] * 2, [chance.choice(lines)], [chance.choice(NASTY)]))
-            lines = lines or [""]
-        return "\n".join(lines).encode(wide, "surrogatepass")
-    if kind == 3:
-        words = text.split(" ")
-        for _ in range(chance.randint(1, 4)):
-            words[chance.randrange(len(words))] = chance.choice(NASTY)
-        return " ".join(words).encode(wide, "surrogatepass")
-    if kind == 4:
-        return text.encode(chance.choice(("utf-16-be", "utf-16-le", "utf-32", "utf-7", "cp500")))
-    for _ in range(chance.choice((1, 2, 3))):
-        try:
-            text = chance.choice(TOKENS)(text, chance)
-        except (IndexError, ValueError):
-            continue
-    return text.encode(wide, "surrogatepass")
 
 
 def issues_of(work: Callable[[], object]) -> tuple[Issue, ...]:

@@ -84,6 +84,7 @@ def test_dataset(done) -> None:
             "units": "um",
             "role": "response",
             "key": "recovered cameras forward model d_f_um",
+            "long_name": "response df, recovered cameras forward model d_f_um",
         }
         assert data["failed"].values.tolist() == [0] * 109 + [1]
         assert str(data["message"].values[-1])

@@ -53,6 +53,10 @@ MAP_POINTS = 65
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
 
+EVEN = 10_000
+"""Rays spread evenly over the stop that tell what edges of surfaces take of a beam: good to 0.1 % of it."""
+_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
@@ -298,6 +302,7 @@ class CameraOptics:
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
+        cut = self._cut(fields)
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
             lit = rays.valid[k]
             weight = nodes.weight * lit[own]
@@ -306,6 +311,10 @@ class CameraOptics:
             fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
+            rms = float(fit.rms)
+            if cut is not None:
+                # over a part of the disk the terms share tilt among them; what is level there was taken out above
+                rms = float(np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
             phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
             out.append(
                 Wavefront(
@@ -315,15 +324,24 @@ class CameraOptics:
                     y=axis,
                     map=table,
                     coefficients=fit.coefficients,
-                    rms=float(fit.rms),
+                    rms=rms,
                     peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
                     residual=float(fit.residual_rms),
                     strehl=float(np.abs(phasor) ** 2),
-                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)),
+                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)) if cut is None else float(cut[k]),
                     place=self._place(rays, k),
                 )
             )
         return tuple(out)
+
+    def _cut(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray | None:
+        """Share of the stop's area whose light edges stop at fields (F, 2), (F,); None where no surface has any."""
+        if not self.model.edges:
+            return None
+        k = np.arange(EVEN)
+        r, turn = np.sqrt((k + 0.5) / EVEN), _GOLDEN * k
+        even = np.stack([r * np.cos(turn), r * np.sin(turn)], axis=-1)
+        return np.asarray(1.0 - np.mean(self.rays(fields, even).valid, axis=-1))
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
         """Wavefront error at one field, as ``wavefronts``."""

@@ -232,9 +232,14 @@ def _spots(run: CameraRun) -> Section:
 
 def _mtf(run: CameraRun) -> Section:
     if not run.mtfs:
-        return Section(
-            "MTF", (f"No MTF is told of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing.",)
-        )
+        why = f"No MTF is told of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing."
+        if run.optics.model.edges:
+            why = (
+                f"No MTF is told of a camera with edges beside its stop ({', '.join(run.optics.model.edges)}): the "
+                "pupil that they cut is no smooth function. Wavefronts, spots and focus are of the light that they "
+                "leave."
+            )
+        return Section("MTF", (why,))
     rows: list[list[Cell]] = []
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)

@@ -165,7 +165,8 @@ def run_camera(
     field = field_grid(ERROR_GRID)
     beams = FieldBeams.trace(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5)
     errors = beams.errors(FocalPlane.of(camera)).reshape(field.shape[:2])
-    sharp = float(errors.max()) < MOST_WAVES
+    # a pupil that edges cut has no smooth function, so no MTF
+    sharp = float(errors.max()) < MOST_WAVES and not optics.model.edges
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
@@ -339,29 +340,48 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     """Contents of optics.nc: wavefront maps, Zernike terms, spots, MTF, fields and curves along the line."""
     first = run.waves[0].to_xarray()
     fields = [list(wave.field) for wave in run.waves]
+    waves, rms, metres = {"units": "waves"}, {"units": "waves rms"}, {"units": "m"}
+
+    def named(text: str, about: dict[str, str] | None = None) -> dict[str, str]:
+        return {**(about or {}), "long_name": text}
+
+    mtf = ("mtf_field", "direction", "frequency")
+    share = "share of the half field"
+    maps = np.stack([w.map for w in run.waves])
+    terms = np.stack([w.coefficients for w in run.waves])
     data: dict[str, Any] = {
-        "wavefront": (("field", "y", "x"), np.stack([w.map for w in run.waves]), {"units": "waves"}),
-        "zernike": (("field", "noll"), np.stack([w.coefficients for w in run.waves]), {"units": "waves rms"}),
-        "field_share": (("field", "direction"), np.array(fields), {"long_name": "share of the half field"}),
-        "wfe": (("field_along", "field_across"), run.errors, {"units": "waves rms"}),
-        "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, {"units": "waves rms"}),
-        "through_focus_mtf": (("mtf_field", "direction", "defocus"), run.focus.mtf),
-        "distortion_line": (("line",), run.distortion.residual, {"units": "m"}),
+        "wavefront": (("field", "y", "x"), maps, named("wavefront error over the stop", waves)),
+        "zernike": (("field", "noll"), terms, named("Zernike terms of the wavefront error", rms)),
+        "field_share": (("field", "direction"), np.array(fields), named(share)),
+        "wfe": (("field_along", "field_across"), run.errors, named("wavefront error over the field", rms)),
+        "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, named("wavefront error through focus", rms)),
+        "through_focus_mtf": (
+            ("mtf_field", "direction", "defocus"),
+            run.focus.mtf,
+            named("modulation at the Nyquist frequency through focus"),
+        ),
+        "distortion_line": (
+            ("line",),
+            run.distortion.residual,
+            named("distortion along the line: place less that of the principal distance", metres),
+        ),
     }
     coords: dict[str, Any] = {
         "x": first["x"],
         "y": first["y"],
         "noll": first["noll"],
-        "term": first["term"],
-        "direction": ["along line", "along track"],
-        "field_along": run.field[:, 0, 0],
-        "field_across": run.field[0, :, 1],
-        "defocus": ("defocus", run.focus.defocus, {"units": "m"}),
-        "line": ("line", run.distortion.position, {"units": "m"}),
-        "mtf_field_share": (("mtf_field", "direction"), np.array(MTF_FIELDS)),
+        "term": first["term"].assign_attrs(named("name of the Zernike term")),
+        "direction": ("direction", ["along line", "along track"], named("on the focal plane")),
+        "field_along": ("field_along", run.field[:, 0, 0], named(f"{share}, along the line")),
+        "field_across": ("field_across", run.field[0, :, 1], named(f"{share}, along the track")),
+        "defocus": ("defocus", run.focus.defocus, named("of the detector, downstream positive", metres)),
+        "line": ("line", run.distortion.position, named("place along the line, from its middle", metres)),
+        "mtf_field_share": (("mtf_field", "direction"), np.array(MTF_FIELDS), named(share)),
     }
     if run.mtfs:
-        data["mtf"] = (("mtf_field", "direction", "frequency"), np.stack([m.values for m in run.mtfs]))
-        data["mtf_limit"] = (("mtf_field", "direction", "frequency"), np.stack([m.limit for m in run.mtfs]))
-        coords["frequency"] = ("frequency", run.mtfs[0].frequency, {"units": "1/m"})
-    return xr.Dataset(data, coords, {"reference_frames": frames_text("optics")})
+        data["mtf"] = (mtf, np.stack([m.values for m in run.mtfs]), named("modulation of the optics"))
+        data["mtf_limit"] = (mtf, np.stack([m.limit for m in run.mtfs]), named("the same without wavefront error"))
+        about = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
+        coords["frequency"] = ("frequency", run.mtfs[0].frequency, about)
+    told = {"title": "wavefronts, MTF and distortion of a camera over its field"}
+    return xr.Dataset(data, coords, {**told, "reference_frames": frames_text("optics")})

@@ -68,7 +68,7 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
         if spec.mirrors[name].light == "passes":
             continue  # a stop's plate stands where its hole is not
         # the other mirrors' clear apertures have the margin already
-        out[name] = Circle(edge.radius + margin) if isinstance(edge, Circle) else edge
+        out[name] = _body(model, name, Circle(edge.radius + margin) if isinstance(edge, Circle) else edge)
     lines = [(spec.line.pixels * spec.line.pitch, 0.0)]
     lines += [(band.pixels * band.pitch, band.offset) for band in spec.bands.values()]
     half = 0.5 * max(length for length, _ in lines) + margin
@@ -79,9 +79,21 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
     return out
 
 
+def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
+    """A surface with the outer edge and the hole that its file says, else with ``edge``."""
+    given = model.edges.get(name, ())
+    stated = [one.shape for one in given if not one.blocks and not one.turn and isinstance(one.shape, Aperture)]
+    if stated:
+        edge = stated[0]
+    holes = [one.shape for one in given if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]
+    if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
+        edge = Circle(edge.radius, edge.centre, holes[0].radius)
+    return edge
+
+
 def obscuration(model: CameraModel, backend: Backend) -> Mapping[str, float]:
-    """Share of a beam that the camera's own mirrors and line CCDs take before it is theirs: body -> the largest over
-    the field. A body that takes nothing is not there.
+    """Share of a beam, of what edges leave of it, that the camera's own mirrors and line CCDs take before it is theirs:
+    body -> the largest over the field. A body that takes nothing is not there.
     """
     nodes = quadrature.disk(_RINGS)
     paths = ray_paths(model, backend, _FIELDS, np.stack([nodes.x, nodes.y], axis=-1), EARLIER)
@@ -93,8 +105,19 @@ def obscuration(model: CameraModel, backend: Backend) -> Mapping[str, float]:
             if body not in ends:
                 taken = _met(backend, bare, body, edge, paths.points[k], paths.points[k + 1])
                 blocked[body] = blocked.get(body, np.zeros(taken.shape, bool)) | taken
-    shares = {body: float(np.max(taken @ nodes.share)) for body, taken in blocked.items()}
+    lit = _lit(model, bare, paths)
+    shares = {body: float(np.max((taken & lit) @ nodes.share / (lit @ nodes.share))) for body, taken in blocked.items()}
     return {body: share for body, share in shares.items() if share > 0.0}
+
+
+def _lit(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
+    """Which rays edges of surfaces let through, (F, N)."""
+    lit = np.ones(paths.points.shape[1:3], dtype=bool)
+    if not model.edges:
+        return lit
+    return lit & model.uncut(
+        lambda name: bare.nominal_pose(name).inverse().apply(paths.points[1 + paths.names.index(name)])
+    )
 
 
 def _met(backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray) -> np.ndarray:

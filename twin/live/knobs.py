@@ -186,8 +186,12 @@ def perturbation(
 
 
 def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
-    """What has no knob."""
-    return {key: value for key, value in what.items() if key not in (*ACTIONS, "pivot")}
+    """What has no knob: tables of nodes and of temperatures."""
+    out = {key: value for key, value in what.items() if key not in (*ACTIONS, "pivot")}
+    heat = what.get("temperature")
+    if isinstance(heat, Mapping) and "table" in heat:
+        out["temperature"] = {key: value for key, value in heat.items() if key not in ("change", "gradient")}
+    return out
 
 
 def _put(what: dict[str, Any], kind: str, numbers: Mapping[str, float], unit: str) -> None:

@@ -8,17 +8,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from analysis.monitor.recovery import measure_spots, recovery_of
-from analysis.spots.centroid import mean_frames
-from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
-from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.clearance import Clearances
@@ -33,7 +29,7 @@ from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.truth import trace_truth
+from twin.monitor.state_reading import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
@@ -48,19 +44,6 @@ LOST = (AimError, BeamMissedError, TemperatureError, SpotError, InputError, Arit
 """What says that a state cannot be. All errors of the analysis are ValueErrors."""
 
 
-@dataclass(frozen=True, eq=False)
-class Exposure:
-    """What the area CCDs recorded of one state, and what was measured in it.
-
-    Attributes:
-        shown: (C, H, W) uint16, the first frame, or the rounded expected image.
-        spots: measured in the mean of all frames, or in the expected image.
-    """
-
-    shown: np.ndarray
-    spots: SpotPositions
-
-
 class LiveBench:
     """An instrument on which knobs are turned. It keeps what was worked out, and no state of the knobs.
 
@@ -71,7 +54,7 @@ class LiveBench:
     def __init__(self, twin: InstrumentTwin) -> None:
         self.twin = twin
         check_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
-        self._before = lru_cache(maxsize=4)(self._measured_before)
+        self._reader = lru_cache(maxsize=4)(self._new_reader)
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
@@ -186,8 +169,7 @@ class LiveBench:
         began = time.perf_counter()
         told: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
         try:
-            with one_blas_thread():
-                run, after, state = self._run(asked, self._hidden(asked))
+            run, after, state = self._run(asked, self._hidden(asked))
         except LOST as error:
             return {**told, **self._lost(asked, error), "ms": _ms(began)}, None
         told |= self._told(run, asked, state)
@@ -196,7 +178,8 @@ class LiveBench:
 
     def before(self, asked: AskedState) -> np.ndarray:
         """Images before the perturbation, uint16 (C, H, W)."""
-        return self._before(asked.noise, asked.frames, asked.seed).shown
+        frames = self._reader(asked.frames, asked.seed).before if asked.noise else None
+        return self._shown(frames, self.twin.experiment.nominal_photons)
 
     def _lost(self, asked: AskedState, error: Exception) -> dict[str, Any]:
         """Why there is no such state, and which bodies are in each other, if that is why."""
@@ -217,7 +200,7 @@ class LiveBench:
         job, experiment = perturbed.resolved.job, perturbed.experiment
         if asked.time is None or job.course is None:
             return experiment.state(job)
-        fields = job.fields(asked.time)
+        fields = experiment.fields(job, asked.time)
         experiment.thermal.check(fields)
         return experiment.thermal.state(fields, experiment.motions(job, asked.time))
 
@@ -265,58 +248,39 @@ class LiveBench:
             ],
         }
 
-    def _measured_before(self, noise: bool, frames: int, seed: int) -> Exposure:
-        experiment = self.twin.experiment
-        if noise:
-            return self._measured(experiment.frames_before(frames, seed), frames)
-        return self._measured(experiment.expected_frames(experiment.nominal_photons), frames)
+    def _new_reader(self, frames: int, seed: int) -> StateReader:
+        return StateReader(self.twin.experiment, frames, seed, self.twin.resolved.job.analysis.centroid)
 
-    def _measured_after(self, photons: np.ndarray, asked: AskedState) -> Exposure:
-        """Of one state's photons, (1, C, H, W)."""
+    def _shown(self, frames: np.ndarray | None, photons: np.ndarray) -> np.ndarray:
+        """What the page shows of a state, uint16 (C, H, W): the first of its frames, or the rounded expected image."""
+        if frames is not None:
+            return frames[:, 0]
         experiment = self.twin.experiment
-        if asked.noise:
-            # at a time of a course from the stream of that time, as the main job does it
-            return self._measured(
-                experiment.frames_after(photons, asked.frames, asked.seed, asked.time or 0)[0], asked.frames
-            )
-        return self._measured(experiment.expected_frames(photons[0]), asked.frames)
-
-    def _measured(self, recorded: np.ndarray, frames: int) -> Exposure:
-        """The spots in frames, (C, N, H, W), or in expected grey values, (C, H, W), with the sigmas of frames."""
-        experiment = self.twin.experiment
-        if recorded.ndim == 4:
-            mean, shown = mean_frames(recorded), recorded[:, 0]
-        else:
-            mean, shown = recorded, np.rint(np.clip(recorded, 0, experiment.detector.max_dn)).astype(np.uint16)
-        centroid = self.twin.resolved.job.analysis.centroid
-        return Exposure(shown, measure_spots(mean, frames, experiment.calibration, centroid))
+        expected = experiment.expected_frames(photons)
+        return np.rint(np.clip(expected, 0, experiment.detector.max_dn)).astype(np.uint16)
 
     def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, State]:
-        experiment, resolved = self.twin.experiment, self.twin.resolved
+        experiment = self.twin.experiment
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
-        truth = trace_truth(experiment.instrument, experiment.backend, [state])
-        photons = experiment.path.expected_photons([state], single=False)
-        before = self._before(asked.noise, asked.frames, asked.seed)
-        after = self._measured_after(photons, asked)
-        spread = difference_covariance(before.spots, after.spots, experiment.calibration.noise)
-        recovery = recovery_of(before.spots, after.spots, spread, experiment.calibration, experiment.disturbances)
+        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0)
+        after = self._shown(found.frames, found.photons)
         run = RenderRun(
-            resolved=resolved,
+            resolved=self.twin.resolved,
             experiment=experiment,
             state=state,
             frames=asked.frames,
             seed=asked.seed,
-            truth=truth,
+            truth=found.truth,
             photons_before=experiment.nominal_photons,
-            photons_after=photons[0],
-            before=before.shown[:, None],
-            after=after.shown[:, None],
-            recovery=recovery,
+            photons_after=found.photons,
+            before=self.before(asked)[:, None],
+            after=after[:, None] if found.frames is None else found.frames,
+            recovery=found.recovery,
             crosstalk=self._crosstalk,
             warnings=(),
         )
-        return run, after.shown, state
+        return run, after, state
 
     def _told(self, run: RenderRun, asked: AskedState, state: State) -> dict[str, Any]:
         experiment = self.twin.experiment
@@ -338,13 +302,11 @@ class LiveBench:
 
     def _guess(self, asked: AskedState) -> dict[str, Any]:
         """What the knobs, as a guess of what is hidden, would have done: the expected image, and the spots in it."""
-        experiment = self.twin.experiment
         try:
-            photons = experiment.path.expected_photons([self.states(asked)], single=False)
-            made = self._measured(experiment.expected_frames(photons[0]), asked.frames)
+            made = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
         except LOST as error:
             return {"problem": str(error)}
-        return {"spots": made.spots.position.tolist(), "image": made.shown}
+        return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.photons)}
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
         detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels

@@ -115,7 +115,7 @@ def _summary(run: RenderRun) -> bytes:
 
 def _irradiance(run: RenderRun) -> bytes:
     from twin.main_job.render_files import irradiance
-    from twin.run.data_files import netcdf
+    from twin.run.netcdf_file import netcdf
 
     return netcdf(irradiance(run))
 

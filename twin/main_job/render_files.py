@@ -16,7 +16,8 @@ from twin.main_job.job_tables import config_text, finish_names, finish_tables, t
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
-from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
+from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files
+from twin.run.netcdf_file import netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun
@@ -112,13 +113,17 @@ def _write_targets(targets: TargetRun, folder: RunFolder) -> None:
             folder.write_bytes(file, content)
 
 
+_WAVELENGTH = {"units": "m", "standard_name": "radiation_wavelength", "long_name": "of the light in vacuum"}
+
+
 def irradiance(run: RenderRun) -> xr.Dataset:
     """Expected photons before and after, (state, channel, row, column), with stray light apart where it was traced."""
     photons = np.stack([run.photons_before, run.photons_after])
-    images = _images(run, "state", ("state", ["before", "after"]), photons)
+    states = ("state", ["before", "after"], {"long_name": "before the disturbance or after it"})
+    images = _images(run, "state", states, photons)
     if run.stray is not None:
         stray = np.stack([run.stray.before.photons, run.stray.after.photons])
-        about = {"long_name": "of these, ghosts and stray light"}
+        about = {"units": "photons", "long_name": "of these, ghosts and stray light"}
         images["stray_photons"] = (("state", "channel", "row", "column"), stray, about)
     return images
 
@@ -133,16 +138,18 @@ def _images(run: RenderRun, first: str, coordinate: tuple[Any, ...], photons: np
             "photons": (
                 (first, "channel", "row", "column"),
                 photons,
-                {"long_name": "expected photons per pixel and frame"},
+                {"units": "photons", "long_name": "expected photons per pixel and frame"},
             )
         },
         coords={
             first: coordinate,
-            "channel": [c.key for c in path.channels],
-            "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x"}),
-            "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y"}),
+            "channel": ("channel", [c.key for c in path.channels], {"long_name": "camera and side of the area CCD"}),
+            "x": ("column", path.axis(1), {"units": "m", "long_name": "detector x, along which columns count"}),
+            "y": ("row", path.axis(0), {"units": "m", "long_name": "detector y, along which rows count"}),
+            "wavelength": ((), path.wavelength, _WAVELENGTH),
         },
         attrs={
+            "title": "expected images of the monitor's area CCDs",
             "wavelength_m": path.wavelength,
             "pitch_m": path.pitch,
             "reference_frames": frames_text("course" if first == "time" else "irradiance"),

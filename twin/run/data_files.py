@@ -10,24 +10,11 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
-
-if TYPE_CHECKING:
-    import xarray as xr
-
-
-def netcdf(data: xr.Dataset) -> bytes:
-    """A data set as the contents of a netCDF-4 file; the same data give the same bytes."""
-    view = data.to_netcdf(engine="h5netcdf")
-    content = bytes(view)
-    # xarray hands out a window on its buffer, which complains when it is thrown away with the window still open
-    if isinstance(view, memoryview):
-        view.release()
-    return content
 
 
 def csv_table(rows: Iterable[Sequence[Any]]) -> bytes:

@@ -175,6 +175,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         },
         "study": {"truth, recovered": f"{_CAMERA}; {_ANGLE}", "responses": "as in the base's file that the key names"},
         "compare": {"numbers, arrays": "as in the compared files, each of which states its own"},
+        "files": {
+            "images/*.fits, expected_photons.fits": "row 0 is the first row stored (NAXIS2 = 1), column 0 the first "
+            "pixel of a row, (0, 0) the centre of the first pixel; columns along detector x, rows along y",
+            "tables": "as in the file of the run that the table was made of, which states its own",
+        },
         "gradient": {"responses": f"{_CAMERA}; {_ANGLE}", "factors": "motions in the moved body's own nominal axes"},
     }
 )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import io
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +10,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from twin.run.data_files import csv_table, netcdf
+from twin.run.data_files import csv_table
+from twin.run.data_table import TABLE_FORMATS, DataColumn, DataTable, MissingPackage
+from twin.run.netcdf_file import netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import MANIFEST
 from twin.study.runs.block_result import BlockResult
@@ -44,16 +44,21 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         key = "; ".join([" = ".join(_path(place) for place in factor.places)] * bool(factor.places) + scaled)
         values = column.values.astype(object) if column.values.dtype.kind == "U" else column.values
         values = values.astype(np.int8) if values.dtype.kind == "b" else values
-        data[column.name] = (RUN, values, {"units": column.unit, ROLE: "factor", "key": key})
+        said = f"factor {column.name}, {key}"
+        data[column.name] = (RUN, values, {"units": column.unit, ROLE: "factor", "key": key, "long_name": said})
     for r, (name, response) in enumerate(study.responses.items()):
         minus = f" - {_path(response.minus)}" if response.minus is not None else ""
-        about = {"units": response.units, ROLE: "response", "key": f"{_path(response.key)}{minus}"}
+        key = f"{_path(response.key)}{minus}"
+        about = {"units": response.units, ROLE: "response", "key": key, "long_name": f"response {name}, {key}"}
         data[name] = (RUN, result.values[:, r], about)
         if response.sigma is not None:
             about = {"units": response.units, ROLE: "sigma", "key": _path(response.sigma), "of": name}
+            about["long_name"] = f"standard deviation of {name}"
             data[f"{name}_sigma"] = (RUN, result.sigmas[:, r], about)
-    data[FAILED] = (RUN, result.failed.astype(np.int8), {"units": "", ROLE: "bookkeeping", "long_name": "1: failed"})
-    data[MESSAGE] = (RUN, np.array(result.messages, object), {"units": "", ROLE: "bookkeeping"})
+    flags: dict[str, Any] = {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "completed failed"}
+    kept = {"units": "", ROLE: "bookkeeping"}
+    data[FAILED] = (RUN, result.failed.astype(np.int8), {**kept, "long_name": "1: failed", **flags})
+    data[MESSAGE] = (RUN, np.array(result.messages, object), {**kept, "long_name": "why it failed"})
     if plan.seeds is not None:
         data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
     attributes = {
@@ -64,7 +69,8 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         "seed": study.design.seed,
         "reference_frames": frames_text("study"),
     }
-    return xr.Dataset(data, coords={RUN: (RUN, np.arange(plan.runs), {"units": ""})}, attrs=attributes)
+    numbered = (RUN, np.arange(plan.runs), {"units": "", "long_name": "number of the run"})
+    return xr.Dataset(data, coords={RUN: numbered}, attrs=attributes)
 
 
 def _path(key: tuple[str | int, ...]) -> str:
@@ -89,12 +95,16 @@ def _cells(values: np.ndarray) -> list[Any]:
 
 
 def parquet(data: xr.Dataset) -> bytes | None:
-    """The data set as a Parquet file; None when pyarrow is not installed."""
-    if importlib.util.find_spec("pyarrow") is None:
+    """The data set as a Parquet file with units and descriptions; None when pyarrow is not installed."""
+    columns = []
+    for name in (RUN, *map(str, data.data_vars)):
+        about = data[name].attrs
+        columns.append(DataColumn(name, data[name].values, about.get("units", ""), about["long_name"]))
+    title, frames = str(data.attrs["title"]), str(data.attrs["reference_frames"])
+    try:
+        return TABLE_FORMATS["parquet"](DataTable("study", title, tuple(columns), {"reference_frames": frames}))
+    except MissingPackage:
         return None
-    out = io.BytesIO()
-    data.to_dataframe().reset_index().to_parquet(out, index=False, engine="pyarrow")
-    return out.getvalue()
 
 
 FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": netcdf, "csv": table, "parquet": parquet}

@@ -152,21 +152,38 @@ class TargetPath:
         Raises:
             BeamMissedError: a chief ray does not reach the line CCD.
         """
-        rays = self.rays(state, directions, np.zeros((1, 2)))
+        # a chief ray that a mirror in the middle of the beam stops is still the beam's middle
+        rays = self.rays(state, directions, np.zeros((1, 2)), edges=False)
         return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
 
-    def rays(self, state: State, directions: np.ndarray, points: np.ndarray) -> LineRays:
+    def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
         """Rays of beams of directions (F, 3), world, through points (N, 2) of the stop in units of its radius.
+
+        Args:
+            state: of the assembly.
+            directions: of the light.
+            points: of the stop.
+            edges: whether edges of the camera's surfaces stop rays.
 
         Raises:
             AimError: a beam does not reach the stop.
             BeamMissedError: nothing of one reaches the line CCD.
         """
-        systems, to_stop = self._systems(state, len(directions))
+        placed = self.assembly.place([state])
+        systems, to_stop = self._systems(state, len(directions), placed)
         target = self.stop.radius * points + np.array(self.stop.centre)
         launch, _ = aim_collimated(self.backend, to_stop, directions, self._launch(directions), target)
-        traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]))
+        cut = {name: self.model.mirrors.index(name) for name in (self.model.edges if edges else ())}
+        kept = tuple(cut.values())
+        traced = trace(self.backend, systems, make_rays(self.backend, launch, directions[:, None]), keep=kept)
         position, leaving, path, valid = traced.numpy()
+        if cut:
+
+            def met(name: str) -> np.ndarray:
+                size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
+                return np.asarray(traced.hit(cut[name]) / size)
+
+            valid = valid & self.model.uncut(met)
         require_some(valid, "the imaging path")
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
 
@@ -187,6 +204,8 @@ class TargetPath:
             BeamMissedError, AimError: the beam does not get through.
             ValueError: it is vignetted.
         """
+        if self.model.edges:
+            raise ValueError("a pupil that edges of surfaces cut is no smooth function: such a camera has no MTF here")
         placed = self.assembly.place([state])
         systems, to_stop = self._systems(state, len(directions), placed)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)

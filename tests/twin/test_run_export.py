@@ -1,0 +1,443 @@
+"""python -m twin.export: frames as FITS that twin.recover reads, tables with units, from run folders of any command."""
+
+import hashlib
+import io
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+from astropy import units
+from astropy.io import fits
+
+from analysis.images.image_file import ImageFile
+from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.resolved import ResolvedJob, resolve
+from scenes.specs.study import UNITS
+from tests.twin.commands import files, invoke
+from tests.twin.study_bench import ROOT
+from twin.export.__main__ import app
+from twin.export.fits_frames import RecordedFrames, expected_fits, frames_fits, read_frames
+from twin.export.result_tables import DESCRIPTIONS, NESTED, result_tables
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_files import write_data
+from twin.main_job.render_job import render_job
+from twin.recover.recover_report import recover_numbers
+from twin.recover.recover_run import run_recover
+from twin.run.data_files import FrameFacts, MapPlace, csv_table, tiff
+from twin.run.data_table import FITS_UNITS, TABLE_FORMATS, DataColumn, DataTable, MissingPackage, ascii_text
+from twin.run.run_folder import RunFolder, write_manifest
+
+JOB = ROOT / "tests/golden/jobs/perturb.yaml"
+SEED, FRAMES = 5, 3
+STRUCTURE = {"SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "NAXIS3", "EXTEND", "BSCALE", "BZERO", "COMMENT"}
+"""Cards that FITS itself asks for."""
+
+
+@pytest.fixture(scope="module")
+def job(backend):
+    return render_job(resolve(JOB), backend, FRAMES, SEED)
+
+
+@pytest.fixture(scope="module")
+def run(job, tmp_path_factory) -> Path:
+    """A run folder as the main job writes it, with its points as a pass would have them."""
+    folder = tmp_path_factory.mktemp("runs") / "first"
+    points = [["sort", "point", "line", "height_m", "status"], ["tie", 0, 3.5, 120.25, ""], ["tie", 1, "", 7.0, "dark"]]
+    with RunFolder(folder) as target:
+        write_data(job, target)
+        target.write_bytes("artefacts/points.csv", csv_table(points))
+        write_manifest(target, "twin.render", 0.0, 1.0, seed=SEED)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def exported(run, tmp_path_factory) -> dict[str, Path]:
+    """Format of tables -> folder of an export."""
+    place = tmp_path_factory.mktemp("exports")
+    for tables in TABLE_FORMATS:
+        frames = "fits" if tables == "fits" else "none"
+        done = invoke(app, run, "--tables", tables, "--frames", frames, "--out", place / tables, "--quiet")
+        assert done.exit_code == 0, done.output
+    return {tables: place / tables for tables in TABLE_FORMATS}
+
+
+# --- frames ----------------------------------------------------------------------------------------------
+
+
+def test_exported_frames_give_the_same_readings_to_the_bit(job, exported, backend, tmp_path) -> None:
+    file = tmp_path / "measurement.yaml"
+    file.write_text(f"instrument: gf7_pair\ndisturbances: orbit\nframes: {exported['fits'] / 'images'}\n")
+    found = run_recover(resolve_measurement(file), backend, experiment=job.experiment)
+    expected = stated(job.recovered_dict())
+    numbers = recover_numbers(found)
+    assert {key: numbers[key] for key in expected} == expected
+    assert found.last.recovered_dict() == job.recovered_dict()
+
+
+def test_every_card_of_every_file_of_frames_is_what_the_run_says(job, run, exported) -> None:
+    """No card beyond those that are checked here, each with a comment, and the unit in it where it has one."""
+    resolved: ResolvedJob = job.resolved
+    detector, ccd = resolved.detector, resolved.instrument.monitor.area_ccd
+    seen = 0
+    for i, channel in enumerate(job.experiment.path.channels):
+        for when, frames in (("before", job.before[i]), ("after", job.after[i])):
+            path = exported["fits"] / f"images/{channel.camera}_{channel.side}_{when}.fits"
+            with fits.open(path, checksum=True) as file:
+                file.verify("exception")
+                header = file[0].header
+                assert len(file) == 1
+                np.testing.assert_array_equal(file[0].data, frames)
+                assert file[0].data.dtype == np.uint16
+            expected = {
+                "BUNIT": ("adu", ""),
+                "NFRAMES": (FRAMES, ""),
+                "AXIS1": ("column", ""),
+                "AXIS2": ("row", ""),
+                "AXIS3": ("frame", ""),
+                "CAMERA": (f"{channel.camera}, {channel.side} area CCD", ""),
+                "NOTE": ("nominal" if when == "before" else "perturbed", ""),
+                "XPIXSZ": (1e6 * ccd.pitch, "um"),
+                "YPIXSZ": (1e6 * ccd.pitch, "um"),
+                "EXPTIME": (ccd.exposure, "s"),
+                "INSTRUME": ("gf7_pair", ""),
+                "DETECTOR": (detector.name, ""),
+                "WAVELEN": (resolved.instrument.monitor.wavelength, "m"),
+                "GAIN": (1.0 / detector.system_gain_dn_per_e, "electron/adu"),
+                "QE": (detector.quantum_efficiency, "electron/photon"),
+                "RDNOISE": (detector.dark_noise_e, "electron"),
+                "DARKCUR": (detector.dark_current_e_per_s, "electron/s"),
+                "FULLWELL": (detector.full_well_e, "electron"),
+                "SATURATE": (detector.saturation_dn, "adu"),
+                "PEDESTAL": (detector.offset_dn, "adu"),
+                "BITDEPTH": (detector.bit_depth, "bit"),
+                "PRNU": (detector.prnu, "1"),
+                "DSNU": (detector.dsnu_e, "electron"),
+                "PROGRAM": ("twin.render", ""),
+                "SEED": (SEED, ""),
+            }
+            own = set(header) - STRUCTURE - {"CREATOR", "CHECKSUM", "DATASUM"}
+            assert own == set(expected)
+            assert header["CREATOR"].startswith("space-camera-twin ")
+            assert (header["NAXIS1"], header["NAXIS2"], header["NAXIS3"]) == (ccd.columns, ccd.rows, FRAMES)
+            for keyword, (value, unit) in expected.items():
+                found = header[keyword]
+                assert found == (pytest.approx(value, rel=1e-14) if isinstance(value, float) else value), keyword
+                comment = header.comments[keyword]
+                assert comment
+                assert comment.startswith(f"[{unit}] ") == bool(unit), keyword
+                if unit and unit != "1":
+                    # electrons are the one unit that FITS has no word for
+                    units.Unit(unit.replace("electron", "count"), format="fits")
+            seen += 1
+    assert seen == 8
+    assert not any(keyword.startswith(("CTYPE", "CRVAL", "CRPIX", "CD1_", "PC1_")) for keyword in header)
+    # light that the header tells is the light that was rendered: grey values without signal lie at the pedestal
+    corner = float(np.mean(job.before[0][:, :4, :4]))
+    assert abs(corner - header["PEDESTAL"]) < 3.0 * header["RDNOISE"] / header["GAIN"]
+
+
+def test_expected_images_are_those_of_the_run(run, exported) -> None:
+    with (
+        xr.open_dataset(run / "irradiance.nc", engine="h5netcdf") as data,
+        fits.open(exported["fits"] / "expected_photons.fits", checksum=True) as file,
+    ):
+        file.verify("exception")
+        assert len(file) == 1 + data.sizes["channel"]
+        for k, channel in enumerate(data["channel"].values):
+            unit = file[f"{channel} photons"]
+            np.testing.assert_array_equal(unit.data, data["photons"].values[:, k])
+            assert unit.header["BUNIT"] == "photon"
+            assert [unit.header["STATE1"], unit.header["STATE2"]] == ["before", "after"]
+            assert unit.header["XPIXSZ"] == pytest.approx(1e6 * data.attrs["pitch_m"], rel=1e-12)
+        assert file[0].header["WAVELEN"] == data.attrs["wavelength_m"]
+
+
+def test_times_maps_and_heights_say_where_and_when_they_are(tmp_path) -> None:
+    shape = (2, 5, 4)
+    frames = np.arange(math.prod(shape), dtype=np.uint16).reshape(shape)
+    facts = FrameFacts("forward, left area CCD", 5.5e-6, 0.01, (0.0, 720.0), "a course")
+    (tmp_path / "a.tiff").write_bytes(tiff(frames, facts))
+    recorded = read_frames(tmp_path / "a.tiff")
+    content = frames_fits(recorded, [])
+    assert content == frames_fits(recorded, [])  # no time of the day
+    with fits.open(io.BytesIO(content)) as file:
+        assert file["FRAMES"].data["time"].tolist() == [0.0, 720.0]
+        assert file["FRAMES"].columns["time"].unit == "s"
+        assert file["FRAMES"].data["frame"].tolist() == [1, 2]
+        assert file[0].header["XPIXSZ"] == 5.5
+    for heights, dtype in ((True, np.float32), (False, np.uint16)):
+        place = MapPlace(116.0, 40.0, 2e-5, -1e-5, heights)
+        (tmp_path / "map.tiff").write_bytes(tiff(frames[:1].astype(dtype), FrameFacts(place=place, note="a map")))
+        with fits.open(io.BytesIO(frames_fits(read_frames(tmp_path / "map.tiff"), []))) as file:
+            header = file[0].header
+            assert [header[key] for key in ("LON0", "LAT0", "DLON", "DLAT")] == pytest.approx(
+                [116.0, 40.0, 2e-5, -1e-5], rel=1e-12
+            )
+            assert header.get("BUNIT") == ("m" if heights else None)
+            np.testing.assert_array_equal(file[0].data, frames[:1])
+    # a course's expected images have the times of their planes
+    data = xr.Dataset(
+        {"photons": (("time", "channel", "row", "column"), np.ones((2, 1, 5, 4)), {"long_name": "expected"})},
+        {"time": [0.0, 720.0], "channel": ["forward/left"]},
+        {"pitch_m": 5e-6},
+    )
+    with fits.open(io.BytesIO(expected_fits(data, []))) as file:
+        assert file["TIMES"].data["time"].tolist() == [0.0, 720.0]
+        assert file[1].header["AXIS3"] == "time"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int16, np.int32, np.float32, np.float64])
+def test_numbers_of_any_sort_stay_what_they_are(dtype, tmp_path) -> None:
+    ends = np.iinfo(dtype) if np.issubdtype(dtype, np.integer) else np.finfo(dtype)
+    frames = np.array([[[ends.min, 0, 1], [2, 3, ends.max]]], dtype)
+    path = tmp_path / "a.fits"
+    path.write_bytes(frames_fits(RecordedFrames(frames, ({"frame": 1},)), [("SEED", 2**63 - 1, "of all")]))
+    read = ImageFile.open(path).frames()
+    assert read.dtype == dtype
+    np.testing.assert_array_equal(read, frames)
+    assert fits.getheader(path)["SEED"] == 2**63 - 1
+
+
+# --- tables ----------------------------------------------------------------------------------------------
+
+
+def read_back(path: Path) -> dict[str, list]:
+    """Column -> values; None for none."""
+    if path.suffix == ".parquet":
+        parquet = pytest.importorskip("pyarrow.parquet")
+        return parquet.read_table(path).to_pydict()
+    with fits.open(path) as file:
+        file.verify("exception")
+        out = {name: file[1].data[name].tolist() for name in file[1].columns.names}
+    return {name: [None if isinstance(v, float) and math.isnan(v) else v for v in col] for name, col in out.items()}
+
+
+@pytest.mark.parametrize("tables", ["parquet", "fits"])
+def test_spots_and_readings_are_those_of_the_run(run, exported, tables) -> None:
+    if tables == "parquet":
+        pytest.importorskip("pyarrow")
+    found = json.loads((run / "recovered.json").read_text())
+    spots = read_back(exported[tables] / f"tables/spots.{tables}")
+    assert len(spots["row"]) == 8
+    for k in range(8):
+        own = found["spots"][spots["camera"][k]][spots["side"][k]][spots["state"][k]]
+        assert {name: spots[name][k] for name in own} == own
+    readings = read_back(exported[tables] / f"tables/readings.{tables}")
+    assert len(readings["camera"]) == sum(len(one) for one in found["cameras"].values())
+    for k, camera in enumerate(readings["camera"]):
+        own = found["cameras"][camera][readings["estimator"][k]]
+        assert {name: readings[name][k] for name in own} == own
+    truth = json.loads((run / "truth.json").read_text())["cameras"]
+    true = read_back(exported[tables] / f"tables/true_changes.{tables}")
+    assert true["d_f_um"] == [truth[camera]["d_f_um"] for camera in true["camera"]]
+    points = read_back(exported[tables] / f"tables/points.{tables}")
+    assert points["line"] == [3.5, None]
+    assert points["point"] == [0, 1]
+
+
+def leaves(data, key=""):
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    for name, value in items:
+        below = f"{key}[{name}]" if isinstance(data, list) else f"{key}.{name}" if key else name
+        if isinstance(value, dict | list):
+            yield from leaves(value, below)
+        else:
+            yield below, value
+
+
+def test_every_number_of_the_run_is_in_the_table_once(run) -> None:
+    manifest = json.loads((run / "manifest.json").read_text())["sha256"]
+    numbers = result_tables(run, list(manifest))[0]
+    columns = {column.name: column.plain for column in numbers.columns}
+    rows = list(zip(columns["file"], columns["key"], strict=True))
+    assert len(set(rows)) == len(rows)
+    values = dict(zip(rows, zip(columns["value"], columns["sigma"], columns["unit"], strict=True), strict=True))
+    count = 0
+    for name in manifest:
+        if name.endswith(".json"):
+            data = json.loads((run / name).read_text())
+            for key, value in leaves({k: v for k, v in data.items() if k not in ("schema", "reference_frames")}):
+                if (name, key) in values:
+                    assert values[name, key][0] == (None if isinstance(value, str | None) else value), key
+                else:  # a sigma stands beside its number
+                    assert values[name, key.removesuffix("_sigma")][1] == value
+                count += 1
+    assert count > 1000
+    number = values["recovered.json", "cameras.forward.model.d_f_um"]
+    assert number[2] == "um"
+    assert number[1] > 0.0
+
+
+@pytest.mark.parametrize("tables", ["parquet", "fits", "csv"])
+def test_every_column_says_its_unit_and_what_it_holds(exported, tables) -> None:
+    listed = json.loads((exported[tables] / "files.json").read_text())["columns"]
+    assert {"numbers", "spots", "readings", "angle_readings", "ground_readings", "true_changes", "points"} <= set(
+        listed
+    )
+    for name, columns in listed.items():
+        path = exported[tables] / f"tables/{name}.{tables}"
+        for k, (column, said) in enumerate(columns.items()):
+            assert said["description"]
+            if tables == "parquet":
+                schema = pytest.importorskip("pyarrow.parquet").read_schema(path)
+                assert schema.names == list(columns)
+                about = schema.field(column).metadata
+                assert about == {b"unit": said["unit"].encode(), b"description": said["description"].encode()}
+                assert schema.metadata[b"title"]
+            elif tables == "fits":
+                header = fits.getheader(path, 1)
+                assert header[f"TTYPE{k + 1}"] == ascii_text(column)
+                assert header.get(f"TUNIT{k + 1}", "") == FITS_UNITS.get(said["unit"], "")
+                assert header[f"TCOMM{k + 1}"].startswith(ascii_text(said["description"]))
+            else:
+                head = path.read_text("utf-8").splitlines()[0]
+                assert (f"{column} [{said['unit']}]" if said["unit"] else column) in head
+    assert listed["readings"]["d_f_um_sigma"]["unit"] == "um"
+    assert listed["spots"]["row"]["unit"] == "px"
+    # no column of the tables that are known by name is told by its name alone
+    for nested in NESTED:
+        assert not any("the run's own table" in one["description"] for one in listed[nested.name].values())
+
+
+def test_every_unit_has_a_spelling_in_fits_or_is_told_in_words() -> None:
+    for own, spelt in FITS_UNITS.items():
+        units.Unit(spelt, format="fits")
+        assert own in {*UNITS.values(), "1/m", "1/mm", "photons"}
+    for unit, text in DESCRIPTIONS.values():
+        assert unit in {"", *UNITS.values()}
+        assert len(text) > 10
+    table = DataTable("t", "a title", (DataColumn.of("error", [1.0, 2.0], "waves", "error of the wavefront"),))
+    with fits.open(io.BytesIO(TABLE_FORMATS["fits"](table))) as file:
+        assert "TUNIT1" not in file[1].header
+        assert file[1].header["TCOMM1"] == "error of the wavefront [waves]"
+
+
+@pytest.mark.parametrize("form", TABLE_FORMATS)
+def test_nasty_values_come_back(form, tmp_path) -> None:
+    """Whole numbers to their last digit, tiny and huge ones, nothing, words with signs and quotes."""
+    if form == "parquet":
+        pytest.importorskip("pyarrow")
+    texts = ['a, "b"', "Δα ± 3 µm", None]
+    table = DataTable(
+        "nasty",
+        "Δα of the χ² × 2",
+        (
+            DataColumn.of("whole", [2**63 - 1, -(2**63), 0], "", "whole numbers"),
+            DataColumn.of("beyond", [2**64, 1, None], "", "larger than 64 bits"),
+            DataColumn.of("real", [5e-324, -1.7976931348623157e308, None], "um", "numbers"),
+            DataColumn.of("text", texts, "", "words"),
+        ),
+        {"frame of Δα": "µm and °, " * 30},
+    )
+    content = TABLE_FORMATS[form](table)
+    assert content == TABLE_FORMATS[form](table)
+    path = tmp_path / f"nasty.{form}"
+    path.write_bytes(content)
+    if form == "csv":
+        rows = content.decode().splitlines()
+        assert rows[0] == "whole,beyond,real [um],text"
+        assert rows[1].startswith(f"{2**63 - 1},{2**64},5e-324,")
+        return
+    found = read_back(path)
+    assert found["whole"] == [2**63 - 1, -(2**63), 0]
+    assert found["beyond"][:2] == [str(2**64), "1"]
+    assert found["real"] == [5e-324, -1.7976931348623157e308, None]
+    assert found["text"] == ([*texts[:2], None] if form == "parquet" else ['a, "b"', "d alpha +- 3 um", ""])
+
+
+def test_columns_that_make_no_table_are_refused() -> None:
+    one = DataColumn.of("a", [1.0], "", "one")
+    for columns in ((one, one), (one, DataColumn.of("b", [1.0, 2.0], "", "two"))):
+        with pytest.raises(ValueError, match="columns of one length with different names"):
+            DataTable("t", "a title", columns)
+    assert one.unit == ""
+    with pytest.raises(KeyError):
+        DataTable("t", "a title", (one,)).column("b")
+
+
+def test_without_pyarrow_parquet_is_refused_with_what_to_do(run, tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(MissingPackage):
+        TABLE_FORMATS["parquet"](DataTable("t", "t", (DataColumn.of("a", [1], "", "one"),)))
+    done = invoke(app, run, "--tables", "parquet", "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "pip install -e .[parquet]" in done.stderr
+    assert files(tmp_path) == set()
+
+
+# --- the command -----------------------------------------------------------------------------------------
+
+
+def test_the_folder_is_a_run_folder_and_names_all_its_files(run, exported) -> None:
+    for tables, folder in exported.items():
+        manifest = json.loads((folder / "manifest.json").read_text())
+        for name, checksum in manifest["sha256"].items():
+            assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == checksum
+        found = json.loads((folder / "files.json").read_text())
+        assert found["schema"] == "files 2"
+        assert found["of"] == "twin.render"
+        named = {one["file"] for one in found["files"]}
+        assert named == {name for name in files(folder) if name.startswith(("images/", "tables/", "expected"))}
+        for one in found["files"]:
+            assert (folder / one["file"]).stat().st_size == one["bytes"]
+        assert "read back" in found["verdict"] if tables == "fits" else "rows as" in found["verdict"]
+        assert "Columns" in (folder / "report.html").read_text("utf-8")
+
+
+def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    picture = copy / "images/forward_left_after.tiff"
+    frames = tifffile.imread(picture)
+    picture.write_bytes(tiff(frames + np.uint16(1), replace(FrameFacts(), camera="forward, left area CCD")))
+    done = invoke(app, copy, "--tables", "none", "--out", tmp_path / "out")
+    assert done.exit_code == 0
+    assert "images/forward_left_after.tiff is not as its run wrote it" in " ".join(done.stdout.split())
+    np.testing.assert_array_equal(fits.getdata(tmp_path / "out/images/forward_left_after.fits"), frames + 1)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "options", "said"),
+    [
+        (lambda run: shutil.rmtree(run), (), "no such folder"),
+        (lambda run: (run / "manifest.json").unlink(), (), "not a run folder"),
+        (lambda run: (run / "truth.json").unlink(), (), "truth.json: file of the run is missing"),
+        (lambda run: (run / "truth.json").write_text('{"cameras": '), (), "cannot be read as a file of a run"),
+        (lambda run: (run / "truth.json").write_bytes(b"\xff\xfe"), (), "cannot be read as a file of a run"),
+        (lambda run: (run / "artefacts/points.csv").write_text("a,b\n1\n"), (), "rows of several lengths"),
+        (
+            lambda run: (run / "images/forward_left_after.tiff").write_bytes(b"II*\0"),
+            (),
+            "forward_left_after.tiff: cannot",
+        ),
+        (lambda run: (run / "irradiance.nc").write_bytes(b"CDF"), (), "irradiance.nc: cannot be read"),
+        (lambda run: None, ("--tables", "parket"), "did you mean 'parquet'"),
+        (lambda run: None, ("--frames", "tiff"), "--frames: no such format"),
+        (lambda run: None, ("--frames", "none", "--tables", "none"), "nothing to export"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused(run, tmp_path, spoil, options, said) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    spoil(copy)
+    done = invoke(app, copy, *options, "--out", tmp_path / "out")
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.stderr.split())
+    assert not (tmp_path / "out").exists()
+    assert not list(tmp_path.glob(".out*"))
+
+
+def test_a_run_without_what_is_asked_for_is_told(tmp_path) -> None:
+    with RunFolder(tmp_path / "empty") as folder:
+        folder.write_text("note.txt", "nothing")
+        write_manifest(folder, "twin.lab", 0.0, 1.0, test="focus")
+    done = invoke(app, tmp_path / "empty", "--out", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "nothing to export of this run" in done.stderr
+    assert "twin.lab focus" in done.stderr

@@ -1,0 +1,88 @@
+"""``python -m twin.export``: frames and tables of a run folder in formats of other programs."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenes.yaml.errors import nearest
+from scenes.yaml.yaml_file import dump_yaml
+from twin.run.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
+from twin.run.command import Result, Session, print_report, run_command
+from twin.run.reference_frames import described
+from twin.run.run_folder import Manifest
+
+PROGRAM = "twin.export"
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    run: Annotated[Path, typer.Argument(readable=False, help="Run folder of any command.")],
+    frames: Annotated[str, typer.Option(help="Recorded frames and expected images: fits or none.")] = "fits",
+    tables: Annotated[str, typer.Option(help="Tables: csv, parquet, fits or none.")] = "csv",
+    out: Out = None,
+    force: Force = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write frames and results of a run folder as files that other programs read: FITS, CSV and Parquet.
+
+    Frames become FITS cubes, images/NAME.fits, whose headers name every quantity with its unit (pixel pitch, exposure,
+    gain, noise, saturation) and hold no world coordinates; expected images become expected_photons.fits.
+    `python -m twin.recover` reads the frames and finds the same numbers as in the run's own.
+
+    Tables stand in tables/: spots, readings by camera and estimator, true changes, matched points, every table of the
+    run, and numbers, with every number of its JSON files. Every column has its unit and says what it holds: in the head
+    of CSV, in the metadata of Parquet's fields, as TUNITn and TCOMMn of FITS.
+
+    For example:
+
+        python -m twin.export runs/perturb-001 --tables parquet --out perturb-files
+
+    The folder also gets files.json, which lists files and columns, and a report.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """
+
+    def read() -> Manifest:
+        from twin.export.export_run import FRAMES, NONE, read_source
+        from twin.run.data_table import TABLE_FORMATS
+
+        for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
+            if value not in allowed:
+                near = nearest(value, allowed)
+                meant = f"; did you mean {near!r}?" if near else ";"
+                raise InputErrorText(f"{option}: no such format, {value!r}{meant} allowed: {', '.join(allowed)}")
+        if frames == tables == NONE:
+            raise InputErrorText("with --frames none and --tables none there is nothing to export")
+        return read_source(run)
+
+    def work(manifest: Manifest, session: Session) -> Result:
+        from twin.export.export_run import KIND, export, export_report
+        from twin.run.page import RunFacts, write_test
+
+        done = export(run, manifest, frames, tables, session.folder, session.advance)
+        report = export_report(done)
+        found = {**done.numbers(), "verdict": report.verdict}
+        chosen = ["--frames", frames, "--tables", tables]
+        again = " ".join(["python -m", PROGRAM, str(run), *chosen, "--out again"])
+        config = dump_yaml({"run": str(run), "frames": frames, "tables": tables})
+        facts = RunFacts(config, "", "", None, session.started, session.seconds, PROGRAM, "", again=again)
+        write_test(KIND, found, report, facts, session.folder)
+        return Result(described(KIND, found), lambda console: print_report(report, console))
+
+    stem = f"{run.resolve().name}-files"
+    run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work)
+
+
+if __name__ == "__main__":
+    app()

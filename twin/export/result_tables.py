@@ -1,0 +1,303 @@
+"""Tables of a run's results: spots, readings and truth by camera, matched points, every number of its JSON files, and
+every table that the run itself keeps as CSV; each column with its unit and what it holds.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.study import unit_of
+from twin.run.data_table import DataColumn, DataTable
+from twin.run.run_folder import MANIFEST
+
+__all__ = ["NUMBERS", "result_tables"]
+
+POINTS = "artefacts/points.csv"
+NUMBERS = "numbers"
+"""Table of every number of the run."""
+_HEADS = ("schema", "reference_frames")
+_OTHER_FILES = (MANIFEST, "study_state.json")
+_HEAD = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]+)\]")
+
+
+@dataclass(frozen=True)
+class Nested:
+    """A table within a JSON file: mappings by name, one within the other, and at the bottom numbers.
+
+    Attributes:
+        name: of the table.
+        file: of the run folder.
+        key: where the mappings begin.
+        levels: what the names of each mapping are.
+        title: of the table.
+    """
+
+    name: str
+    file: str
+    key: str
+    levels: tuple[str, ...]
+    title: str
+
+
+NESTED = (
+    Nested("spots", "recovered.json", "spots", ("camera", "side", "state"), "Centres of the spots in the frames"),
+    Nested("readings", "recovered.json", "cameras", ("camera", "estimator"), "What every estimator reads of a camera"),
+    Nested(
+        "angle_readings",
+        "recovered.json",
+        "intersection_angle",
+        ("estimator",),
+        "What every estimator reads of the angle between two cameras",
+    ),
+    Nested(
+        "ground_readings",
+        "recovered.json",
+        "ground",
+        ("estimator",),
+        "What every estimator reads of errors on the ground",
+    ),
+    Nested("true_changes", "truth.json", "cameras", ("camera",), "True changes of the cameras, by the exact trace"),
+)
+"""Tables that runs keep within a file; a new one is added here."""
+
+DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
+    {
+        "camera": ("", "name of the camera in the instrument"),
+        "side": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
+        "state": ("", "before the disturbance or after it"),
+        "estimator": ("", "by which the number is read"),
+        "row": ("px", "row of the spot's centre on the area CCD; 0 is the centre of the first"),
+        "column": ("px", "column of the spot's centre on the area CCD; 0 is the centre of the first"),
+        "sigma_row": ("px", "standard deviation of row"),
+        "sigma_column": ("px", "standard deviation of column"),
+        "d_alpha_arcsec": ("arcsec", "turn of the camera about its Y, right-handed, perturbed minus nominal"),
+        "d_beta_arcsec": ("arcsec", "turn of the camera about its X, right-handed, perturbed minus nominal"),
+        "d_gamma_arcsec": ("arcsec", "turn of the camera about its Z, the line of sight, perturbed minus nominal"),
+        "d_f_um": ("um", "change of the principal distance, in pixels of the line CCD, longer positive"),
+        "principal_distance_mm": ("mm", "principal distance of the nominal camera"),
+        "change_arcsec": ("arcsec", "change of the angle between the cameras' lines of sight, opening positive"),
+        "along_m": ("m", "error on the ground along the track"),
+        "across_m": ("m", "error on the ground across the track, to the right"),
+        "height_m": ("m", "error in height, up"),
+        "left_plan_rms_m": ("m", "rms error in plan that is left when the reading is corrected for"),
+        "left_height_rms_m": ("m", "rms error in height that is left when the reading is corrected for"),
+        "sort": ("", "what the point was chosen for: control by the map, tie between the lines"),
+        "point": ("", "number of the point within its sort"),
+        "line_name": ("", "line CCD in whose image it is"),
+        "longitude_deg": ("deg", "longitude of the ground point on WGS 84, east positive"),
+        "latitude_deg": ("deg", "geodetic latitude of the ground point on WGS 84"),
+        "x_itrs_m": ("m", "X of the ground point, ITRS"),
+        "y_itrs_m": ("m", "Y of the ground point, ITRS"),
+        "z_itrs_m": ("m", "Z of the ground point, ITRS"),
+        "predicted_line": ("px", "line at which camera and platform have the point"),
+        "predicted_pixel": ("px", "pixel at which camera and platform have the point"),
+        "line": (
+            "px",
+            "line at which it was found; 0 is the centre of the pass's first, an image file may begin later",
+        ),
+        "pixel": ("px", "pixel of the line CCD at which it was found; 0 is the centre of the first"),
+        "sigma_line_px": ("px", "standard deviation of line"),
+        "sigma_pixel_px": ("px", "standard deviation of pixel"),
+        "correlation_of_sigmas": ("", "correlation of the errors of line and pixel"),
+        "template_correlation": ("", "correlation of the two windows after matching"),
+        "accepted": ("", "1: matched and in agreement with the others"),
+        "status": ("", "empty where it is accepted, else why it is not"),
+    }
+)
+"""Column -> unit and what it holds; other columns say both in their own names."""
+TITLES: Mapping[str, str] = FrozenMap({POINTS: "Points measured in the images", "study.csv": "Every run of the study"})
+"""File of a table that the run keeps -> what it is; others are known by their file."""
+_POINT_HEIGHT = ("m", "height of the ground point above the ellipsoid of WGS 84")
+_SIGMAS = {
+    "_sigma": "standard deviation of {}, by noise and by what is stated to move",
+    "_sigma_noise": "standard deviation of {}, by the noise of the images alone",
+}
+
+
+def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
+    """All tables of a run.
+
+    Args:
+        folder: of the run.
+        files: of it, relative to it, as its manifest lists them.
+
+    Raises:
+        ValueError: a JSON or CSV file is not what runs write.
+    """
+    data = {
+        name: json.loads((folder / name).read_text("utf-8"))
+        for name in files
+        if name.endswith(".json") and name not in _OTHER_FILES
+    }
+    tables = [numbers] if (numbers := _numbers(data)) is not None else []
+    tables += [table for nested in NESTED if (table := _nested(nested, data.get(nested.file, {}))) is not None]
+    taken = {table.name for table in tables}
+    for name in files:
+        if name.endswith(".csv"):
+            stem = Path(name).stem
+            own = stem if stem not in taken else f"{stem}_table"
+            taken.add(own)
+            table = _kept(own, name, (folder / name).read_text("utf-8"), _told_names(folder, name, files))
+            tables += [table] if table is not None else []
+    return tables
+
+
+def _frames_of(data: Any) -> dict[str, str]:
+    """What a file says that its numbers refer to."""
+    frames = data.get("reference_frames", {}) if isinstance(data, Mapping) else {}
+    return {f"frame of {quantity}": str(text) for quantity, text in frames.items()}
+
+
+# --- numbers ---------------------------------------------------------------------------------------------
+
+
+def _numbers(data: Mapping[str, Any]) -> DataTable | None:
+    """Every number and word of the JSON files, with its key and sigma."""
+    rows: list[tuple[str, str, float | None, float | None, str, str | None]] = []
+    for file, content in data.items():
+        for key, sigma, value in _leaves(content):
+            last = tuple(part for part in re.split(r"[.\[\]]", key) if part and not part.isdigit())
+            number = float(value) if isinstance(value, bool | int | float) else None
+            text = None if isinstance(value, int | float) and not isinstance(value, bool) else json.dumps(value)
+            text = value if isinstance(value, str) else text
+            rows.append((file, key, number, sigma, unit_of(last[-1:]) if number is not None else "", text))
+    if not rows:
+        return None
+    names = ("file", "key", "value", "sigma", "unit", "text")
+    told = (
+        "file of the run folder",
+        "key in the file, from the outermost in; [k] is the k-th of a list",
+        "number, in the unit of its row; of true and false 1 and 0",
+        "standard deviation that the file states beside it (key_sigma), in the same unit",
+        "unit of the number, as its key says; empty for pure numbers",
+        "words, true, false and null",
+    )
+    columns = zip(names, zip(*rows, strict=True), told, strict=True)
+    return DataTable(
+        NUMBERS,
+        "Every number of the run's JSON files",
+        tuple(_typed(name, list(values), about, name in ("value", "sigma")) for name, values, about in columns),
+    )
+
+
+def _typed(name: str, values: list[Any], about: str, numbers: bool) -> DataColumn:
+    if numbers and all(value is None for value in values):
+        values = [float("nan")] * len(values)
+    return DataColumn.of(name, values, "", about)
+
+
+def _leaves(data: Any, key: str = "") -> Iterator[tuple[str, float | None, Any]]:
+    """(key, sigma, value) of everything in nested data; a sigma beside its number is no row of its own."""
+    if isinstance(data, Mapping):
+        for name, value in data.items():
+            number = name.removesuffix("_sigma")
+            beside = number != name and _is_number(data.get(number)) and _is_number(value)
+            if (key or name not in _HEADS) and not beside:
+                sigma: Any = data.get(f"{name}_sigma")
+                below = f"{key}.{name}" if key else str(name)
+                if _is_number(value):
+                    yield below, float(sigma) if _is_number(sigma) else None, value
+                else:
+                    yield from _leaves(value, below)
+    elif isinstance(data, list):
+        for k, value in enumerate(data):
+            yield from _leaves(value, f"{key}[{k}]")
+    else:
+        yield key, None, data
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+# --- tables within a file --------------------------------------------------------------------------------
+
+
+def _nested(nested: Nested, content: Mapping[str, Any]) -> DataTable | None:
+    rows = list(_rows(content.get(nested.key), len(nested.levels)))
+    if not rows:
+        return None
+    names = list(dict.fromkeys(name for _, found in rows for name in found))
+    columns = [_column(level, [path[k] for path, _ in rows]) for k, level in enumerate(nested.levels)]
+    columns += [_column(name, [found.get(name) for _, found in rows]) for name in names]
+    return DataTable(nested.name, nested.title, tuple(columns), {"file": nested.file, **_frames_of(content)})
+
+
+def _rows(data: Any, depth: int, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
+    """(names, numbers) at the bottom of mappings."""
+    if not isinstance(data, Mapping):
+        return
+    if depth == 0:
+        yield above, {name: value for name, value in data.items() if not isinstance(value, Mapping | list)}
+        return
+    for name, below in data.items():
+        yield from _rows(below, depth - 1, (*above, str(name)))
+
+
+def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenMap()) -> DataColumn:
+    """A column with the unit and the description that its name has."""
+    head = _HEAD.fullmatch(name)
+    own, unit = (head["name"], head["unit"]) if head is not None else (name, "")
+    if own in named:
+        return DataColumn.of(own, values, unit, named[own])
+    if own in DESCRIPTIONS and not unit:
+        return DataColumn.of(own, values, *DESCRIPTIONS[own])
+    for ending, text in _SIGMAS.items():
+        base = own.removesuffix(ending)
+        if base != own and base in DESCRIPTIONS:
+            return DataColumn.of(own, values, DESCRIPTIONS[base][0], text.format(base))
+    return DataColumn.of(own, values, unit or unit_of((own,)), f"column {own!r} of the run's own table")
+
+
+# --- tables that the run keeps ---------------------------------------------------------------------------
+
+
+def _kept(name: str, file: str, text: str, named: Mapping[str, str]) -> DataTable | None:
+    """A CSV file of the run; None for one without rows."""
+    heads, *rows = list(csv.reader(io.StringIO(text))) or [[]]
+    if not rows:
+        return None
+    if any(len(row) != len(heads) for row in rows):
+        raise ValueError(f"{file} has rows of several lengths")
+    columns: list[DataColumn] = []
+    for k, head in enumerate(heads):
+        one = _column(head, _cells([row[k] for row in rows]), named)
+        if file == POINTS and head == "height_m":
+            one = DataColumn.of(head, one.plain, *_POINT_HEIGHT)
+        columns.append(replace(one, name=_free(one.name, [other.name for other in columns])))
+    return DataTable(name, TITLES.get(file, f"{file} of the run"), tuple(columns), {"file": file})
+
+
+def _free(name: str, taken: Sequence[str]) -> str:
+    """The name, with a number behind it where others have it."""
+    names = (name, *(f"{name} ({k})" for k in range(2, len(taken) + 2)))
+    return next(one for one in names if one not in taken)
+
+
+def _cells(cells: Sequence[str]) -> list[Any]:
+    """Numbers, whole ones as such, where all that is there is one; else texts. An empty cell is None."""
+    for sort in (int, float):
+        try:
+            return [None if cell == "" else sort(cell) for cell in cells]
+        except ValueError:
+            continue
+    return [cell or None for cell in cells]
+
+
+def _told_names(folder: Path, name: str, files: Sequence[str]) -> dict[str, str]:
+    """Column -> what it holds, where the same table stands in a netCDF file beside it."""
+    beside = f"{name.removesuffix('.csv')}.nc"
+    if beside not in files:
+        return {}
+    with h5py.File(folder / beside) as data:
+        return {column: str(data[column].attrs["long_name"]) for column in data if "long_name" in data[column].attrs}
