@@ -216,16 +216,6 @@ def test_frames_of_another_noise_than_stated_are_told(bench):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["bad pixels", "cosmic rays", "background", "missing frames"])
-def test_sigmas_hold_with_a_learnt_shape(bench, kind):
-    """200 sets as well."""
-    found, told = squares(bench, (kind,), range(SETS), learnt=True)
-    low, high = (chi2.isf(p, 2 * SETS) for p in (1.0 - FALSE_ALARM / 2.0, FALSE_ALARM / 2.0))
-    assert low < found.sum() < high
-    assert all(spot.fits for spots in told for spot in spots)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["clean", *(kind for kind in KINDS if kind != "movement"), "all"])
 def test_corrected_estimates_hold_their_sigmas(bench, kind):
     """200 sets of frames of each kind, and of all together: chi-square within its limits, nothing refused."""
