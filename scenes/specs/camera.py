@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from optics.geometry.sag_terms import SagTerm
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
+from scenes.specs.baffle import SurfaceEdgeSpec
 from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import (
     AreaCcdChoiceSpec,
@@ -20,7 +21,6 @@ from scenes.specs.instrument import (
     check_made,
     reflector_kinds,
 )
-from scenes.specs.surface_edge import SurfaceEdgeSpec
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Radius, Vector, Vector2, Wavelength
 from scenes.yaml.sag_terms import SagTerms
