@@ -27,6 +27,7 @@ __all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
 DEAREST = 4.0
 """Times that sigma may grow by what is missing, before a spot counts as lost."""
 _REMEDIES = (
+    ("(saturation", "frames with less light or a shorter exposure"),
     (
         "too near the edge",
         "frames in which the spot stands 10 pixels or more inside; another crop, or a shifted window",
@@ -142,8 +143,10 @@ class ChannelMeasurement:
         """Compare frames with each other, and images with the shape of the spot; what is refused."""
         issues: list[Issue] = []
         for number, state in enumerate(self.channel.states):
+            burnt = ""
             try:
                 screened = self._screen(state)
+                burnt = "; ".join(found.text for found in screened.findings if found.kind == "saturation")
                 if self.shape is None:
                     screened, self.shape = self._learn(screened)
                 self._screened.append(screened)
@@ -151,13 +154,16 @@ class ChannelMeasurement:
             except FramesError as error:
                 issues.append(cannot_measure(self._test, state, self.channel.name, str(error), error.remedy))
             except SpotError as error:
-                issues.append(self._lost(state, error))
+                issues.append(self._lost(state, error, burnt))
             if issues and number == 0:
                 break
         return issues
 
-    def _lost(self, state: StateFrames, error: SpotError) -> Issue:
+    def _lost(self, state: StateFrames, error: SpotError, burnt: str = "") -> Issue:
+        """Why a spot cannot be measured; where pixels are saturated, that comes first."""
         reason = "; ".join(error.reasons.values())
+        if burnt:
+            reason = f"too much of the spot is missing (saturation: {burnt}): {reason}"
         return cannot_measure(self._test, state, self.channel.name, reason, remedy(reason))
 
     def _screen(self, state: StateFrames) -> ScreenedFrames:
