@@ -30,10 +30,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import matplotlib.font_manager  # noqa: F401 - makes its folders at home when it is loaded, whichever case is the first
 from typer.testing import CliRunner
 
+from optics.numerics.threads import LIMIT
 from tests.robustness.cases import Case, Reached, cases, cut
 from tests.robustness.mutate import Mutant, mutate
 
@@ -208,6 +210,8 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
         with (
             cut(soon=number % DEEP != DEEP - 1),
             _watch.within(folder) as seen,
+            # one core is no reason for a second process
+            mock.patch.dict(os.environ, {LIMIT: "1"}),
             limited(3.0 * SECONDS if number % DEEP == DEEP - 1 else SECONDS),
         ):
             arguments = [*case.words, str(paths[0]), *case.options, *out]

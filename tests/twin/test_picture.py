@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 import twin.main_job.render_command
+import twin.pictures.picture
 import twin.pictures.picture_light as picture_light
 import twin.render as command
 from scenes.specs.load import EXAMPLES
@@ -222,9 +224,9 @@ def done(backend):
 def ready(done, monkeypatch):
     """The computation is replaced by one that is done already, and pictures are small."""
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments: done)
-    monkeypatch.setattr(
-        twin.main_job.render_command, "write_pictures", lambda *arguments: write_pictures(*arguments, shots=SMALL)
-    )
+    # imported where they are asked for
+    small = partial(write_pictures, shots=SMALL)
+    monkeypatch.setattr(twin.pictures.picture, "write_pictures", small)
 
 
 def test_the_command_writes_them(ready, tmp_path):

@@ -65,8 +65,18 @@ def open_files() -> int:
 
 
 def children() -> list[int]:
-    """Processes below this one that have not been waited for."""
-    return [child.pid for child in psutil.Process().children()]
+    """Processes below this one that have not been waited for, without those of other tests."""
+    return [child.pid for child in psutil.Process().children() if child.pid not in OTHERS]
+
+
+OTHERS: set[int] = set()
+
+
+@pytest.fixture(autouse=True)
+def _others():
+    """What earlier tests of this process keep running, as Dask's resource tracker."""
+    OTHERS.clear()
+    OTHERS.update(child.pid for child in psutil.Process().children())
 
 
 def test_both_processes_take_their_part() -> None:

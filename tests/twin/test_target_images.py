@@ -170,7 +170,7 @@ def test_noise_bias(perfect):
     # what a modulus with this noise does: E r^2 = m^2 + 2 sigma^2
     sigma = np.sqrt(0.5 * np.maximum(np.mean((quiet.mtf + excess) ** 2, axis=0) - quiet.mtf**2, 0.0))
     assert np.all(np.abs(mean - rice_bias(quiet.mtf, sigma))[1:] < far * error[1:])
-    # and what is reported of it: guessed from a noisy modulus, which at two sigmas makes it a sixth of a sigma too large
+    # and what is reported of it: guessed from a noisy modulus, at two sigmas a sixth of a sigma too large
     drawn = np.random.default_rng(11).standard_normal((2, 1_000_000))
     guessed = np.zeros(len(f))
     for i in range(1, len(f)):

@@ -62,7 +62,7 @@ def load_drawing() -> None:
     from twin.uncertainty import uncertainty_plot
 
     _ = light_path_plots, motion_map, spot_plots, summary_plot, scene_file, uncertainty_plot
-    xarray.Dataset({"first": ("x", [0.0])}).to_netcdf(engine="h5netcdf")
+    xarray.DataArray([0.0], dims="x", name="first").to_netcdf(engine="h5netcdf")
     with look("first"):
         figure = new_figure(1.0)
         figure.subplots().set_title("0 \N{MINUS SIGN}", fontweight="bold")
@@ -114,10 +114,9 @@ def _summary(run: RenderRun) -> bytes:
 
 
 def _irradiance(run: RenderRun) -> bytes:
-    from twin.main_job.render_files import irradiance
-    from twin.run.netcdf_file import netcdf
+    from twin.main_job.render_files import irradiance_file
 
-    return netcdf(irradiance(run))
+    return irradiance_file(run)
 
 
 def _scene(instrument: Instrument, state: State, paths: LightPaths) -> bytes:

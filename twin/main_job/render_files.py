@@ -35,7 +35,12 @@ def write_data(run: RenderRun, folder: RunFolder) -> None:
         folder: an open run folder.
     """
     write_results(run, folder)
-    folder.write_bytes("irradiance.nc", netcdf(irradiance(run)))
+    folder.write_bytes("irradiance.nc", irradiance_file(run))
+
+
+def irradiance_file(run: RenderRun) -> bytes:
+    """Contents of irradiance.nc."""
+    return netcdf(irradiance(run))
 
 
 def write_results(run: RenderRun, folder: RunFolder) -> None:
