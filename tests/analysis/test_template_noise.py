@@ -100,6 +100,7 @@ def edges(count, *, noise, faint, seed):
     return Pair(np.hstack(images[0]), np.hstack(images[1]), places, places + SHIFT)
 
 
+@pytest.mark.slow
 def test_places_on_edges_keep_in_their_covariances():
     """Edges whose faint texture tells the place along them: half of chi-square is 1 within the limits of so many
     windows (one false alarm in 1000), and the long axis lies along the edge. By the normal matrix alone it is twice as

@@ -115,6 +115,7 @@ def test_a_chief_ray_that_is_stopped_is_still_the_beams_middle(bare, cut) -> Non
     np.testing.assert_allclose(cut.path.places({}, light)[0], [np.tan(np.radians(0.1)) / 0.3, 0.0], rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_no_mtf_is_told_of_a_cut_pupil(cut, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="edges of surfaces cut"):
         cut.mtfs([(0.0, 0.0)])
@@ -203,6 +204,7 @@ def test_clear_apertures_that_stop_nothing_are_left_out(backend, tmp_path: Path)
     assert any("2 of them stop no light of the field" in str(note) for note in made.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "edge", ["{blocks: circle, radius: 1 m}", "{clear: circle, radius: 2 mm, centre: [149 mm, 0 mm]}"]
 )
@@ -216,6 +218,7 @@ def test_a_field_that_edges_leave_dark_is_refused_by_name(edge, tmp_path: Path) 
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_field_with_dark_corners_is_taken_to_be_round(backend, tmp_path: Path) -> None:
     """Fields on both axes, and an edge near the image that lets through no more than the circle of them."""
     spec = camera(CAMERA.replace("field: {x: 0.1 deg, y: 0.1 deg}", "field: {x: 0.7 deg, y: 0.7 deg}"))
