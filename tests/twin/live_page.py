@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = shutil.which("chromium")
-# software rendering, so that it needs no GPU; no services of the browser's maker
+# As a browser without a graphics card: pages are put together by the processor, and so is WebGL. No services of the
+# browser's maker.
 FLAGS = [
     "--no-sandbox",
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
+    "--disable-gpu-compositing",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-quic",

@@ -7,6 +7,7 @@ it can do, the server asks it for the last state only (`twin.live.clients`).
 from __future__ import annotations
 
 import asyncio
+import gc
 import multiprocessing
 import os
 import signal
@@ -132,6 +133,9 @@ def compute(pipe: Connection, what: str, backend: str) -> None:
         try:
             answers = Answers(what, backend, lambda part: pipe.send(("part", part)))
             pipe.send(("ready", answers.opened))
+            # what is built stays; looking through it again and again would cost every state some milliseconds
+            gc.collect()
+            gc.freeze()
         except (InputError, BackendUnavailable, LibraryMissing, ValueError) as error:
             pipe.send(("failed", str(error)))
             return

@@ -53,6 +53,7 @@ export class Readings {
         name.title = row.meaning;
         row.cells = Array.from({ length: hello.estimators.length + 4 }, () => row.line.insertCell());
         row.cells[1 + hello.estimators.indexOf(hello.judged)].className = 'judged';
+        row.texts = [];
         row.name = `${group.title} ${row.symbol} [${row.unit}]`;
       }
     }
@@ -87,7 +88,8 @@ export class Readings {
       const error = truth === undefined ? undefined : own[row.key] - truth;
       const texts = [fixed(truth, places), ...estimators.map((name) => fixed(row.reading(told.readings, name)[row.key], places)),
         fixed(sigma, places), fixed(error, places), error === undefined ? '–' : fixed(error / sigma, 1)];
-      texts.forEach((text, k) => { row.cells[k].textContent = text; });
+      texts.forEach((text, k) => { if (row.texts[k] !== text) row.cells[k].textContent = text; });
+      row.texts = texts;
       row.cells[texts.length - 1].classList.toggle('far', error !== undefined && Math.abs(error / sigma) > FAR);
     }
     const found = told.readings.disturbances;
@@ -105,7 +107,7 @@ export class Readings {
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
     if (!width || !this.rows) return;
     if (canvas.width !== Math.round(width * ratio)) { canvas.width = Math.round(width * ratio); canvas.height = Math.round(height * ratio); }
-    const pen = canvas.getContext('2d');
+    const pen = canvas.getContext('2d', { willReadFrequently: true });
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     const span = Number(byId('strip-span').value);

@@ -2,13 +2,22 @@
 const byId = (id) => document.getElementById(id);
 const LARGEST = 1e7; // factor at the slider's end
 const FIRST = 1e5;
+const SLOW = 12; // ms of a drawing from which it is slow
+const REST = 300; // ms without a change after which a slow one is made
+const LATEST = 2000; // ms after which it is made all the same
 const TURN = 0.12; // radians an arrow key turns the view by
 
-const supported = () => {
+// none, or what draws: a graphics card, or the processor in its place
+const graphics = () => {
   try {
-    return !!document.createElement('canvas').getContext('webgl2');
+    const context = document.createElement('canvas').getContext('webgl2');
+    if (!context) return null;
+    const told = context.getExtension('WEBGL_debug_renderer_info');
+    const name = String(told ? context.getParameter(told.UNMASKED_RENDERER_WEBGL) : '');
+    context.getExtension('WEBGL_lose_context')?.loseContext();
+    return /swiftshader|llvmpipe|software|basic render/i.test(name) ? 'processor' : 'card';
   } catch {
-    return false;
+    return null;
   }
 };
 
@@ -29,11 +38,12 @@ export class Scene {
   }
 
   async load() {
-    if (typeof THREE === 'undefined' || !supported()) {
+    const kind = typeof THREE === 'undefined' ? null : graphics();
+    if (!kind) {
       this.root.textContent = 'This browser shows no three-dimensional pictures (WebGL 2 is missing).';
       return;
     }
-    if (!this.renderer) this.start();
+    if (!this.renderer) this.start(kind);
     const answer = await fetch('scene.glb');
     const gltf = await new THREE.GLTFLoader().parseAsync(await answer.arrayBuffer(), '');
     if (this.model) this.world.remove(this.model);
@@ -69,9 +79,11 @@ export class Scene {
     this.root.dataset.ready = 'yes';
   }
 
-  start() {
-    this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+  start(kind) {
+    // the processor has the spots to compute
+    const card = kind === 'card';
+    this.renderer = new THREE.WebGLRenderer({ antialias: card, alpha: true });
+    this.renderer.setPixelRatio(card ? Math.min(devicePixelRatio, 2) : 1);
     this.root.replaceChildren(this.renderer.domElement);
     this.world = new THREE.Scene();
     this.world.add(new THREE.HemisphereLight(0xffffff, 0x8890a0, 2.4));
@@ -159,19 +171,28 @@ export class Scene {
     this.draw();
   }
 
-  // once a frame, however often it is asked for; where drawing is slow (no graphics card), a fifth of the time at most
+  // Once a frame, however often it is asked for. Where drawing is slow (no graphics card) it waits until the knobs rest,
+  // so that spots and readings come first.
   draw() {
-    if (this.waiting || !this.model) return;
+    if (!this.model) return;
+    const now = performance.now();
+    const slow = (this.cost ?? 0) > SLOW;
+    if (this.waiting && !slow) return;
+    this.asked ??= now;
+    clearTimeout(this.timer);
     this.waiting = true;
-    const rest = Math.max(0, (this.drawn ?? 0) + 4 * (this.cost ?? 0) - performance.now());
-    setTimeout(() => requestAnimationFrame(() => {
-      this.waiting = false;
-      const began = performance.now();
-      this.renderer.render(this.world, this.camera);
-      this.renderer.getContext().finish();
-      this.drawn = performance.now();
-      this.cost = this.drawn - began;
-    }), rest);
+    const rest = slow ? Math.max(0, Math.min(REST, this.asked + LATEST - now)) : 0;
+    this.timer = setTimeout(() => requestAnimationFrame(() => this.render()), rest);
+  }
+
+  render() {
+    this.waiting = false;
+    this.asked = undefined;
+    const began = performance.now();
+    this.renderer.render(this.world, this.camera);
+    // or the cost would be told before the work is done
+    this.renderer.getContext().finish();
+    this.cost = performance.now() - began;
   }
 
   // where a body stands now, world, metres; for whoever looks

@@ -134,7 +134,7 @@ export class Spots {
     const marks = figure.marks;
     const size = Math.round(marks.clientWidth * (window.devicePixelRatio || 1)) || 150;
     if (marks.width !== size) { marks.width = size; marks.height = size; }
-    const pen = marks.getContext('2d');
+    const pen = marks.getContext('2d', { willReadFrequently: true });
     pen.clearRect(0, 0, size, size);
     if (!byId('marks').checked || this.told.problem) return;
     const scale = size / across;
