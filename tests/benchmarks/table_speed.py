@@ -15,22 +15,13 @@ from scenes.yaml.csv_table import read_table
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from twin.laboratory.measured_readings import read_comparisons
+from twin.orbit.measured.measurement_files import CONVENTIONS
 from twin.orbit.measured.measurement_tables import COLUMNS
 from twin.orbit.measured.platform_columns import platform_of
 
 ROWS, QUICK_ROWS = 1_000_000, 20_000
 LIMIT_S = 20.0
 """Of either: read in seconds, on a slow machine too."""
-_CONVENTIONS = {
-    "frame": "itrs",
-    "quaternion": {"scalar": "last", "turns": "body_to_frame"},
-    "body_axes": ["forward", "right", "down"],
-    "time_scale": "utc",
-    "line_moment": "middle",
-    "centre": "integer",
-    "first_pixel": 0,
-    "first_pixel_sees": "right",
-}
 
 
 def attitude(folder: Path, rows: int) -> Callable[[], int]:
@@ -45,7 +36,7 @@ def attitude(folder: Path, rows: int) -> Callable[[], int]:
 
     def read() -> int:
         orbit, looks = (read_table(folder / f"{key}.csv", COLUMNS[key], 2) for key in ("orbit", "attitude"))
-        conventions = ConventionsSpec.model_validate(_CONVENTIONS)
+        conventions = ConventionsSpec.model_validate(CONVENTIONS)
         return len(platform_of("2020-01-01T00:00:00Z", orbit, looks, conventions).attitude_time)
 
     return read

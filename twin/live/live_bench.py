@@ -26,6 +26,7 @@ from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import MOST_FRAMES, AskedState, BlindState, Course
 from twin.main_job.monitor_reading import stated
+from twin.main_job.render_job import MIN_LIGHT
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.monitor.crosstalk import crosstalk
@@ -34,10 +35,6 @@ from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
 
-SUSPECTS = 3
-"""Bodies that may explain a contradiction, as shown."""
-MIN_LIGHT = 0.5
-"""Share of the nominal light on a CCD below which a channel is warned of."""
 BLIND = 7
 """Random stream of what is hidden, beside those of the monitor and of targets."""
 LOST = (AimError, BeamMissedError, TemperatureError, SpotError, InputError, ArithmeticError, ValueError)
@@ -182,7 +179,7 @@ class LiveBench:
         return self._shown(frames, self.twin.experiment.nominal_photons)
 
     def _lost(self, asked: AskedState, error: Exception) -> dict[str, Any]:
-        """Why there is no such state, and which bodies are in each other, if that is why."""
+        """Why there is no such state."""
         if isinstance(error, SpotError):
             channels = self.twin.experiment.path.channels
             reasons = [f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items()]

@@ -77,7 +77,6 @@ class AskedView(_Said):
         view: which picture.
         camera: of which camera.
         field: along the line, as a share of the half field.
-        defocus: of the picture, micrometres downstream.
     """
 
     type: Literal["view"] = "view"
