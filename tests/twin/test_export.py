@@ -12,7 +12,7 @@ import pytest
 import twin.orbit.__main__ as command
 from optics.numerics.backend import load_backend
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_setup import resolve_angle, resolve_simulate
+from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
 from tests.twin.commands import files, invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.test_simulate import write
