@@ -17,9 +17,10 @@ from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import is_file, read_yaml
+from scenes.yaml.yaml_file import read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
 
