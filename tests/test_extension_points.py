@@ -56,7 +56,7 @@ from scenes.specs.camera import MirrorSpec
 from scenes.specs.channel import PRISMS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
-from scenes.specs.orbit_spec import OrbitSpec
+from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.resolved import resolve
 from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError

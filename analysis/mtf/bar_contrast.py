@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
-from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
+from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
 
 __all__ = ["BarError", "BarMtf", "measure_bars"]
@@ -169,7 +169,7 @@ def measure_bars(
         frequency_sigma=np.sqrt(np.diag(covariance)[-2:]),
         mtf=mtf,
         sigma=sigma,
-        noise_bias=scale * float(rice_bias(signal, across_sigma)),
+        noise_bias=scale * float(measured_bias(amplitude, across_sigma)),
         amplitude=amplitude,
         phase=math.atan2(-s, c),
         harmonics={h: math.hypot(*parameters[3 + 2 * k : 5 + 2 * k]) for k, h in enumerate(numbers)},

@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge, pixel_noise
 from analysis.mtf.edge_mtf import EdgeMtf
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
-from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
+from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
 
 __all__ = ["EdgeError", "EdgeMtf", "measure_edge"]
@@ -213,7 +213,7 @@ def _result(
         sigma_along=along,
         sigma_across=across,
         sigma=np.sqrt(rice_sigma(signal, along, across) ** 2 + 3.0 * (blur * modulus) ** 2),
-        noise_bias=rice_bias(signal, across),
+        noise_bias=measured_bias(modulus, across),
         angle=line.sign * math.atan(fitted.slope),
         angle_sigma=slope_sigma * cosine**2,
         position=offset,

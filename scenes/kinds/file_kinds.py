@@ -16,12 +16,12 @@ from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.measured.orbit_check import OrbitCheckSpec
 from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
 from scenes.specs.measured.orbit_match import OrbitMatchSpec
-from scenes.specs.orbit_angle import OrbitAngleSpec
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_monitor import OrbitMonitorSpec
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.orbit.angle import OrbitAngleSpec
+from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+from scenes.specs.orbit.monitor import OrbitMonitorSpec
+from scenes.specs.orbit.simulate import OrbitSimulateSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.study import StudySpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec

@@ -23,7 +23,7 @@ from optics.geometry.zernike import MAX_NOLL
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription
 from scenes.lens.shapes import even_asphere, turned_over
-from scenes.lens.statements import Source, decoded, read_bytes
+from scenes.lens.statements import Source, read_lines
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 
 _OVER = Pose(np.diag([1.0, -1.0, -1.0]))
@@ -379,10 +379,7 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
 def _loaded(path: str | Path) -> object:
     """The contents of a YAML file that may name parts of itself again, with the places of its keys."""
     source = Source(str(path))
-    content = read_bytes(path)
-    if len(content) > LARGEST_FILE:
-        raise source.error("too large for a telescope", 1, f"{len(content)} bytes", f"at most {LARGEST_FILE}")
-    text = "\n".join(decoded(content, source))
+    text = "\n".join(read_lines(source, "a telescope in YAML", LARGEST_FILE))
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of anchors that are given twice

@@ -36,7 +36,7 @@ from scenes.lens.prescription import (
     glass_key,
 )
 from scenes.lens.shapes import LARGEST_ORDER, clear, even_asphere, polynomial
-from scenes.lens.statements import Source, Statement, decoded, read_bytes
+from scenes.lens.statements import Source, Statement, read_lines
 
 _D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9
 
@@ -52,7 +52,7 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
         InputError: the file is damaged, or says something that would be taken wrongly; with the line.
     """
     source = Source(str(path))
-    lines = decoded(read_bytes(path), source)
+    lines = read_lines(source)
     system = CodevSystem(source)
     for statement in statements(lines):
         if system.private:

@@ -13,7 +13,7 @@ from pathlib import Path
 from optics.materials.glass import GLASSES
 from optics.numerics.frozen_map import FrozenMap
 from scenes.lens.prescription import Glasses, glass_key
-from scenes.lens.statements import Source, Statement, decoded, read_bytes, split_words
+from scenes.lens.statements import Source, Statement, read_lines, split_words
 
 
 def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
@@ -126,7 +126,7 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
     glasses: list[CatalogueGlass] = []
     name, formula, begun = "", 0, 0
     coefficients: tuple[float, ...] = ()
-    for number, text in enumerate(decoded(read_bytes(path), source), start=1):
+    for number, text in enumerate(read_lines(source, "a glass catalogue"), start=1):
         words = split_words(text)
         if not words:
             continue

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from scenes.lens.prescription import Note
 from scenes.yaml.errors import InputError, Issue, shown
+from scenes.yaml.input_file import read_bytes
 
 LARGEST_FILE = 16 << 20
 """Bytes; prescriptions have some ten thousand."""
@@ -116,36 +116,21 @@ def is_number(word: str) -> bool:
     return _NUMBER.fullmatch(word) is not None
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """What a file holds.
+def read_lines(source: Source, what: str = "a prescription", most: int = LARGEST_FILE) -> list[str]:
+    """The lines of a source's file: UTF-16 of either order, with or without a mark, UTF-8, or one byte a character.
+
+    Args:
+        source: to read from.
+        what: its file should be, for messages.
+        most: bytes that it may have.
 
     Raises:
-        InputError: it cannot be read, or is too large for a prescription.
+        InputError: the file cannot be read, is too large or empty, or holds bytes that no text of its encoding has,
+            with their line.
     """
-    file = str(path)
-    try:
-        if not stat.S_ISREG(Path(path).stat().st_mode):
-            raise InputError(Issue("is not a regular file", file, allowed="a prescription"))
-        with Path(path).open("rb") as stream:
-            content = stream.read(LARGEST_FILE + 1)
-    except FileNotFoundError:
-        raise InputError(Issue("no such file", file)) from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
-    if len(content) > LARGEST_FILE:
-        raise InputError(Issue("too large for a prescription", file, allowed="at most 16 MB"))
+    content = read_bytes(source.file, what, most, (Path(source.file).suffix,))
     if not content.strip(b"\0 \t\r\n"):
-        raise InputError(Issue("an empty file", file, 1, allowed="a prescription"))
-    return content
-
-
-def decoded(content: bytes, source: Source) -> list[str]:
-    """The lines of a file: UTF-16 of either order, with or without a mark, UTF-8, or else one byte a character.
-
-    Raises:
-        InputError: bytes that no text of that encoding has, with their line.
-    """
+        raise source.error("an empty file", 1, allowed=what)
     encoding = next((name for mark, name in _MARKS if content.startswith(mark)), "")
     if not encoding:
         head = content[:400]

@@ -29,7 +29,7 @@ from scenes.lens.prescription import (
     glass_key,
 )
 from scenes.lens.shapes import clear, even_asphere, polynomial
-from scenes.lens.statements import MOST_SURFACES, Source, Statement, decoded, joined, read_bytes, split_words
+from scenes.lens.statements import MOST_SURFACES, Source, Statement, joined, read_lines, split_words
 
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
 D_LINE = 587.5618e-9
@@ -117,7 +117,7 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
         InputError: the file is damaged, or says something that would be taken wrongly; with the line.
     """
     source = Source(str(path))
-    lines = decoded(read_bytes(path), source)
+    lines = read_lines(source)
     system = _System(source)
     for number, text in enumerate(lines, start=1):
         words = split_words(text.rstrip("\x1a"))

@@ -13,9 +13,10 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names, load_camera, load_instrument, paths_of_cameras
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Name, Paths, Source, Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import YamlFile, dump_yaml, is_file, read_yaml
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
 ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run with one"
 

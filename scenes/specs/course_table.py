@@ -10,7 +10,9 @@ from typing import Any
 
 from scenes.specs.course import CourseSpec
 from scenes.specs.job import JobSpec, pivot_problem
+from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.translate import validate
 from scenes.yaml.units import (
     ANGLE,
@@ -22,7 +24,7 @@ from scenes.yaml.units import (
     Kind,
     parse_quantity,
 )
-from scenes.yaml.yaml_file import YamlFile, is_file, read_text
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile
 
 TIME = "time"
 AXES = ("x", "y", "z")
@@ -117,7 +119,7 @@ def _read(path: Path, named: CourseSpec) -> CourseSpec:
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Line, counted from 1, and cells; empty lines and those that begin with # are left out."""
-    reader = csv.reader(io.StringIO(read_text(path), newline=""))
+    reader = csv.reader(io.StringIO(table_text(path, most=LARGEST_BYTES), newline=""))
     try:
         for row in reader:
             if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#"):

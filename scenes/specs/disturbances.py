@@ -113,6 +113,7 @@ BodyPatterns = Annotated[
     Field(min_length=1),
     BeforeValidator(_some_paths, json_schema_input_type=BodyPattern | tuple[BodyPattern, ...]),
 ]
+Reason = Annotated[Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
 TimeLaw = Annotated[
     TimeLawSpec, BeforeValidator(_law, json_schema_input_type=Literal["white", "constant"] | TimeLawSpec)
@@ -168,7 +169,24 @@ class CorrelationSpec(Spec):
         return tuple(tuple(1.0 if i == j else value for j in range(count)) for i in range(count))
 
 
-class CauseSpec(Spec):
+class _CauseWords(Spec):
+    """What may be said of a cause."""
+
+    bodies: Annotated[BodyPatterns | None, STATED] = None
+    shift: Annotated[ShiftSigma | None, STATED] = None
+    rotate: Annotated[RotateSigma | None, STATED] = None
+    scale: Annotated[ScaleSigma | None, STATED] = None
+    figure: Annotated[FigureSigmas | None, STATED] = None
+    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
+    index_gradient: Annotated[IndexSigma | None, STATED] = None
+    pivot: Annotated[Name | None, STATED] = None
+    together: Annotated[Correlation | None, STATED] = None
+    correlations: Annotated[tuple[CorrelationSpec, ...] | None, STATED] = None
+    time: Annotated[TimeLaw | None, STATED] = None
+    reason: Annotated[Reason | None, STATED] = None
+
+
+class CauseSpec(_CauseWords):
     """One cause of change: its bodies and the standard deviation of each component of each of their motions. Components
     are independent of each other unless it says otherwise.
 
@@ -189,17 +207,9 @@ class CauseSpec(Spec):
     """
 
     bodies: BodyPatterns
-    shift: Annotated[ShiftSigma | None, STATED] = None
-    rotate: Annotated[RotateSigma | None, STATED] = None
-    scale: Annotated[ScaleSigma | None, STATED] = None
-    figure: Annotated[FigureSigmas | None, STATED] = None
-    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
-    index_gradient: Annotated[IndexSigma | None, STATED] = None
-    pivot: Annotated[Name | None, STATED] = None
-    together: Annotated[Correlation | None, STATED] = None
     correlations: tuple[CorrelationSpec, ...] = ()
     time: TimeLaw = TimeLawSpec(kind="white")
-    reason: Annotated[Text, Field(min_length=1)]
+    reason: Reason
 
     @model_validator(mode="after")
     def _moves_something(self) -> "CauseSpec":
@@ -208,7 +218,7 @@ class CauseSpec(Spec):
         return self
 
 
-class CauseChangeSpec(Spec):
+class CauseChangeSpec(_CauseWords):
     """What a job says of a cause in place of the disturbances file, number by number; a cause that the file does not
     have needs all that a cause needs.
 
@@ -216,19 +226,6 @@ class CauseChangeSpec(Spec):
         bodies, shift, rotate, scale, figure, temperature, index_gradient: as of a cause.
         pivot, together, correlations, time, reason: as of a cause.
     """
-
-    bodies: Annotated[BodyPatterns | None, STATED] = None
-    shift: Annotated[ShiftSigma | None, STATED] = None
-    rotate: Annotated[RotateSigma | None, STATED] = None
-    scale: Annotated[ScaleSigma | None, STATED] = None
-    figure: Annotated[FigureSigmas | None, STATED] = None
-    temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
-    index_gradient: Annotated[IndexSigma | None, STATED] = None
-    pivot: Annotated[Name | None, STATED] = None
-    together: Annotated[Correlation | None, STATED] = None
-    correlations: Annotated[tuple[CorrelationSpec, ...] | None, STATED] = None
-    time: Annotated[TimeLaw | None, STATED] = None
-    reason: Annotated[Annotated[Text, Field(min_length=1)] | None, STATED] = None
 
     @property
     def given(self) -> Mapping[str, Any]:

@@ -16,20 +16,19 @@ from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradien
 from scenes.yaml.bsdf_file import ENDING, read_bsdf
 from scenes.yaml.coating_file import read_coating
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest
+from scenes.yaml.input_file import digest_of, is_file
 from scenes.yaml.node_table import (
     DECKS_NEED,
     HEAT_DECKS_NEED,
     INPUT_DECKS,
     MESHES,
     TABLES,
-    digest_of,
     read_nodes,
     read_temperatures,
 )
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Reference, Spec, Text, Whole
 from scenes.yaml.units import SCALE
-from scenes.yaml.yaml_file import is_file
 
 Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 MeshUnit = Literal["m", "mm", "um"]

@@ -19,8 +19,9 @@ from scenes.specs.load import (
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import names_text, nearest
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Paths, Spec
-from scenes.yaml.yaml_file import is_file, read_yaml
+from scenes.yaml.yaml_file import read_yaml
 
 MEASURED = "measured"
 """Key of a test whose data come from files and not from a simulated bench."""

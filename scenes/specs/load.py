@@ -15,17 +15,12 @@ from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.specs.orbit_angle import OrbitAngleSpec
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_scene import LineImageSpec
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.orbit_spec import PayloadTestSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import is_file, read_yaml
+from scenes.yaml.yaml_file import read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
 
@@ -64,12 +59,12 @@ def instrument_path(job: JobSpec) -> Path:
     Raises:
         InputError: there is none, said with the line of the job's file.
     """
-    return _find(INSTRUMENTS, job.instrument, job, ("instrument",))
+    return find_named(INSTRUMENTS, job.instrument, job, ("instrument",))
 
 
 def load_error_budget(name_or_path: str | Path, relative_to: str | Path | None = None) -> ErrorBudgetSpec:
     """Read an error budget; arguments and errors as `load_instrument`."""
-    return _load(ErrorBudgetSpec, BUDGETS, name_or_path, relative_to)
+    return load_named(ErrorBudgetSpec, BUDGETS, name_or_path, relative_to)
 
 
 def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:
@@ -82,7 +77,7 @@ def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = N
     Raises:
         InputError: as `load_job`.
     """
-    instrument = _load(InstrumentSpec, INSTRUMENTS, name_or_path, relative_to)
+    instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path, relative_to)
     paths_of_cameras(instrument)
     path_of_detector(instrument)
     return instrument
@@ -90,7 +85,7 @@ def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = N
 
 def load_disturbances(name_or_path: str | Path, relative_to: str | Path | None = None) -> DisturbancesSpec:
     """Read a disturbances file; arguments and errors as `load_instrument`."""
-    return _load(DisturbancesSpec, DISTURBANCES, name_or_path, relative_to)
+    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path, relative_to)
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
@@ -110,7 +105,7 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
             text = "there is no disturbances file that could be changed"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
-    stated = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
+    stated = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
     return stated if asked is None else stated.changed(asked)
 
 
@@ -123,7 +118,7 @@ def read_design(
     Raises:
         InputError: a file is not there or not valid, or nothing is stated to move.
     """
-    start = load_instrument(_find(INSTRUMENTS, design.instrument, design, ("instrument",)))
+    start = load_instrument(find_named(INSTRUMENTS, design.instrument, design, ("instrument",)))
     files = paths_of_cameras(start)
     cameras = {site.camera: load_camera(files[name]) for name, site in start.cameras.items()}
     owner: Spec = design
@@ -136,9 +131,9 @@ def read_design(
     stated = {}
     for k, reference in enumerate(references):
         key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
-        stated[reference] = validate(DisturbancesSpec, read_yaml(_find(DISTURBANCES, reference, owner, key)))
+        stated[reference] = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
     sheets = {
-        name: load_detector(_find(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
+        name: load_detector(find_named(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
         for name, one in (design.area_ccds or {}).items()
     }
     return start, cameras, load_detector(path_of_detector(start)), stated, sheets
@@ -147,38 +142,38 @@ def read_design(
 def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
     """Name in the instrument -> file of its camera. Raises InputError if there is none."""
     return {
-        name: _find(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
+        name: find_named(CAMERAS, mounted.camera, instrument, ("cameras", name, "camera"))
         for name, mounted in instrument.cameras.items()
     }
 
 
 def path_of_detector(instrument: InstrumentSpec) -> Path:
     """The file of the area CCD's data sheet. Raises InputError if there is none."""
-    return _find(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
+    return find_named(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
 
 
 def find_detector(name_or_path: str, named_by: Spec, key: KeyPath) -> Path:
     """The file of a data sheet that another file names. Raises InputError, at that file's key, if there is none."""
-    return _find(DETECTORS, name_or_path, named_by, key)
+    return find_named(DETECTORS, name_or_path, named_by, key)
 
 
 def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    return _load(CameraSpec, CAMERAS, name_or_path, relative_to)
+    return load_named(CameraSpec, CAMERAS, name_or_path, relative_to)
 
 
 def load_detector(name_or_path: str | Path, relative_to: str | Path | None = None) -> DetectorSpec:
     """Read a detector's data sheet; arguments and errors as `load_instrument`."""
-    return _load(DetectorSpec, DETECTORS, name_or_path, relative_to)
+    return load_named(DetectorSpec, DETECTORS, name_or_path, relative_to)
 
 
 def load_autocollimator_test(
     name_or_path: str | Path = "principle_experiment", relative_to: str | Path | None = None
 ) -> AutocollimatorSetup:
     """Read a test with two autocollimators and the data sheet of their CCDs; arguments, errors as `load_instrument`."""
-    spec = _load(AutocollimatorTestSpec, LAB, name_or_path, relative_to)
+    spec = load_named(AutocollimatorTestSpec, LAB, name_or_path, relative_to)
     reference = spec.autocollimator.area_ccd.detector
-    detector = _find(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
+    detector = find_named(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
     return AutocollimatorSetup(spec, load_detector(detector))
 
 
@@ -186,75 +181,47 @@ def load_turntable_test(
     name_or_path: str | Path = "turntable", relative_to: str | Path | None = None
 ) -> TurntableTestSpec:
     """Read a turntable test; arguments and errors as `load_instrument`."""
-    return _load(TurntableTestSpec, LAB, name_or_path, relative_to)
+    return load_named(TurntableTestSpec, LAB, name_or_path, relative_to)
 
 
 def load_lab_test(model: type[SpecType], name_or_path: str | Path, relative_to: str | Path | None = None) -> SpecType:
     """Read a laboratory test of that sort; arguments and errors as `load_instrument`."""
-    return _load(model, LAB, name_or_path, relative_to)
-
-
-def load_orbit_test(model: type[SpecType], name_or_path: str | Path) -> SpecType:
-    """Read a test in orbit of that sort; arguments and errors as `load_instrument`."""
-    return _load(model, ORBIT, name_or_path, None)
+    return load_named(model, LAB, name_or_path, relative_to)
 
 
 def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
     """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
-    return _find(CAMERAS, test.camera, test, ("camera",))
+    return find_named(CAMERAS, test.camera, test, ("camera",))
 
 
 def find_turntable_test(test: DistortionTestSpec) -> Path:
     """The file of the distortion test's turntable. Raises InputError if there is none."""
-    return _find(LAB, test.turntable, test, ("turntable",))
-
-
-def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> ThreeLineCameraSpec:
-    """Read a three-line payload; arguments and errors as `load_instrument`."""
-    return _load(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
-
-
-def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | PayloadTestSpec) -> Path:
-    """The file of the payload of a test in orbit. Raises InputError if there is none."""
-    return _find(PAYLOADS, test.camera, test, ("camera",))
-
-
-def find_orbit_camera(test: OrbitAngleSpec) -> Path:
-    """The file of the payload or instrument of a test in orbit. Raises InputError if there is none."""
-    reference, file = test.camera, test.source.file
-    for folder in (PAYLOADS, INSTRUMENTS):
-        if _candidate(folder, reference, Path(file).parent if file else Path()) is not None:
-            return _find(folder, reference, test, ("camera",))
-    payloads, instruments = library_names(PAYLOADS), library_names(INSTRUMENTS)
-    allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
-    meant = nearest(reference, (*payloads, *instruments))
-    problem = "no such name in payloads or instruments"
-    raise test.error(problem, ("camera",), found=reference, allowed=allowed, suggestion=meant)
-
-
-def load_line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
-    """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
-    `load_instrument`.
-    """
-    sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
-    sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
-    return {
-        image.detector: load_detector(_find(DETECTORS, image.detector, camera, (*key, "detector")))
-        for key, image in sections
-        if image is not None
-    }
+    return find_named(LAB, test.turntable, test, ("turntable",))
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
     """Data sheets of a camera's line CCDs, by the name that the bands give. Raises InputError as `load_instrument`."""
     return {
-        band.detector: load_detector(_find(DETECTORS, band.detector, camera, ("bands", name, "detector")))
+        band.detector: load_detector(find_named(DETECTORS, band.detector, camera, ("bands", name, "detector")))
         for name, band in camera.bands.items()
     }
 
 
-def _load(model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None) -> SpecType:
-    path = _candidate(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
+def load_named(
+    model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None
+) -> SpecType:
+    """Read a file of one folder of the library, or a user's own of that kind.
+
+    Args:
+        model: what its kind of files may say.
+        folder: of the library, for a name.
+        name_or_path: as of `load_instrument`.
+        relative_to: likewise.
+
+    Raises:
+        InputError: as `load_instrument`.
+    """
+    path = place_of(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
     if path is None:
         name, allowed = str(name_or_path), _names_and_paths(folder)
         meant = nearest(name, library_names(folder))
@@ -267,10 +234,10 @@ def _names_and_paths(folder: str) -> str:
     return f"{names_text(names)}, or the path of a .yaml file"
 
 
-def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
+def find_named(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
     """The file that a specification refers to, or an InputError at the line of the reference."""
     file = owner.source.file
-    path = _candidate(folder, reference, Path(file).parent if file else Path())
+    path = place_of(folder, reference, Path(file).parent if file else Path())
     if path is None:
         meant = nearest(reference, library_names(folder))
         problem, allowed = f"no such name in {folder}", _names_and_paths(folder)
@@ -281,7 +248,7 @@ def _find(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
     return path
 
 
-def _candidate(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
+def place_of(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
     """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
     text = str(name_or_path)
     if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):

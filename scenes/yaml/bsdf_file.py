@@ -33,7 +33,7 @@ import numpy as np
 
 from optics.materials.scatter_table import ScatterTable
 from scenes.yaml.errors import InputError, Issue, nearest, shown
-from scenes.yaml.yaml_file import read_text
+from scenes.yaml.input_file import read_text
 
 ENDING = ".bsdf"
 LARGEST = 64 << 20

@@ -17,8 +17,8 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_text, nearest, shown
+from scenes.yaml.input_file import read_text
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
-from scenes.yaml.yaml_file import read_text
 
 LARGEST_TABLE = 1 << 30
 """Bytes."""
@@ -135,17 +135,18 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
     return Table(file, numbers, FrozenMap(heads), FrozenMap(values))
 
 
-def table_text(path: str | Path, what: str = "a CSV file") -> str:
+def table_text(path: str | Path, what: str = "a CSV file", most: int = LARGEST_TABLE) -> str:
     """The text of a file of measured numbers.
 
     Args:
         path: of the file, UTF-8 text.
         what: it should be, for messages.
+        most: bytes that it may have.
 
     Raises:
         InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
     """
-    return read_text(path, what, LARGEST_TABLE, (Path(path).suffix,))
+    return read_text(path, what, most, (Path(path).suffix,))
 
 
 def _rows(file: str, text: str) -> tuple[list[int], list[list[str]]]:

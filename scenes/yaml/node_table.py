@@ -1,7 +1,6 @@
 """Nodes of finite-element programs, with displacements or temperatures, from CSV files, and from meshes by meshio."""
 
 import contextlib
-import hashlib
 import io
 import re
 import threading
@@ -16,8 +15,8 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import LEAST_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
+from scenes.yaml.input_file import digest_of, is_file
 from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_ratio
-from scenes.yaml.yaml_file import is_file
 
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
 FARTHEST = 100.0
@@ -243,9 +242,3 @@ def _within(file: str, values: np.ndarray, most: float, what: str, allowed: str)
         number = int(np.argmax(bad))
         text = f"node number {number} (from 0) has {what} out of range"
         raise InputError(Issue(text, file, found=shown(values[number].tolist()), allowed=allowed))
-
-
-def digest_of(path: Path) -> str:
-    """SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -8,8 +8,6 @@ parser's events, so a refusal comes before anything is unfolded.
 
 import io
 import re
-import stat
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,8 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
-from scenes.yaml.errors import InputError, Issue, KeyPath, nearest, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+from scenes.yaml.input_file import read_text
 from scenes.yaml.units import OTHER_MINUS, foreign_minus
 
 LARGEST_BYTES = 1_000_000
@@ -68,7 +67,7 @@ def read_yaml(path: str | Path) -> YamlFile:
         InputError: no such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several
             documents, nested deeper than 32, or with duplicate keys, anchors, aliases, merge keys or tags.
     """
-    return parse_yaml(read_text(path), str(path))
+    return parse_yaml(read_text(path, "a YAML file", LARGEST_BYTES, (".yaml", ".yml")), str(path))
 
 
 def parse_yaml(text: str, file: str = "") -> YamlFile:
@@ -129,66 +128,6 @@ def _styled(value: Any) -> Any:
     if isinstance(value, str) and (value in _WORDS or "?" in value or not isinstance(_number_or_text(value), str)):
         return DoubleQuotedScalarString(value)
     return value
-
-
-_YAML_ENDS = (".yaml", ".yml")
-
-
-def read_text(
-    path: str | Path, what: str = "a YAML file", most: int = LARGEST_BYTES, ends: Sequence[str] = _YAML_ENDS
-) -> str:
-    """The text of a file that nobody has vetted.
-
-    Args:
-        path: of the file, UTF-8 text.
-        what: it should be, for messages.
-        most: bytes that it may have.
-        ends: of names of the files beside it that may have been meant where there is none.
-
-    Raises:
-        InputError: there is none, it cannot be read, is too large or holds other than UTF-8 text.
-    """
-    file = str(path)
-    try:
-        mode = Path(path).stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise InputError(Issue("is a directory, not a regular file", file, allowed=what))
-        # A device or a pipe could be endless or block.
-        if not stat.S_ISREG(mode):
-            raise InputError(Issue("is not a regular file", file, allowed=what))
-        with Path(path).open("rb") as stream:
-            content = stream.read(most + 1)
-    except FileNotFoundError:
-        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path), ends))) from None
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
-    if len(content) > most:
-        size = f"{most >> 30} GB" if most >> 30 else f"{most // 10**6} MB"
-        raise InputError(Issue("too large", file, allowed=f"at most {size}"))
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(Issue(f"not UTF-8 text: byte 0x{content[error.start]:02x}", file, line)) from None
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is a file; there is none of a name that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
-
-
-def _file_beside(path: Path, ends: Sequence[str]) -> str | None:
-    """The file with one of these ends in the same folder that was probably meant."""
-    try:
-        names = [place.name for place in path.parent.iterdir() if place.suffix in ends]
-    except (OSError, ValueError):
-        return None
-    meant = nearest(path.name, names)
-    return None if meant is None else str(path.parent / meant)
 
 
 class _Builder:

@@ -307,9 +307,11 @@ def test_noise_bias_at_low_light(k):
         assert mtf.mean() > 10 * error
         # what is left without a signal: mean of |noise|
         assert mtf.mean() == pytest.approx(across * math.sqrt(math.pi / 2), abs=5 * error)
-    # what is reported knows no truth; where signal and noise are alike it is good to a factor of two
-    reported = np.mean([edge.noise_bias[k] for edge in edges])
-    assert 0.5 < reported / float(rice_bias(truth, across)) < 2.0
+    # what is reported knows no truth: stated to 0.09 sigma where there is a signal, too small by half a sigma without
+    reported = np.array([edge.noise_bias[k] for edge in edges])
+    scatter = 5 * reported.std(ddof=1) / math.sqrt(len(edges))
+    wrong = reported.mean() - float(rice_bias(truth, across))
+    assert -(0.53 if k == 64 else 0.09) * across - scatter < wrong < 0.09 * across + scatter
 
 
 def test_the_angle_enters_the_sigma():

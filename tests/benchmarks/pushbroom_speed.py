@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from scenes.specs.orbit_scene import ControlSpec, GroundSpec
+from scenes.specs.orbit.scene import ControlSpec, GroundSpec
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.pushbroom_bench import LINES, PLACE, lines

@@ -203,7 +203,7 @@ def _labs() -> Iterator[Case]:
 
 
 def _orbits() -> Iterator[Case]:
-    from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
+    from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_monitor, resolve_simulate
 
     for stem in ("angle", "angle_gf7", "angle_off_axis"):
         yield _of_one(f"orbit-{stem}", orbit, "angle", f"orbit/{stem}.yaml")

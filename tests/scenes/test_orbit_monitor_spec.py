@@ -7,8 +7,8 @@ import pytest
 
 from scenes.schema import json_schema
 from scenes.specs.load import LIBRARY, ORBIT, SCENES, load_instrument
-from scenes.specs.orbit_monitor import MotionSpec
-from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
+from scenes.specs.orbit.monitor import MotionSpec
+from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.yaml.errors import InputError
 from tests.scenes.orbit_files import assert_told, write
 

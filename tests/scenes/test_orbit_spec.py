@@ -5,7 +5,7 @@ import math
 import pytest
 from pydantic import TypeAdapter
 
-from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from optics.geometry.pose import rotation_vector
-from scenes.specs.orbit_spec import AttitudeSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec, OrbitSpec
 from twin.orbit.flight.earth import RATE, Earth
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory

@@ -13,9 +13,9 @@ import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.specs.orbit_spec import ThermalDriftSpec
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.flight import ThermalDriftSpec
+from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.camera_drift import (
     PooledErrors,

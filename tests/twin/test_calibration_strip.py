@@ -12,9 +12,9 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_angle import EffectsSpec
-from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.specs.orbit_spec import ThermalDriftSpec
+from scenes.specs.orbit.angle import EffectsSpec
+from scenes.specs.orbit.flight import ThermalDriftSpec
+from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from tests.twin.commands import invoke, refused
 from tests.twin.strip_prediction import predicted
 from twin.orbit.calibration.flown_campaign import fly_fields

@@ -12,17 +12,18 @@ import pytest
 import twin.orbit.__main__ as command
 from optics.numerics.backend import load_backend
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_setup import resolve_angle, resolve_simulate
+from scenes.specs.orbit.setup import resolve_angle, resolve_simulate
 from tests.twin.commands import files, invoke
 from tests.twin.line_scanner_model import LineScannerModel
 from tests.twin.test_simulate import write
-from twin.orbit.export.export_report import export_files, geotiff
+from twin.orbit.export.export_report import export_files
 from twin.orbit.export.export_run import ExportSource, read_source, run_export
 from twin.orbit.export.line_scanner import line_scanner
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.simulate_run import fly_simulation
+from twin.run.data_files import FrameFacts, tiff
 
 run = partial(invoke, command.app)
 CSM = Path(__file__).parent / "csm"
@@ -128,7 +129,7 @@ def _gdal(rpc: RationalPolynomial, shape: tuple[int, int], points: np.ndarray) -
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with MemoryFile(geotiff(np.zeros(shape, np.uint16), rpc, "test")) as memory, memory.open() as file:
+        with MemoryFile(tiff(np.zeros((1, *shape), np.uint16), FrameFacts(place=rpc))) as memory, memory.open() as file:
             assert file.shape == shape
             with RPCTransformer(file.rpcs) as transformer:
                 rows = transformer.rowcol(*points.T, op=lambda value: value)
@@ -196,19 +197,28 @@ def test_command(tmp_path: Path) -> None:
     assert again.exit_code == 0
     for name in models:
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
-    import rasterio
     import tifffile
+    from rasterio.io import MemoryFile
 
     for name in ("forward", "nadir"):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with rasterio.open(tmp_path / "out" / "models" / f"{name}.tif") as file:
+            # out of its folder: GDAL prefers the text beside it to the tag
+            content = (tmp_path / "out" / "models" / f"{name}.tif").read_bytes()
+            with MemoryFile(content) as memory, memory.open() as file:
                 image, rpcs = file.read(1), file.rpcs
         assert np.array_equal(image, np.squeeze(tifffile.imread(tmp_path / "run" / "images" / f"{name}.tiff")))
         text = (tmp_path / "out" / "models" / f"{name}_RPC.TXT").read_text().splitlines()
-        told = dict(row.split(": ", 1) for row in text)
-        assert float(told["LINE_OFF"].split()[0]) == rpcs.line_off
-        assert [float(told[f"SAMP_NUM_COEFF_{k}"]) for k in range(1, 21)] == rpcs.samp_num_coeff
+        told = {key: value.split()[0] for key, value in (row.split(": ", 1) for row in text)}
+        # all 90 numbers of both places; GDAL hands on 15 digits of those in the tag
+        of_tag = {key: value for key, value in rpcs.to_gdal().items() if not key.startswith("ERR")}
+        for key, values in of_tag.items():
+            own = [told.pop(key)] if key in told else [told.pop(f"{key}_{k}") for k in range(1, 21)]
+            tagged = [float(value) for value in values.split()]
+            assert tagged == pytest.approx([float(value) for value in own], rel=1e-14, abs=0.0), key
+        assert not told
+        # nobody states errors
+        assert (rpcs.err_bias, rpcs.err_rand) == (-1.0, -1.0)
         isd = json.loads((tmp_path / "out" / "models" / f"{name}.json").read_text())
         assert (isd["image_lines"], isd["image_samples"]) == image.shape
         assert isd["starting_detector_sample"] == said["lines"][name]["first_pixel"] > 0

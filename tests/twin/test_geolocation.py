@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from scenes.specs.load import load_three_line_camera
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects

@@ -12,9 +12,9 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_scene import ImagePointsSpec
-from scenes.specs.orbit_setup import resolve_calibration, resolve_simulate
+from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+from scenes.specs.orbit.scene import ImagePointsSpec
+from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign

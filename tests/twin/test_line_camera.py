@@ -12,8 +12,8 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_directions
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.specs.load import load_three_line_camera
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate

@@ -23,8 +23,8 @@ from scenes.specs.measured.orbit_data_setup import (
     resolve_measured_calibration,
 )
 from scenes.specs.measured.pass_files import body_axes_matrix
-from scenes.specs.orbit_angle import EffectsSpec
-from scenes.specs.orbit_setup import resolve_angle, resolve_calibration, resolve_simulate
+from scenes.specs.orbit.angle import EffectsSpec
+from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke

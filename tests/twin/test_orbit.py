@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from scenes.specs.orbit_spec import OrbitSpec
+from scenes.specs.orbit.flight import OrbitSpec
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, RATE, Earth
 from twin.orbit.flight.orbit import (
     FIELD_RADIUS,

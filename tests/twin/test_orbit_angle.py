@@ -15,8 +15,8 @@ from scipy.stats import chi2
 import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.angle.angle_flight import AnglePass, angle_camera, fly
 from twin.orbit.angle.angle_run import estimated, frame_rows, run_angle, tls_angles

@@ -13,7 +13,7 @@ import twin.orbit.__main__ as command
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly

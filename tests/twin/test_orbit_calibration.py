@@ -16,9 +16,9 @@ from analysis.orbit.calibration_parameters import CalibrationError
 from analysis.orbit.three_line_model import misclosure
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_angle import LINES, EffectsSpec
-from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.specs.orbit_spec import ThermalDriftSpec
+from scenes.specs.orbit.angle import LINES, EffectsSpec
+from scenes.specs.orbit.flight import ThermalDriftSpec
+from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.calibration_numbers import calibration_numbers
 from twin.orbit.calibration.calibration_run import run_calibration, true_values

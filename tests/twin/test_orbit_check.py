@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from scenes.specs.load import load_three_line_camera
 from scenes.specs.measured.orbit_check import OrbitCheckSpec
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.measured.pass_files_setup import CheckSetup
+from scenes.specs.orbit.load import load_three_line_camera
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke

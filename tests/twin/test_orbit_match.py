@@ -10,11 +10,12 @@ import pytest
 import tifffile
 
 import twin.orbit.__main__ as command
-from scenes.specs.load import ORBIT, SCENES, load_three_line_camera
+from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.measured.pass_files import with_absolute_files
 from scenes.specs.measured.pass_files_setup import MatchSetup
-from scenes.specs.orbit_setup import resolve_simulate
+from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench

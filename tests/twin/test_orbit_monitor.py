@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
 from optics.geometry.tree import Motion
-from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
+from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras

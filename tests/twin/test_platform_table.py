@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes.specs.orbit_spec import OrbitSpec, PassingSpec
+from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_times import LineTimes
 from twin.orbit.flight.orbit import propagate

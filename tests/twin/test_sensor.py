@@ -10,9 +10,9 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from optics.geometry.tree import Motion
-from scenes.specs.load import load_three_line_camera
-from scenes.specs.orbit_spec import OrbitSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.flight import OrbitSpec
+from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import (

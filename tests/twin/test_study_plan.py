@@ -103,6 +103,12 @@ def test_config_yaml_says_all(tmp_path) -> None:
     assert resolve_study(renamed).fingerprint == setup.fingerprint
 
 
+def test_a_table_of_other_than_text_is_told_with_its_line(tmp_path) -> None:
+    (tmp_path / "t.csv").write_bytes(b"z\n1 um\n\xff\n")
+    with pytest.raises(InputError, match=r"t\.csv:3: not UTF-8 text"):
+        resolve_study(write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: z}")))
+
+
 def test_a_new_node_and_a_new_figure_term_are_made(tmp_path) -> None:
     plan = plan_of(tmp_path, ("base/forward/M2, shift, 2]", "base/forward/M3, figure, Z11]"))
     made = leaf(plan.setup.tree, ("job", "perturb", "base/forward/M3"))
@@ -115,7 +121,7 @@ REFUSED = [
     (("M2, shift, 2]", "M2, shift]"), "factors.m2z.key", "not a single value"),
     (("M2, shift, 2]", "M2, figure, Z99]"), "factors.m2z", "Z66"),
     ((NORMAL, "values: [1 um, a]"), "factors.m2z.values", "not a quantity among"),
-    ((NORMAL, "table: {file: none.csv, column: z}"), "factors.m2z.table.file", "No such file"),
+    ((NORMAL, "table: {file: none.csv, column: z}"), "factors.m2z.table.file", "no such file"),
     (("file: job.yaml", "file: jobs.yaml"), "base.file", "no such file"),
     (("file: job.yaml", "file: pertrub"), "base.file", "'perturb'"),
 ]

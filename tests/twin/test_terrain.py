@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenes.specs.orbit_scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
+from scenes.specs.orbit.scene import ControlSpec, LightSpec, TerrainSpec, TextureSpec
 from twin.orbit.flight.earth import Earth
 from twin.orbit.ground.grid import GroundFrame, SplineGrid, correlated_field, fractal_field
 from twin.orbit.ground.orthophoto import SCALE, make_control

@@ -15,7 +15,7 @@ import pytest
 from analysis.orbit.planes import PlaneFit
 from optics.geometry.pose import about_axis
 from optics.numerics.backend import load_backend
-from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit.angle import LINES
 from tests.validation.undrawn import undrawn
 from twin.orbit.angle import angle_flight as flight_module
 from twin.validation.checks.check import VERDICTS

@@ -8,7 +8,7 @@ import pytest
 from analysis.orbit.planes import Station
 from analysis.orbit.sensitivity import sensitivity
 from optics.numerics.backend import load_backend
-from scenes.specs.orbit_angle import LINES, THREE_LINE_ANGLES
+from scenes.specs.orbit.angle import LINES, THREE_LINE_ANGLES
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED

@@ -5,7 +5,6 @@ Rows are sorted before anything is computed, so that their order in a file chang
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from scenes.specs.camera_tests import DistortionFiles
 from scenes.specs.turntable_test import TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.input_file import digest_of
 from scenes.yaml.units import ANGLE, LENGTH
 
 __all__ = ["Comparisons", "DataFile", "SpotReadings", "read_comparisons", "read_spots", "read_turntable"]
@@ -66,8 +66,7 @@ class DataFile:
     @classmethod
     def of(cls, table: Table) -> DataFile:
         """Of a table."""
-        with Path(table.file).open("rb") as stream:
-            return cls(table.file, len(table), hashlib.file_digest(stream, "sha256").hexdigest())
+        return cls(table.file, len(table), digest_of(Path(table.file)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -29,7 +29,7 @@ from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.monitor.time_series import pieces
-from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, remedy
+from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
 from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_measurement
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector
@@ -304,44 +304,43 @@ def state_name(times: Sequence[float] | None, number: int) -> str:
     return "after" if times is None else f"at {moment(times[number - 1])}"
 
 
+def _worst(
+    results: Sequence[ChannelResult],
+    times: Sequence[float] | None,
+    suspect: Callable[[SpotResult], tuple[float, ...] | None],
+) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Of each channel with suspect spots the worst: where, and what makes it so. `suspect` gives that, largest for the
+    worst, or None for nothing.
+    """
+    for result in results:
+        judged = ((suspect(spot), state_name(times, k)) for k, (_, spot) in enumerate(result.states()))
+        found = [(why, state) for why, state in judged if why is not None]
+        if found:
+            why, state = max(found)
+            others = f", the worst of {len(found)} states" if len(found) > 1 else ""
+            yield f"{result.channel.name} {state}{others}", why
+
+
 def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None) -> tuple[str, ...]:
     """Spots whose core is not as calibrated; of a series the worst of each channel."""
-    out = []
-    for result in results:
-        found = [
-            (spot.core[0], spot.core[1], state_name(times, k))
-            for k, (_, spot) in enumerate(result.states())
-            if not spot.fits and spot.core is not None
-        ]
-        if not found:
-            continue
-        chi, pixels, state = max(found)
-        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
-        out.append(
-            f"{result.channel.name} {state}{others}: the spot has not the calibrated shape, reduced chi-square of its"
-            f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
-            " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
-        )
-    return tuple(out)
+    return tuple(
+        f"{where}: the spot has not the calibrated shape, reduced chi-square of its"
+        f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
+        " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core)
+    )
 
 
 def _noisy(results: Sequence[ChannelResult], times: Sequence[float] | None, source: str) -> tuple[str, ...]:
     """Frames that have another noise than is stated; of a series the worst of each channel."""
-    out = []
-    for result in results:
-        found = [
-            (abs(math.log(spot.noise_ratio)), spot.noise_ratio, state_name(times, k))
-            for k, (_, spot) in enumerate(result.states())
-            if spot.noise_ratio is not None
-        ]
-        if not found:
-            continue
-        _, ratio, state = max(found)
-        others = f", the worst of {len(found)} states" if len(found) > 1 else ""
-        out.append(
-            f"{result.channel.name} {state}{others}: beside the spot the frames are {ratio:.2f} times as noisy as"
-            f" {source}: another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and"
-            " the search for defects rest on it: name the right `detector`, or measure it with dark and flat frames"
-            " and `photon_transfer: measured`"
-        )
-    return tuple(out)
+
+    def apart(spot: SpotResult) -> tuple[float, ...] | None:
+        return None if spot.noise_ratio is None else (abs(math.log(spot.noise_ratio)), spot.noise_ratio)
+
+    return tuple(
+        f"{where}: beside the spot the frames are {ratio:.2f} times as noisy as"
+        f" {source}: another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and"
+        " the search for defects rest on it: name the right `detector`, or measure it with dark and flat frames"
+        " and `photon_transfer: measured`"
+        for where, (_, ratio) in _worst(results, times, apart)
+    )

@@ -10,7 +10,7 @@ import io
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -30,6 +30,13 @@ SPOT_STRETCH = 30.0
 ENLARGE = 4
 LARGEST_ENLARGED = 600
 """Rows or columns from which a picture is shown as large as it is."""
+
+
+class Placed(Protocol):
+    """What says where on the ground the pixels of an image lie."""
+
+    def tags(self) -> list[tuple[Any, ...]]:
+        """As tifffile takes tags: code, type, count, value, only once in the file."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +74,7 @@ class FrameFacts:
         exposure: of each frame, seconds.
         times: of each frame in the course, seconds.
         note: what else is to be known.
-        place: of a map; the TIFF then is a GeoTIFF.
+        place: of a map, or of an image from orbit; the TIFF then is a GeoTIFF.
     """
 
     camera: str = ""
@@ -75,7 +82,7 @@ class FrameFacts:
     exposure: float | None = None
     times: tuple[float, ...] | None = None
     note: str = ""
-    place: MapPlace | None = None
+    place: Placed | None = None
 
     def page(self, k: int) -> dict[str, Any]:
         """What is known of frame number ``k``, as plain data."""

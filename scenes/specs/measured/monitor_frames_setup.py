@@ -21,11 +21,13 @@ from scenes.specs.measured.monitor_frames import (
     MeasurementSpec,
 )
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.units import MOMENT, parse_quantity
-from scenes.yaml.yaml_file import is_file, read_text, read_yaml
+from scenes.yaml.yaml_file import LARGEST_BYTES, read_yaml
 
 ENDINGS = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
 """Of frames in a folder, in the order in which they are looked for."""
@@ -216,7 +218,8 @@ class _FrameTable:
     channels: tuple[str, ...]
 
     def read(self) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
-        file, reader = str(self.path), csv.reader(io.StringIO(read_text(self.path), newline=""))
+        file, text = str(self.path), table_text(self.path, most=LARGEST_BYTES)
+        reader = csv.reader(io.StringIO(text, newline=""))
         heads: list[str] = []
         seen: dict[str, dict[float | str, list[str]]] = {}
         corners: dict[tuple[str, bool], tuple[int, int]] = {}

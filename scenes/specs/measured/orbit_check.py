@@ -12,8 +12,8 @@ from scenes.specs.measured.pass_files import (
     PointSigma,
     TimeScale,
 )
-from scenes.specs.orbit_scene import LightEffectsSpec
-from scenes.specs.orbit_spec import PayloadTestSpec
+from scenes.specs.orbit.flight import PayloadTestSpec
+from scenes.specs.orbit.scene import LightEffectsSpec
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Number, Reference, Spec, Whole
 from scenes.yaml.units import TIME

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.measured.pass_files import BodyAxes, PlatformFilesSpec
-from scenes.specs.orbit_angle import Angles, EffectsSpec, Flag, Moment
-from scenes.specs.orbit_calibration import LaunchSpec, MapLimitsSpec, checked_schemes
-from scenes.specs.orbit_spec import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
+from scenes.specs.orbit.angle import Angles, EffectsSpec, Flag, Moment
+from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec, checked_schemes
+from scenes.specs.orbit.flight import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.spec import Name, Named, Reference, Spec
 

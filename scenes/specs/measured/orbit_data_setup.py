@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.load import find_payload, load_orbit_test, load_three_line_camera
 from scenes.specs.measured.orbit_data import (
     MeasuredAngleSpec,
     MeasuredCalibrationSpec,
@@ -14,9 +13,10 @@ from scenes.specs.measured.orbit_data import (
     PassFilesSpec,
 )
 from scenes.specs.measured.pass_files import PlatformFilesSpec, with_absolute_files
-from scenes.specs.orbit_setup import AngleSetup, CalibrationSetup, resolve_angle, resolve_calibration
+from scenes.specs.orbit.load import find_payload, load_orbit_test, load_three_line_camera
+from scenes.specs.orbit.setup import AngleSetup, CalibrationSetup, resolve_angle, resolve_calibration
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import Problem, nearest
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate

@@ -6,8 +6,8 @@ from pydantic import AfterValidator, Field
 
 from scenes.specs.measured.orbit_check import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec, PointSigma, RasterFileSpec
-from scenes.specs.orbit_scene import ImagePointsSpec, LightEffectsSpec
-from scenes.specs.orbit_spec import PayloadTestSpec
+from scenes.specs.orbit.flight import PayloadTestSpec
+from scenes.specs.orbit.scene import ImagePointsSpec, LightEffectsSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.spec import Named, Reference, Spec, Whole
 

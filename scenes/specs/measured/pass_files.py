@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_spec import EarthSpec
+from scenes.specs.orbit.flight import EarthSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Reference, Spec, Text

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from scenes.specs.load import find_payload, load_orbit_test, load_three_line_camera
 from scenes.specs.measured.orbit_check import OrbitCheckSpec
 from scenes.specs.measured.orbit_match import OrbitMatchSpec
 from scenes.specs.measured.pass_files import with_absolute_files
+from scenes.specs.orbit.load import find_payload, load_orbit_test, load_three_line_camera
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import names_text, nearest
 
 

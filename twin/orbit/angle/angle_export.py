@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.specs.orbit_setup import AngleSetup
+from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.units import MOMENT, format_quantity
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.angle.angle_flight import LEAST_SIGMA

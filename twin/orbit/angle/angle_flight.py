@@ -51,8 +51,8 @@ from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_angle import OrbitAngleSpec
-    from scenes.specs.orbit_setup import AngleSetup
+    from scenes.specs.orbit.angle import OrbitAngleSpec
+    from scenes.specs.orbit.setup import AngleSetup
 
 
 @dataclass(frozen=True, eq=False)

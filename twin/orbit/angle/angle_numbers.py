@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
-from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
 from twin.orbit.angle.measured_angle import MeasuredAngleRun, MeasuredAngles, run_measured_angle
 from twin.run.plain_data import plain_data

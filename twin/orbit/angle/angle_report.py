@@ -17,7 +17,7 @@ from twin.run.artefact import FAR, Cell, Table, fixed
 from twin.run.report import Report, one_sentence
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import AngleSetup
+    from scenes.specs.orbit.setup import AngleSetup
 
 SIGHTED = "lines of sight in the tls planes"
 METHOD_NAMES = {

@@ -37,7 +37,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import AngleSetup
+    from scenes.specs.orbit.setup import AngleSetup
 
 EFFECTS = ("light_time", "aberration", "refraction")
 BEND = 0.01 * ARCSEC

@@ -19,7 +19,7 @@ from analysis.orbit.planes import PlaneError, Station, Strip
 from analysis.orbit.resection import ResectionError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit_angle import LEAST_POINTS, usual_angles
+from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
 from scenes.yaml.errors import names_text, nearest
 from twin.orbit.angle.angle_flight import INTERIOR, LEAST_SIGMA, Measurement, interior, without_effects
 from twin.orbit.angle.angle_run import Estimate, estimated

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
+from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
 from twin.orbit.calibration.campaign import FieldPass, Rejected, interior_names
 from twin.orbit.calibration.image_numbers import ImageNumbers

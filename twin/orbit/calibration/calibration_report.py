@@ -19,7 +19,7 @@ from twin.run.artefact import Cell, Table
 from twin.run.report import Report, one_sentence
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 
 def calibration_report(run: CalibrationRun) -> Report:

@@ -18,7 +18,7 @@ from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_prior
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit.angle import LINES
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
@@ -28,7 +28,7 @@ from twin.run.procedure import Advance
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Sizes of the drift against the file's."""

@@ -20,7 +20,7 @@ from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import INTERIOR, LineModel, Rays
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.calibration.observations import PassData, image_sigma, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
@@ -32,8 +32,8 @@ from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec, ReadingErrorsSpec
-    from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-    from scenes.specs.orbit_spec import ErrorsSpec
+    from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+    from scenes.specs.orbit.flight import ErrorsSpec
     from twin.orbit.calibration.field_images import FieldImages
 
 
@@ -198,7 +198,7 @@ class Campaign:
     @property
     def simulated(self) -> OrbitCalibrationSpec:
         """The test of a simulation. AssertionError for measurements."""
-        from scenes.specs.orbit_calibration import OrbitCalibrationSpec
+        from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 
         assert isinstance(self.spec, OrbitCalibrationSpec), "this campaign was measured"
         return self.spec

@@ -27,9 +27,9 @@ from twin.run.procedure import Advance, BenchError
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_calibration import CalibrationImagesSpec, FieldSpec, PatchPlaceSpec
-    from scenes.specs.orbit_scene import GroundSpec
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit.calibration import CalibrationImagesSpec, FieldSpec, PatchPlaceSpec
+    from scenes.specs.orbit.scene import GroundSpec
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 _OFFSET = 9000.0
 """Metres. As far from the middle of the real terrain model, east and north, a patch may lie; 30 km x 32 km are real."""

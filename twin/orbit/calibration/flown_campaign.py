@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_spec import OrbitSpec, PassingSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.calibration.campaign import Campaign, PassTruth, campaign_of, line_model
 from twin.orbit.calibration.field_images import FieldImages, Imager
 from twin.orbit.calibration.observations import FieldPoints, PassData, light_effects
@@ -38,8 +38,8 @@ from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit.calibration import FieldSpec, OrbitCalibrationSpec, PointsSpec
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 
 _DRIFT, _READING = 6, 7

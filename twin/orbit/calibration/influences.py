@@ -14,7 +14,7 @@ from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit.angle import LINES
 from twin.orbit.calibration.campaign import Campaign, interior_names
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS

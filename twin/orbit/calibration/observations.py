@@ -28,8 +28,8 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.pass_measurements import ImagePoints
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_angle import EffectsSpec
-    from scenes.specs.three_line_camera import LineCameraSpec
+    from scenes.specs.orbit.angle import EffectsSpec
+    from scenes.specs.orbit.three_line_camera import LineCameraSpec
 
 
 EFFECTS = ("light_time", "aberration", "refraction")

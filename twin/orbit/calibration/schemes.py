@@ -21,7 +21,7 @@ from twin.orbit.calibration.observations import EFFECTS
 from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import CalibrationSetup
+    from scenes.specs.orbit.setup import CalibrationSetup
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReading
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_check import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
-    from scenes.specs.three_line_camera import ThreeLineCameraSpec
+    from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 
 _LINES = (
     Column("camera", text=True),

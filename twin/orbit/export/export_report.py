@@ -7,12 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numpy as np
-
 from twin.orbit.export.export_run import Export, ExportedLine
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.run.artefact import Cell, Table, significant
+from twin.run.data_files import FrameFacts, tiff
 from twin.run.plain_data import plain_data
 from twin.run.report import Report, Section, one_sentence
 
@@ -108,52 +107,11 @@ def export_files(run: Export) -> dict[str, bytes]:
         if line.polynomial is not None:
             found[names["rpc"]] = line.polynomial.text().encode()
         if line.window.frame is not None:
-            found[names["image"]] = geotiff(line.window.frame, line.polynomial, f"{line.window.name} {run.epoch}")
+            facts = FrameFacts(
+                line.window.name, line.window.pitch, note=f"second 0 of its orbit is {run.epoch}", place=line.polynomial
+            )
+            found[names["image"]] = tiff(line.window.frame[None], facts)
     return found
-
-
-def geotiff(frame: np.ndarray, polynomial: RationalPolynomial | None, description: str) -> bytes:
-    """An image (rows, columns) as a GeoTIFF, with its rational polynomials where it has any."""
-    # a fifth of a second, which only those wait for who write one
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
-    from rasterio.io import MemoryFile
-
-    with MemoryFile() as memory, rasterio.Env(CPL_LOG="OFF"):
-        import warnings
-
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)  # an image from orbit has no map's coordinates
-            kind = {"driver": "GTiff", "dtype": frame.dtype, "compress": "deflate", "predictor": 2, "count": 1}
-            with memory.open(height=frame.shape[0], width=frame.shape[1], **kind) as file:
-                file.write(frame, 1)
-                file.update_tags(TIFFTAG_IMAGEDESCRIPTION=description)
-                if polynomial is not None:
-                    file.rpcs = _gdal(polynomial)
-        return bytes(memory.read())
-
-
-def _gdal(model: RationalPolynomial) -> Any:
-    """The polynomials as rasterio has them."""
-    from rasterio.rpc import RPC
-
-    line, sample, latitude, longitude, height = zip(model.offset.tolist(), model.scale.tolist(), strict=True)
-    return RPC(
-        line_off=line[0],
-        line_scale=line[1],
-        samp_off=sample[0],
-        samp_scale=sample[1],
-        lat_off=latitude[0],
-        lat_scale=latitude[1],
-        long_off=longitude[0],
-        long_scale=longitude[1],
-        height_off=height[0],
-        height_scale=height[1],
-        line_num_coeff=model.line_numerator.tolist(),
-        line_den_coeff=model.line_denominator.tolist(),
-        samp_num_coeff=model.sample_numerator.tolist(),
-        samp_den_coeff=model.sample_denominator.tolist(),
-    )
 
 
 _ROUGH = 0.1

@@ -17,7 +17,7 @@ import tifffile
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.kinds.file_kinds import kind_of
-from scenes.specs.orbit_setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
+from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly

@@ -8,6 +8,7 @@ coordinates count from the centre of the first pixel, heights are above the elli
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,7 +106,18 @@ class RationalPolynomial:
         rows += [f"{name}_COEFF_{k + 1}: {v!r}" for name, part in parts.items() for k, v in enumerate(part.tolist())]
         return "\n".join(rows) + "\n"
 
+    def tags(self) -> list[tuple[Any, ...]]:
+        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors that nobody states, offsets, scales and
+        coefficients, in the order of RPC00B.
+        """
+        parts = (self.line_numerator, self.line_denominator, self.sample_numerator, self.sample_denominator)
+        values = (*_UNSTATED, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
+        return [(_COEFFICIENTS, "d", len(values), values, True)]
 
+
+_COEFFICIENTS = 50844
+_UNSTATED = (-1.0, -1.0)
+"""Error bias and random error, metres."""
 _WIDEST = 90.0
 """Degrees of longitude."""
 

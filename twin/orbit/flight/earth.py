@@ -26,7 +26,7 @@ import pyproj
 from scipy.interpolate import CubicSpline
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_spec import EarthSpec
+    from scenes.specs.orbit.flight import EarthSpec
 
 
 DAY = 86400.0

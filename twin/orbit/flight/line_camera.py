@@ -23,7 +23,7 @@ from optics.raytrace.system import assemble
 from scenes.models.camera_assembly import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE
-from scenes.specs.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
 
 TRACED_POINTS = 49
 """Points of a traced line. An unperturbed line needs nine terms; the rest is for figure errors."""

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_spec import ElementsSpec, OrbitSpec, PassingSpec
+    from scenes.specs.orbit.flight import ElementsSpec, OrbitSpec, PassingSpec
 
 GM = 3.986004415e14
 """m^3/s^2 (EGM96)."""

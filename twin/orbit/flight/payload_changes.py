@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-    from scenes.specs.orbit_simulate import OrbitSimulateSpec
+    from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+    from scenes.specs.orbit.simulate import OrbitSimulateSpec
 
 
 def changed_payload(

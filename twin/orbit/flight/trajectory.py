@@ -24,7 +24,7 @@ from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 from twin.orbit.flight.orbit import Orbit
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_spec import AttitudeSpec, ErrorsSpec
+    from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from twin.orbit.ground.texture import Extent, apparent, reflectance
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_scene import ControlSpec, TextureSpec
+    from scenes.specs.orbit.scene import ControlSpec, TextureSpec
 
 SCALE = 10_000.0
 """Grey values of an orthophoto for a reflectance of 1."""

@@ -15,7 +15,7 @@ from twin.orbit.flight.earth import curvature_radii
 from twin.orbit.ground.grid import SplineGrid, fractal_field
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_scene import TerrainSpec
+    from scenes.specs.orbit.scene import TerrainSpec
 
 _MOST_POSTS = 4096
 """Posts along a side of a fractal; it repeats beyond."""

@@ -20,7 +20,7 @@ from twin.orbit.ground.terrain import Terrain
 from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_scene import LightSpec, TextureSpec
+    from scenes.specs.orbit.scene import LightSpec, TextureSpec
 
 _DARKEST, _BRIGHTEST = 0.02, 0.85
 _EXPONENT = 1.25

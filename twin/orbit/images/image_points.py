@@ -30,7 +30,7 @@ from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.imaged_ground import Frame, ImagedGround, Map
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_scene import ImagePointsSpec
+    from scenes.specs.orbit.scene import ImagePointsSpec
 
 
 SOFTENING = 0.4

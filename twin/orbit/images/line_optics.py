@@ -25,13 +25,13 @@ from optics.waves.pupil_function import PupilFunction, circular_pupil
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.transfer import TransferTable
 from scenes.specs.camera import BandSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.sensor import Sensor
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 
 if TYPE_CHECKING:
     from scenes.specs.detector import DetectorSpec
-    from scenes.specs.orbit_scene import LineImageSpec
+    from scenes.specs.orbit.scene import LineImageSpec
 
 
 def optics_of(

@@ -41,7 +41,7 @@ from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_scene import ControlSpec, GroundSpec
+    from scenes.specs.orbit.scene import ControlSpec, GroundSpec
 
 LARGEST_GROUND = 40_000.0
 """Metres: side of the ground of one patch, against input that asks for more than the memory holds."""

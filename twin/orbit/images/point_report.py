@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 
-from scenes.specs.orbit_scene import ImagePointsSpec
+from scenes.specs.orbit.scene import ImagePointsSpec
 from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.imaged_ground import Frame, ImagedGround
 from twin.orbit.images.patch import Patch

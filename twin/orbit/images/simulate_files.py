@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.flight.platform_table import joined_quaternions
 from twin.orbit.flight.trajectory import Trajectory, readings
 from twin.orbit.images.image_points import MatchedPoints

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.orbit_setup import SimulateSetup, resolve_simulate
+from scenes.specs.orbit.setup import SimulateSetup, resolve_simulate
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import LineImage

@@ -23,7 +23,7 @@ from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import SimulateSetup
+    from scenes.specs.orbit.setup import SimulateSetup
 
 
 _DPI = 110

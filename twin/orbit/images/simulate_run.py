@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.simulate import OrbitSimulateSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
@@ -27,7 +27,7 @@ from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import SimulateSetup
+    from scenes.specs.orbit.setup import SimulateSetup
 
 _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
     {

@@ -13,7 +13,7 @@ import numpy as np
 import pyproj
 
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.yaml_file import is_file
+from scenes.yaml.input_file import is_file
 
 LARGEST_PART = 100_000_000
 """Pixels that are read at once."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from analysis.orbit.calibration_parameters import level_covariance
 from scenes.specs.measured.orbit_data import ConventionsSpec, OrbitDataSpec, PassFilesSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.units import LENGTH, SPEED, TIME

@@ -29,7 +29,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_monitor import OrbitMonitorSpec
+    from scenes.specs.orbit.monitor import OrbitMonitorSpec
 
 CHUNK = 25
 """States rendered at once, to bound memory."""

@@ -35,8 +35,8 @@ from twin.orbit.monitoring.monitor_series import TOO_FAR, MonitorSeries, Reading
 from twin.run.procedure import Advance, BenchError
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_monitor import OrbitMonitorSpec
-    from scenes.specs.orbit_setup import MonitorSetup
+    from scenes.specs.orbit.monitor import OrbitMonitorSpec
+    from scenes.specs.orbit.setup import MonitorSetup
 
 
 def states_of(

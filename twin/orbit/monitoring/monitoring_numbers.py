@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
-from scenes.specs.orbit_monitor import PARAMETERS
-from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
+from scenes.specs.orbit.monitor import PARAMETERS
+from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight
 from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms, run_monitor
 from twin.run.plain_data import plain_data

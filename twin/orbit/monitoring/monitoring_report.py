@@ -9,7 +9,7 @@ import numpy as np
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
-from scenes.specs.orbit_monitor import PARAMETERS
+from scenes.specs.orbit.monitor import PARAMETERS
 from twin.orbit.monitoring.monitoring_numbers import cause_heights
 from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
@@ -17,7 +17,7 @@ from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit_setup import MonitorSetup
+    from scenes.specs.orbit.setup import MonitorSetup
 
 
 def sections(run: MonitorRun) -> tuple[Section, ...]:

@@ -20,7 +20,7 @@ from analysis.orbit.forward_intersection import check_errors
 from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_monitor import PARAMETERS
+from scenes.specs.orbit.monitor import PARAMETERS
 from twin.orbit.flight.line_camera import look_angle
 from twin.orbit.monitoring.monitor_series import Readings
 from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
@@ -28,7 +28,7 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.orbit_setup import MonitorSetup
+    from scenes.specs.orbit.setup import MonitorSetup
 
 CASES = ("none", "monitored", "interval", "smoothed", "parameters", "true")
 """As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by values smoothed

@@ -18,10 +18,12 @@ from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
+from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Source, Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, is_file, parse_yaml, read_yaml
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
 from twin.run.versions import source_digest, versions
 from twin.study.runs.base_job import BaseJob
 from twin.study.runs.config_tree import Tree, with_place, with_values
@@ -274,11 +276,13 @@ def _with_tables(study: StudySpec) -> StudySpec:
 
 def _read_table(study: StudySpec, path: Path, key: KeyPath) -> dict[str, list[Any]]:
     """Columns of a CSV file."""
+    if not is_file(path):
+        raise study.error(f"no such file: {path}", (*key, "file"), allowed="a CSV file, relative to this file")
+    text = table_text(path)
     try:
-        rows = [row for row in csv.reader(io.StringIO(path.read_text("utf-8-sig"), newline="")) if row]
-    except (OSError, ValueError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise study.error(f"the table {path} cannot be read: {reason}", (*key, "file")) from None
+        rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+    except csv.Error as error:
+        raise study.error(f"the table {path} cannot be read: {error}", (*key, "file")) from None
     if len(rows) < 2:
         raise study.error(f"the table {path} has no rows", (*key, "file"), allowed="names, then a row or more")
     ragged = next((k for k, row in enumerate(rows) if len(row) != len(rows[0])), None)

@@ -13,7 +13,7 @@ from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import NearVerticalWarning, PlaneFit, fit_plane
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_run import values_of
 from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
 from twin.validation.checks.group import CheckGroup, Context

@@ -14,8 +14,8 @@ from analysis.units import ARCSEC
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, Measurement, angle_camera, fly
 from twin.orbit.angle.angle_run import resected
 from twin.orbit.flight.light_effects import NO_EFFECTS

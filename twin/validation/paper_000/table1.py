@@ -13,7 +13,7 @@ from analysis.orbit.angles import intersection_angles
 from analysis.orbit.planes import Station
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit_angle import LINES
+from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_flight import Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of
 from twin.run.artefact import SvgFigure

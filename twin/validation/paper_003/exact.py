@@ -15,9 +15,9 @@ from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.three_line_model import BIAS, INTERIOR, Rays, misclosure, partials
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.orbit_angle import LINES, EffectsSpec
-from scenes.specs.orbit_setup import CalibrationSetup, resolve_calibration
-from scenes.specs.orbit_spec import ThermalDriftSpec
+from scenes.specs.orbit.angle import LINES, EffectsSpec
+from scenes.specs.orbit.flight import ThermalDriftSpec
+from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from analysis.orbit.angles import height_error
-from scenes.specs.orbit_setup import CalibrationSetup
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.validation.checks.check import SIGMAS, Check, CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import Context

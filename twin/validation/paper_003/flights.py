@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_setup import CalibrationSetup
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields

@@ -9,9 +9,9 @@ import numpy as np
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_calibration import CalibrationImagesSpec
-from scenes.specs.orbit_setup import CalibrationSetup
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.calibration import CalibrationImagesSpec
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.run.artefact import SvgFigure, Table

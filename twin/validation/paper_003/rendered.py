@@ -12,9 +12,9 @@ from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.three_line_model import BIAS, INTERIOR, misclosure
 from analysis.units import ARCSEC
-from scenes.specs.orbit_angle import LINES
-from scenes.specs.orbit_scene import TerrainSpec
-from scenes.specs.orbit_setup import CalibrationSetup
+from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.scene import TerrainSpec
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields

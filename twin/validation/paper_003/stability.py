@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.third_difference import third_difference
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
-from scenes.specs.orbit_setup import CalibrationSetup
+from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.validation.checks.check import CONSISTENT, CORRECTED, UNDECIDED, Check, CheckResult, Explanation, mean_of

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from scenes.specs.job import PlainPerturbationSpec
-from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, OrbitSpec
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Name, Named, Number, Paths, Reference, Seed, Spec, Text, Whole

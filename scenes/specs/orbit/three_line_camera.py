@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
-from scenes.specs.orbit_scene import LineImageSpec
+from scenes.specs.orbit.scene import LineImageSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Name, Named, Spec, Text, Whole

@@ -11,22 +11,20 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import (
+from scenes.specs.load import load_camera, load_instrument, paths_of_cameras
+from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
+from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+from scenes.specs.orbit.load import (
     find_orbit_camera,
     find_payload,
-    load_camera,
-    load_instrument,
     load_line_detectors,
     load_orbit_test,
     load_three_line_camera,
-    paths_of_cameras,
 )
-from scenes.specs.orbit_angle import LINES, OrbitAngleSpec, usual_angles
-from scenes.specs.orbit_calibration import OrbitCalibrationSpec
-from scenes.specs.orbit_monitor import OrbitMonitorSpec
-from scenes.specs.orbit_simulate import OrbitSimulateSpec
+from scenes.specs.orbit.monitor import OrbitMonitorSpec
+from scenes.specs.orbit.simulate import OrbitSimulateSpec
+from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
-from scenes.specs.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath, names_text, nearest
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import ANGLE, MOMENT, format_quantity

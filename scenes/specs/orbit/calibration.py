@@ -5,9 +5,9 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit_angle import LINES, DatumShift, EffectsSpec, Flag, GroundSigma, Relief, TerrainHeight
-from scenes.specs.orbit_scene import ControlSpec, GroundSpec, ImagePointsSpec
-from scenes.specs.orbit_spec import AngleSigmas, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, Flag, GroundSigma, Relief, TerrainHeight
+from scenes.specs.orbit.flight import AngleSigmas, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole

@@ -22,9 +22,9 @@ from scenes.specs.job import (
     check_nodes,
     perturbation_issues,
 )
-from scenes.specs.orbit_angle import Flag, Relief, TerrainHeight
-from scenes.specs.orbit_calibration import Count, FieldLength, LineTime
-from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.angle import Flag, Relief, TerrainHeight
+from scenes.specs.orbit.calibration import Count, FieldLength, LineTime
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, Text, Whole

@@ -4,10 +4,10 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from scenes.specs.orbit_angle import Moment
-from scenes.specs.orbit_calibration import InteriorChangeSpec, LineTime
-from scenes.specs.orbit_scene import ControlSpec, GroundSpec, ImagePointsSpec, LightEffectsSpec
-from scenes.specs.orbit_spec import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.angle import Moment
+from scenes.specs.orbit.calibration import InteriorChangeSpec, LineTime
+from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec, LightEffectsSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
 

@@ -1,0 +1,82 @@
+"""Bytes and text of files that nobody has vetted: every file that a user names is read by one of these."""
+
+import hashlib
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+
+from scenes.yaml.errors import InputError, Issue, nearest
+
+_UNITS = ((10**9, "GB"), (10**6, "MB"), (10**3, "kB"), (1, "bytes"))
+
+
+def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> bytes:
+    """What a file holds.
+
+    Args:
+        path: of the file.
+        what: it should be, for messages.
+        most: bytes that it may have.
+        ends: of names of the files beside it that may have been meant where there is none.
+
+    Raises:
+        InputError: there is none, it cannot be read or is too large.
+    """
+    file = str(path)
+    try:
+        mode = Path(path).stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError(Issue("is a directory, not a regular file", file, allowed=what))
+        # A device or a pipe could be endless or block.
+        if not stat.S_ISREG(mode):
+            raise InputError(Issue("is not a regular file", file, allowed=what))
+        with Path(path).open("rb") as stream:
+            content = stream.read(most + 1)
+    except FileNotFoundError:
+        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path), ends))) from None
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
+    if len(content) > most:
+        size = next(f"{most // unit} {name}" for unit, name in _UNITS if most >= unit)
+        raise InputError(Issue("too large", file, allowed=f"at most {size}"))
+    return content
+
+
+def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> str:
+    """The text of a file, UTF-8 with or without a mark; arguments as `read_bytes`.
+
+    Raises:
+        InputError: as `read_bytes`, and where it holds other than UTF-8 text.
+    """
+    content = read_bytes(path, what, most, ends)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        problem = f"not UTF-8 text: byte 0x{content[error.start]:02x}"
+        raise InputError(Issue(problem, str(path), line)) from None
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; there is none of a name that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file that was read."""
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _file_beside(path: Path, ends: Sequence[str]) -> str | None:
+    """The file with one of these ends in the same folder that was probably meant."""
+    try:
+        names = [place.name for place in path.parent.iterdir() if place.suffix in ends]
+    except (OSError, ValueError):
+        return None
+    meant = nearest(path.name, names)
+    return None if meant is None else str(path.parent / meant)
