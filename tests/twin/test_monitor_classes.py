@@ -199,10 +199,10 @@ def test_a_state_is_the_same_alone_and_among_others(setup) -> None:
     """More states never change one: photons and lines of sight are the same to the bit."""
     names = list(setup.instrument.cameras)
     rng = np.random.default_rng(3)
-    states: list[State] = [
-        {f"{BASE}/{name}/{body}": Motion(rotate=tuple(3e-6 * rng.normal(size=3)), shift=tuple(2e-6 * rng.normal(size=3)))}
-        for name, body in zip(names * 2, ("M2", "focal_plane", "M1", "M3"), strict=False)
-    ]
+    states: list[State] = []
+    for name, body in zip(names * 2, ("M2", "focal_plane", "M1", "M3"), strict=False):
+        motion = Motion(rotate=tuple(3e-6 * rng.normal(size=3)), shift=tuple(2e-6 * rng.normal(size=3)))
+        states.append({f"{BASE}/{name}/{body}": motion})
     together = setup.path.expected_photons(states, single=False), setup.sight.trace(states)
     for s in (0, len(states) - 1):
         np.testing.assert_array_equal(setup.path.expected_photons(states[s : s + 1], single=False)[0], together[0][s])
