@@ -44,17 +44,22 @@ def in_pieces(measure: Callable[[slice], SpotPositions], count: int, threads: in
     """Measure `count` spots a few at a time and join the results; SpotError then names the bad spots of all pieces."""
     reasons: dict[int, str] = {}
 
-    def piece(start: int, size: int = _PIECE) -> SpotPositions | None:
-        end = min(start + size, count)
+    def tried(start: int, end: int) -> SpotPositions | None:
         try:
             return measure(slice(start, end))
         except SpotError as error:
             reasons.update({start + n: reason for n, reason in error.reasons.items()})
-        if size > 1:
+        return None
+
+    # two functions, since one that called itself would keep all images until Python looks for what refers to itself
+    def piece(start: int) -> SpotPositions | None:
+        end = min(start + _PIECE, count)
+        found = tried(start, end)
+        if found is None and end > start + 1:
             # spots that are bad for another reason are not named yet
             for n in range(start, end):
-                piece(n, 1)
-        return None
+                tried(n, n + 1)
+        return found
 
     starts = range(0, count, _PIECE)
     if threads == 1:
