@@ -25,7 +25,8 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.test_course import JOB as COURSE
 from twin.live.live_bench import LiveBench
-from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState
+from twin.live.messages import MOST_FRAMES, AskedState
+from twin.live.recording import job_text
 from twin.live.source import Source, read_source
 from twin.main_job.job_tables import config_text
 from twin.main_job.monitor_reading import stated
@@ -166,17 +167,30 @@ def test_what_was_changed_after_the_run_is_told(tmp_path):
     assert "was changed after the run" in source.notes[0]
 
 
-def test_numbers_that_a_page_cannot_hold_are_told(pair, tmp_path):
-    """More frames than a page reads; a seed that a number in JSON would round, to another draw of the noise."""
-    seed = 2**60 + 12345
-    many = JOB.replace("frames: 2, seed: 1", f"frames: {MOST_FRAMES + 1}, seed: {seed}")
+def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
+    many = JOB.replace("frames: 2", f"frames: {MOST_FRAMES + 1}")
     source = read_source(str(written(tmp_path, many)))
-    assert len(source.notes) == 2
-    assert str(seed) in source.notes[1]
-    rest = bench_of(source, pair).at_rest
-    assert (rest.frames, rest.seed) == (MOST_FRAMES, seed & LARGEST_SEED)
-    assert rest.seed == 12345
-    assert float(rest.seed) == rest.seed
+    assert source.notes == (f"the page takes {MOST_FRAMES} frames in place of {MOST_FRAMES + 1}",)
+    assert bench_of(source, pair).at_rest.frames == MOST_FRAMES
+    assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
+
+
+def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, backend, tmp_path):
+    """A number in JSON holds 53; the noise is that of all, and the saved job has all."""
+    seed = 2**62 + 2**55 + 12345
+    file = written(tmp_path, JOB.replace("seed: 1", f"seed: {seed}"))
+    bench = bench_of(read_source(str(file)), pair)
+    asked = AskedState(**json.loads(bench.at_rest.model_dump_json()))
+    assert asked.seed == 12345
+    assert bench.greeting()["seed"] == 12345
+    run = render_job(resolve(file), backend, experiment=bench_experiment(pair, tmp_path))
+    shown, after = bench.state(asked)
+    assert shown["readings"] == stated(run.recovered_dict())
+    assert np.array_equal(after, run.after[:, 0])
+    assert np.array_equal(bench.before(asked), run.before[:, 0])
+    assert resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")).job.render.seed == seed
+    other = AskedState(**{**asked.model_dump(), "seed": 12346})
+    assert resolve(written(tmp_path, job_text(bench, other), "saved.yaml")).job.render.seed == 12346
 
 
 def test_a_folder_does_not_hide_an_instrument_of_the_library(tmp_path, monkeypatch):
@@ -282,15 +296,15 @@ def test_a_study_folder_opens_its_base_with_factors_as_knobs(studied):
 
 @pytest.mark.parametrize("number", range(8))
 def test_a_run_of_a_study_opens_as_it_was_run(studied, number):
-    """Everything that its factors set, texts and ratios among it, and its seed as far as a page can hold it."""
+    """Everything that its factors set, texts and ratios among it, and its seed."""
     setup = resolve_study(studied / "config.yaml")
     plan = Plan.of(setup)
     run = plan.run(number)
     expected = read_job(with_values(setup.tree, run.values))
     assert run.seed is not None
     source = read_source(str(studied), number)
-    assert source.resolved == expected.with_render(expected.frames, run.seed & LARGEST_SEED)
-    assert (run.seed > LARGEST_SEED) == any("another draw" in note for note in source.notes)
+    assert source.resolved == expected.with_render(expected.frames, run.seed)
+    assert source.notes == ()
     values = {column.name: column.values[number].item() for column in plan.columns}
     for factor in source.factors:
         assert factor.value == values[factor.name]
@@ -435,8 +449,8 @@ def commanded(*arguments: object) -> None:
 @pytest.mark.slow
 def test_folders_that_the_commands_made(pair, tmp_path):
     """A study's run is what the study wrote of it; a measurement and a list of limits open; a camera's run does not."""
-    text = STUDY.replace("design:", "noise: shared\ndesign:").replace("[1, 4]", "[2, 4]")
-    text = text.replace("runs: 8", "runs: 3").replace("  light:", "  #").replace("[ml, gaussian]", "[ml, ml]")
+    text = STUDY.replace("[1, 4]", "[2, 4]").replace("runs: 8", "runs: 3")
+    text = text.replace("  light:", "  #").replace("[ml, gaussian]", "[ml, ml]")
     written(tmp_path, JOB)
     commanded("twin.study", written(tmp_path, text, "study.yaml"), "--out", tmp_path / "study", "--workers", 1)
     import xarray as xr

@@ -20,7 +20,7 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.translate import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
-from twin.live.messages import LARGEST_SEED, MOST_FRAMES
+from twin.live.messages import MOST_FRAMES
 from twin.live.study_factors import FactorKnob, base_with, factor_knobs
 from twin.run.run_folder import Manifest, read_manifest
 from twin.study.runs.plan import Plan
@@ -79,7 +79,7 @@ class Source:
                 )
         scalars = {**(self.scalars or {}), **{name: known[name].scalar(value) for name, value in values.items()}}
         made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with(self.study, scalars), {}))
-        return made.with_render(made.frames, self.resolved.job.render.seed) if self.own_noise else _seeded(made)
+        return made.with_render(made.frames, self.resolved.job.render.seed) if self.own_noise else made
 
 
 def read_source(what: str, run: int | None = None) -> Source:
@@ -268,16 +268,8 @@ def _of_study(file: Path, run: int | None) -> Source:
 
 
 def _for_a_page(source: Source) -> Source:
-    """The source with numbers that a page can hold, and what that changes told."""
-    seed, frames, notes = source.resolved.job.render.seed, source.resolved.frames, list(source.notes)
-    if frames > MOST_FRAMES:
-        notes.append(f"the page takes {MOST_FRAMES} frames in place of {frames}")
-    if seed > LARGEST_SEED:
-        notes.append(f"the noise is another draw: the seed {seed} is larger than the numbers of a page can be")
-    return replace(source, resolved=_seeded(source.resolved), notes=tuple(notes))
-
-
-def _seeded(resolved: ResolvedJob) -> ResolvedJob:
-    """With a seed that a page can hold: the last bits of one that is too large."""
-    seed = resolved.job.render.seed
-    return resolved if seed <= LARGEST_SEED else resolved.with_render(resolved.frames, seed & LARGEST_SEED)
+    """The source, and what a page changes of it told."""
+    frames = source.resolved.frames
+    if frames <= MOST_FRAMES:
+        return source
+    return replace(source, notes=(*source.notes, f"the page takes {MOST_FRAMES} frames in place of {frames}"))
