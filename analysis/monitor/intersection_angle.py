@@ -93,27 +93,17 @@ def exact(
     nominal = abs(forward_look_rad - backward_look_rad)
     if nominal < 1e-3:
         raise ValueError("intersection angle: the cameras look the same way, their angle has no direction to change in")
-    looks = (forward_look_rad, backward_look_rad)
-    given = [(np.asarray(c.d_alpha_rad, np.float64), np.asarray(c.d_beta_rad, np.float64)) for c in (forward, backward)]
-
-    def angle(values: list[tuple[Array, Array]]) -> Array:
-        u, v = (_line_of_sight(a, b, look) for (a, b), look in zip(values, looks, strict=True))
-        return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.sum(u * v, axis=-1)))
-
+    rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
+    given = np.stack(np.broadcast_arrays(*(np.asarray(one, np.float64) for one in rotations)))
+    # the angle as it is, and with each rotation a step further and back
     step = 1e-5
-    slopes: list[Array] = []
-    for k in range(2):
-        both = []
-        for which in (0, 1):
-            ends = []
-            for sign in (1, -1):
-                moved = list(given)
-                pair = list(given[k])
-                pair[which] = pair[which] + sign * step
-                moved[k] = (pair[0], pair[1])
-                ends.append(angle(moved))
-            both.append((ends[0] - ends[1]) / (2 * step))
-        slopes.append(np.stack(np.broadcast_arrays(*both), axis=-1))
+    moves = np.concatenate([np.zeros((1, 4)), step * np.eye(4), -step * np.eye(4)]).T
+    d_alpha, d_beta, other_alpha, other_beta = given[:, None] + moves.reshape(4, 9, *(1,) * (given.ndim - 1))
+    angles = _between(
+        _line_of_sight(d_alpha, d_beta, forward_look_rad), _line_of_sight(other_alpha, other_beta, backward_look_rad)
+    )
+    each = (angles[1:5] - angles[5:]) / (2 * step)
+    slopes = [np.stack([each[2 * k], each[2 * k + 1]], axis=-1) for k in range(2)]
 
     def sigma(own: tuple[Array, Array], shared: Array | None) -> Array:
         variance: Any = 0.0
@@ -123,19 +113,26 @@ def exact(
             variance = variance + 2 * np.einsum("...i,...ij,...j->...", slopes[0], shared[..., :2, :2], slopes[1])
         return np.sqrt(variance)
 
-    change = angle(given) - nominal
+    change = angles[0] - nominal
     noise = sigma((forward.covariance, backward.covariance), across)
     if forward.total is None or backward.total is None:
         return IntersectionAngleChange(change, noise)
     return IntersectionAngleChange(change, sigma((forward.total, backward.total), across_total), noise)
 
 
-def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> Array:
-    """(..., 3) unit vector in the base frame: +Z turned by the rotation vector (d_beta, d_alpha, 0), then by the look
-    angle.
+def _between(u: tuple[Array, Array, Array], v: tuple[Array, Array, Array]) -> Array:
+    """Angle between unit vectors given by their components."""
+    (ux, uy, uz), (vx, vy, vz) = u, v
+    sine = np.sqrt((uy * vz - uz * vy) ** 2 + (uz * vx - ux * vz) ** 2 + (ux * vy - uy * vx) ** 2)
+    return np.asarray(np.arctan2(sine, ux * vx + uy * vy + uz * vz))
+
+
+def _line_of_sight(d_alpha: Array, d_beta: Array, look: float) -> tuple[Array, Array, Array]:
+    """Components of the unit vector in the base frame: +Z turned by the rotation vector (d_beta, d_alpha, 0), then by
+    the look angle.
     """
     turn = np.hypot(d_alpha, d_beta)
     ratio = np.sinc(turn / np.pi)
     x, y, z = ratio * d_alpha, -ratio * d_beta, np.cos(turn)
     c, s = math.cos(look), math.sin(look)
-    return np.stack(np.broadcast_arrays(c * x + s * z, y, c * z - s * x), axis=-1)
+    return c * x + s * z, y, c * z - s * x

@@ -16,7 +16,6 @@ from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.derivatives import jvp
-from optics.raytrace.element_numbers import FrameNumbers
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.imaging import aim_collimated
@@ -114,17 +113,10 @@ def trace_beams(
     if not valid.all():
         raise BeamMissedError("a part of a beam misses a surface of the prescription")
     hits = np.stack([traced.hit(i)[0] for i in keep])
-    rotation, origin = _stands(imaging.world)
-    points = np.einsum("kij,knj->kni", rotation[:, 0], hits) + origin[:, 0, None]
+    points = np.einsum("kij,knj->kni", imaging.world.rotation[0], hits) + imaging.world.translation[0][:, None]
     points = np.concatenate([launch[None], points.reshape(len(hits), *shape)])
     rays = DesignRays(position.reshape(shape), direction.reshape(shape), path.reshape(shape[:2]) + phase, points)
     return rays if variables is None else _differentiated(backend, prescription, beams, variables, rays, chief)
-
-
-def _stands(poses: Sequence[FrameNumbers]) -> tuple[np.ndarray, np.ndarray]:
-    """World rotation (K, B, 3, 3) and origin (K, B, 3) of a batch's elements, or their derivatives."""
-    rotation, origin = zip(*(pose.arrays() for pose in poses), strict=True)
-    return np.stack(rotation), np.stack(origin)
 
 
 def _differentiated(
@@ -174,8 +166,8 @@ def _differentiated(
         keep=keep,
     )
     assert systems.world_tangents is not None
-    rotation, _ = _stands(systems.world)
-    rotation_step, origin_step = _stands(systems.world_tangents)
+    rotation, rotation_step = (np.swapaxes(p.rotation, 0, 1) for p in (systems.world, systems.world_tangents))
+    origin_step = np.swapaxes(systems.world_tangents.translation, 0, 1)
     hits = np.stack([pushed.traced.hit(k) for k in keep])
     hit_steps = np.stack([pushed.hits[k] for k in keep])
     points = np.einsum("kvij,kvnj->kvni", rotation, hit_steps) + np.einsum("kvij,kvnj->kvni", rotation_step, hits)

@@ -26,6 +26,21 @@ def one_blas_thread() -> Iterator[None]:
         yield
 
 
+def kernel_threads(count: int) -> None:
+    """From now on kernels of this process run on so many threads, the calling one among them.
+
+    Small ones are faster on one: threads that wait for the next kernel do so actively, and take their cores from all
+    else.
+
+    Args:
+        count: number of threads, at least 1.
+    """
+    import drjit as dr
+
+    if dr.thread_count() != count:
+        dr.set_thread_count(count)
+
+
 LIMIT = "TWIN_THREADS"
 """Environment variable that limits ``cores``, for processes that share the machine with others of their kind."""
 

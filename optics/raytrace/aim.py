@@ -75,7 +75,8 @@ def aim(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Solve for the rays that meet the last element of ``systems`` at ``target``.
 
-    Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update.
+    Newton's method with one difference Jacobian per ray, improved by Broyden's rank-one update. A ray that has arrived
+    stays, so that its numbers do not depend on what else is aimed with it.
 
     Args:
         backend: where to trace.
@@ -118,13 +119,13 @@ def aim(
             return q, slope
         if not np.isfinite(worst):
             break  # also after a step along a singular Jacobian
-        change = _solve(slope, miss)
+        moving = np.max(np.abs(miss), axis=-1)[..., None] > tolerance
+        change = np.where(moving, _solve(slope, miss), 0.0)
         q = q + change
         there = hit(q)
         error = (there - here) - np.einsum("bnij,bnj->bni", slope, change)
         norm = np.sum(change**2, axis=-1)[..., None, None]
-        # rays that have arrived take no meaningful step; their slope stays
-        moving = np.max(np.abs(miss), axis=-1)[..., None, None] > tolerance
+        moving = moving[..., None]
         update = error[..., :, None] * change[..., None, :] / np.where(moving, norm, 1.0)
         slope = np.where(moving, slope + update, slope)
         here = there

@@ -136,7 +136,7 @@ def vjp(
     import drjit as dr
 
     alone = replace(systems, tangents=None, world_tangents=None)
-    uploaded = replace(alone.upload(backend), differentiable=True)
+    uploaded = replace(alone.upload(backend, own=True), differentiable=True)
     wanted = [leaves(numbers)[path] for numbers, own in zip(uploaded.values, names, strict=True) for path in own]
     rays = make_rays(backend, position, direction)
     for variable in (*wanted, rays.position, rays.direction):

@@ -69,11 +69,6 @@ class FrameNumbers:
         """Of x, y and z."""
         return self.x, self.y, self.z
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (B, 3, 3) and translation (B, 3), NumPy."""
-        rotation = np.array([c.turn for c in self.coordinates])
-        return np.moveaxis(rotation, -1, 0), np.stack([c.shift for c in self.coordinates], axis=-1)
-
 
 @dataclass(frozen=True, eq=False)
 class IndexNumbers:
@@ -215,12 +210,6 @@ def numbers_of(
         outer,
         inner,
     )
-
-
-def world_frame(element: Element, placed: PlacedBodies) -> FrameNumbers:
-    """Pose of an element in the world, (S,) each, complex when a derivative is carried."""
-    body = placed.index[element.body]
-    return FrameNumbers.of(placed.rotation[:, body], placed.translation[:, body])
 
 
 def _index_numbers(

@@ -13,6 +13,36 @@ from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, require_some, trace
 
 
+def aim_chief_rays(
+    backend: Backend,
+    to_stop: SystemBatch,
+    points: np.ndarray,
+    guess: np.ndarray,
+    transverse: np.ndarray,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[RayFan, np.ndarray, np.ndarray]:
+    """Aim rays of image points at the centre of the stop.
+
+    Args:
+        backend: where to trace.
+        to_stop: B systems from the image side to the stop (last element).
+        points: image points, world, (B, M, 3).
+        guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
+        transverse: direction near which the first transverse axis is taken, (3,).
+        start: parameters (B, M, 2) and their Jacobian (B, M, 2, 2) of rays that are near, as this returns them.
+
+    Returns:
+        The family of the rays, their parameters (B, M, 2) and Jacobian (B, M, 2, 2).
+
+    Raises:
+        AimError: no ray gets there.
+    """
+    direction = np.broadcast_to(guess, points.shape)
+    fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
+    near, slope = (None, None) if start is None else start
+    return fan, *aim(backend, to_stop, fan, np.zeros(2), near, slope)
+
+
 def chief_rays(
     backend: Backend,
     to_stop: SystemBatch,
@@ -20,6 +50,7 @@ def chief_rays(
     points: np.ndarray,
     guess: np.ndarray,
     transverse: np.ndarray,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Chief rays of image points, traced backward from the image through the centre of the stop.
 
@@ -30,13 +61,15 @@ def chief_rays(
         points: image points, world, (B, M, 3).
         guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
         transverse: direction near which the first transverse axis is taken, (3,).
+        start: as of `aim_chief_rays`.
 
     Returns:
         Points on the rays after the first mirror, and object-space directions toward the scene, world, (B, M, 3) each.
+
+    Raises:
+        AimError, BeamMissedError: light is lost.
     """
-    direction = np.broadcast_to(guess, points.shape)
-    fan = RayFan(points, direction, transverse_axes(direction, np.broadcast_to(transverse, direction.shape)))
-    q, _ = aim(backend, to_stop, fan, np.zeros(2))
+    fan, q, _ = aim_chief_rays(backend, to_stop, points, guess, transverse, start)
     position, direction = fan.at(q)
     out = trace(backend, to_object, make_rays(backend, position, direction), world=True)
     assert out.world is not None
@@ -52,6 +85,7 @@ def chief_directions(
     points: np.ndarray,
     guess: np.ndarray,
     transverse: np.ndarray,
+    start: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
     """Object-space directions of ``chief_rays``, toward the scene, world, (B, M, 3).
 
@@ -62,8 +96,9 @@ def chief_directions(
         points: image points, world, (B, M, 3), metres.
         guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
         transverse: direction near which the first transverse axis is taken, (3,).
+        start: as of `aim_chief_rays`.
     """
-    return chief_rays(backend, to_stop, to_object, points, guess, transverse)[1]
+    return chief_rays(backend, to_stop, to_object, points, guess, transverse, start)[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,12 +99,15 @@ def image(field: PupilField, x: Grid, y: Grid, single: bool = False) -> np.ndarr
     count = len(field.u)
     out = np.empty((count, y.count, x.count))
 
+    # a few images use all cores, too
+    together = max(1, min(_AT_ONCE, count // cores()))
+
     def piece(start: int) -> None:
-        some = slice(start, start + _AT_ONCE)
+        some = slice(start, start + together)
         _irradiance(field[some], k, x, y, np.complex64 if single else np.complex128, out[some])
 
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        list(pool.map(piece, range(0, count, _AT_ONCE)))
+        list(pool.map(piece, range(0, count, together)))
     return out
 
 

@@ -86,7 +86,7 @@ def test_forward_mode_for_every_motion(backend, bare, rays) -> None:
 @pytest.mark.parametrize("name", ["c", "k", "A0"])
 def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str) -> None:
     systems = assemble(bare, ["imaging"], [BASE])
-    uploaded = replace(systems.upload(backend), differentiable=True)
+    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
     parameter = leaves(uploaded.values[mirror])[NUMBERS[name]]
     dr.enable_grad(parameter)
     dr.set_grad(parameter, backend.opaque([1.0]))
@@ -108,7 +108,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> N
     """d(sum w . out)/d(parameters) of all four elements in one backward sweep."""
     systems = assemble(bare, ["imaging"], [BASE])
     weight = np.random.default_rng(1).normal(size=(len(rays[0]), 4))
-    uploaded = replace(systems.upload(backend), differentiable=True)
+    uploaded = replace(systems.upload(backend, own=True), differentiable=True)
     wanted: list[Path] = [
         (0, *NUMBERS["c"]),
         (0, "surface", "even", 1),
@@ -129,7 +129,7 @@ def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> N
     reverse = np.array([dr.grad(numbers[path])[0] for path in wanted])
     forward = []
     for path in wanted:
-        fresh = replace(systems.upload(backend), differentiable=True)
+        fresh = replace(systems.upload(backend, own=True), differentiable=True)
         number = leaves(fresh.values)[path]
         dr.enable_grad(number)
         dr.set_grad(number, backend.opaque([1.0]))

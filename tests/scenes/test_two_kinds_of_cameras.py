@@ -9,7 +9,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.yaml.errors import InputError
-from twin.monitor.truth import trace_sight
+from twin.monitor.truth import LineSight
 
 GF7 = load_camera("gf7")
 
@@ -32,7 +32,7 @@ def test_terms_that_one_camera_lacks_are_zero(backend) -> None:
     """The forward camera, which has no A8, sees what it sees beside its like."""
     terms = dict(GF7.mirrors["M3"].aspheric)
     alone, zero, more = (
-        trace_sight(built(backend, with_terms(t)), backend, [{}])
+        LineSight(built(backend, with_terms(t)), backend).trace([{}])
         for t in (terms, {**terms, "A8": 0.0}, {**terms, "A8": 1e-7})
     )
     np.testing.assert_allclose(zero, alone, rtol=0, atol=1e-15)

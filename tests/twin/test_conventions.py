@@ -19,7 +19,7 @@ from scenes.models.thermal_model import ThermalModel
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family
-from twin.monitor.truth import trace_sight, trace_truth, truth_jacobian
+from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
 from twin.orbit.flight.line_camera import traced_line_cameras
 
 CAMERA = "forward"
@@ -222,7 +222,7 @@ def test_principal_distance_is_eq_3_of_paper_004(gf7_pair, backend):
 def test_the_truth_and_the_pixels_in_orbit_see_the_whole_line(name: str, instrument, backend):
     """The looks of its very ends, sent back into the camera, arrive at the outer edges of the first and last pixels."""
     chosen = instrument(name)
-    sight = trace_sight(chosen, backend, [{}])[:, 0]
+    sight = LineSight(chosen, backend).trace([{}])[:, 0]
     lines = traced_line_cameras(chosen, backend)
     for looks, (camera, model) in zip(sight, chosen.cameras.items(), strict=True):
         line, seen = model.spec.line, lines[camera]

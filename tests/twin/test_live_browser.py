@@ -111,6 +111,33 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     assert distance == pytest.approx(1e-6 * value * factor, rel=0.06)
 
 
+def test_the_view_in_three_dimensions_does_not_hold_up_a_drag(page):
+    """Without a graphics card it is slow to draw: of two seconds of a drag not more than two frames show it anew."""
+    drawn = page.page.evaluate(
+        """async (knob) => {
+          const slider = document.querySelector(`#tree .knob[data-knob="${knob}"] input[type=range]`);
+          const render = Object.getPrototypeOf(liveTwin.scene).render;
+          let drawn = 0;
+          liveTwin.scene.render = function () { drawn += 1; render.call(this); };
+          const end = performance.now() + 2000;
+          for (let k = 1; performance.now() < end; k += 1) {
+            slider.value = 2 * Math.sin(k / 9);
+            slider.dispatchEvent(new Event('input', { bubbles: true }));
+            await new Promise((next) => setTimeout(next, 30));
+          }
+          const during = drawn;
+          await new Promise((next) => setTimeout(next, 1500));
+          delete liveTwin.scene.render;
+          return [during, drawn, liveTwin.scene.cost];
+        }""",
+        DESPACE,
+    )
+    during, after, cost = drawn
+    assert cost > 12.0, "the time of a software drawing is that of its work, not of handing it over"
+    assert during <= 2
+    assert after > during, "the last state is drawn once the knob rests"
+
+
 def test_undo_redo_reset_and_typed_numbers(page):
     page.number(DESPACE).fill("2.5")
     page.number(DESPACE).press("Enter")

@@ -156,3 +156,54 @@ def digest(processors: set[int]) -> str:
 def test_same_bytes_on_one_processor_and_on_all() -> None:
     every = os.sched_getaffinity(0)
     assert digest({min(every)}) == digest(every) != ""
+
+
+def one_by_one(setup) -> list[State]:
+    """Every body of an instrument moved, turned, grown and with another index, alone."""
+    small = Motion(rotate=(2e-6, 1e-6, -1e-6), shift=(1e-7, -2e-7, 1e-7), scale=1e-7, index=1e-8)
+    return [{body.path: small} for body in setup.instrument.assembly.tree.bodies]
+
+
+def test_cameras_whose_light_a_body_changes(setup) -> None:
+    """To the bit: of the others not even the last digit of a spot's place moves, and of these some spot does."""
+    path, states = setup.path, one_by_one(setup)
+    places = path.coarse_trace([{}, *states]).place
+    moved = [path.moved_cameras(state) for state in states]
+    for s, (state, cameras) in enumerate(zip(states, moved, strict=True), 1):
+        for channel, place in zip(path.channels, places, strict=True):
+            if channel.camera not in cameras:
+                np.testing.assert_array_equal(place[s], place[0], str(state))
+    assert path.moved_cameras({}) == ()
+    names = set(setup.instrument.cameras)
+    assert {f"{BASE}/{name}/M2" for name in names} == {next(iter(s)) for s in states if "/M2" in next(iter(s))}
+    for state, cameras in zip(states, moved, strict=True):
+        body = next(iter(state))
+        if body in {f"{BASE}/{name}/{part}" for name in names for part in ("M1", "M2", "focal_plane")}:
+            assert cameras == (body.split("/")[1],), body
+    assert moved[[next(iter(s)) for s in states].index(BASE)] == tuple(setup.instrument.cameras)
+
+
+def test_channels_left_alone_are_rendered_once_and_alike(setup) -> None:
+    """Photons of one state are those of ``expected_photons`` to the bit, whichever channels were kept."""
+    path = setup.path
+    first = next(iter(setup.instrument.cameras))
+    small = Motion(rotate=(2e-6, 1e-6, -1e-6))
+    far = Motion(shift=(0.2 * path.pitch * path.shape[0], 0.0, 0.0))  # in another class of nodes
+    for state in ({}, {f"{BASE}/{first}/M2": small}, {BASE: small}, {f"{BASE}/{first}/focal_plane": far}):
+        kept = path.photons_of(state)
+        np.testing.assert_array_equal(kept, path.expected_photons([state], single=False)[0])
+        kept[:] = 0.0  # the caller's own
+
+
+def test_a_state_is_the_same_alone_and_among_others(setup) -> None:
+    """More states never change one: photons and lines of sight are the same to the bit."""
+    names = list(setup.instrument.cameras)
+    rng = np.random.default_rng(3)
+    states: list[State] = [
+        {f"{BASE}/{name}/{body}": Motion(rotate=tuple(3e-6 * rng.normal(size=3)), shift=tuple(2e-6 * rng.normal(size=3)))}
+        for name, body in zip(names * 2, ("M2", "focal_plane", "M1", "M3"), strict=False)
+    ]
+    together = setup.path.expected_photons(states, single=False), setup.sight.trace(states)
+    for s in (0, len(states) - 1):
+        np.testing.assert_array_equal(setup.path.expected_photons(states[s : s + 1], single=False)[0], together[0][s])
+        np.testing.assert_array_equal(setup.sight.trace(states[s : s + 1])[:, 0], together[1][:, s])

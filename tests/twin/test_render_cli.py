@@ -25,7 +25,7 @@ import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
-from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings
+from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, drawings
 from twin.main_job.render_job import render_job
 
 run = partial(invoke, command.app)
@@ -119,7 +119,7 @@ def ready(repeated, monkeypatch):
     monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept[0])
 
     def few(*given):
-        return {SCENE: bytes, SUMMARY: bytes, **{name: drawings(*given)[name] for name in (LIMITS, IRRADIANCE)}}
+        return {SCENE: bytes, SUMMARY: bytes, IRRADIANCE: drawings(*given)[IRRADIANCE]}
 
     monkeypatch.setattr(twin.main_job.render_command, "drawings", few)
     monkeypatch.setattr(twin.main_job.render_command, "render_report", lambda *_: "")

@@ -129,7 +129,7 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     _end_with(os.getppid())
     from optics.numerics.backend import BackendUnavailable
     from optics.numerics.llvm import LibraryMissing
-    from optics.numerics.threads import one_blas_thread
+    from optics.numerics.threads import cores, kernel_threads, one_blas_thread
     from scenes.yaml.errors import InputError
     from twin.live.answers import Answers
 
@@ -148,6 +148,8 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
                 kind, question = pipe.recv()
             except (EOFError, OSError):
                 return
+            # a state is many small kernels; whatever else is asked for may have large ones
+            kernel_threads(1 if kind == "state" else cores())
             pipe.send(answers.to(kind, question))
 
 

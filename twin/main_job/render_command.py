@@ -16,7 +16,7 @@ from twin.main_job.assumptions import assumed
 from twin.main_job.deformation_results import faces_of
 from twin.main_job.finish_section import finish_section
 from twin.main_job.heat_section import heat_section
-from twin.main_job.render_drawings import IRRADIANCE, LIMITS, SCENE, SUMMARY, drawings, load_drawing
+from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, drawings, load_drawing
 from twin.main_job.render_files import write_results
 from twin.main_job.render_job import render_job
 from twin.main_job.render_report import PICTURES, render_report
@@ -90,10 +90,11 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     made = (_deformed(run), heat_section(run), finish_section(run))
     tables = tuple(section for section in made if section is not None)
     further = further_sections("render", run)
+    limits = _limits(run)
     drawn = beside.results()
     for name, file in ((IRRADIANCE, "irradiance.nc"), (SCENE, "scene.glb"), (SUMMARY, "summary.png")):
         folder.write_bytes(file, drawn[name])
-    sections = (*tables, drawn[LIMITS], *further)
+    sections = (*tables, limits, *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problem = ""
     if picture:
@@ -104,6 +105,13 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
     write_manifest(folder, PROGRAM, session.started, seconds, **entries)
     return problem
+
+
+def _limits(run: RenderRun) -> Section:
+    """The section on what limits the readings."""
+    from twin.uncertainty.uncertainty_report import limits_section
+
+    return limits_section(run.limits)
 
 
 def _deformed(run: RenderRun) -> Section | None:

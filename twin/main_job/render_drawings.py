@@ -10,18 +10,16 @@ from optics.geometry.tree import State
 from scenes.models.instrument_model import Instrument
 from twin.main_job.render_results import RenderRun
 from twin.pictures.light_paths import LightPaths
-from twin.run.report import Section
-from twin.uncertainty.monitor_limits import MonitorLimits
 
-__all__ = ["APART", "IRRADIANCE", "LIMITS", "SCENE", "SUMMARY", "drawings", "load_drawing"]
+__all__ = ["APART", "IRRADIANCE", "SCENE", "SUMMARY", "drawings", "load_drawing"]
 
-LIMITS, SUMMARY, SCENE, IRRADIANCE = "limits", "summary", "scene", "irradiance"
-"""What is no figure of the report's own: the section on limits, the bytes of summary.png, scene.glb, irradiance.nc."""
-APART = (LIMITS, SUMMARY, SCENE, IRRADIANCE)
+SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
+"""What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
+APART = (SUMMARY, SCENE, IRRADIANCE)
 
 
 def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any]]:
-    """Name -> what draws it, the longest first: <svg> elements but for ``LIMITS`` and what is written as it is.
+    """Name -> what draws it, the longest first: <svg> elements but for ``APART``, which are written as they are.
 
     Args:
         run: the run; what it works out on demand is taken as it is now.
@@ -30,7 +28,6 @@ def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any
     experiment = run.experiment
     out: dict[str, Callable[[], Any]] = {"motions": partial(_motions, run)}
     out |= {f"spots {name}": partial(_spots, run, name) for name in experiment.instrument.cameras}
-    out[LIMITS] = partial(_limits, run.limits)
     out[IRRADIANCE] = partial(_irradiance, run)
     out["footprints"] = partial(_footprints, experiment.instrument, paths)
     if run.targets is not None:
@@ -99,12 +96,6 @@ def _footprints(instrument: Instrument, paths: LightPaths) -> str:
     from twin.main_job.light_path_plots import footprints_svg
 
     return footprints_svg(instrument, paths)
-
-
-def _limits(limits: MonitorLimits | None) -> Section:
-    from twin.uncertainty.uncertainty_report import limits_section
-
-    return limits_section(limits)
 
 
 def _summary(run: RenderRun) -> bytes:

@@ -27,7 +27,6 @@ from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import SpotFocus
 from twin.monitor.time_series import run_series, series_states, too_large
-from twin.monitor.truth import trace_truth
 from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
 from twin.run.procedure import Advance, silent
@@ -111,18 +110,18 @@ def render_job(
     except (AimError, BeamMissedError) as error:
         raise _no_spots(resolved, str(error)) from error
     try:
-        truth = trace_truth(experiment.instrument, backend, [state])
+        truth = experiment.sight.truth([state])
         stage.begin(3)
         calibration = experiment.calibration
         stage.begin(4)
         nominal = experiment.nominal_photons
-        photons = experiment.path.expected_photons([state], single=False) if course is None else None
+        photons = experiment.path.photons_of(state)[None] if course is None else None
     except (AimError, BeamMissedError) as error:
         raise _too_large(resolved, str(error)) from error
     series = None
     if photons is None:
         series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
-        # rendered among other states a state differs in the last bit, and with it all noise; the run shows one of both
+        # a course is rendered in single precision; the run shows the frames that it measured
         photons = series.shown_photons[None]
     stray = None
     if resolved.job.render.stray is not None:

@@ -38,7 +38,7 @@ from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath, SpotFocus
 from twin.monitor.motions import line_family
 from twin.monitor.stated_disturbances import disturbances_of
-from twin.monitor.truth import Truth, ground_geometry, trace_truth, truth_jacobian
+from twin.monitor.truth import LineSight, Truth, ground_geometry, truth_jacobian
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
@@ -171,7 +171,12 @@ class MonitorExperiment:
     @cached_property
     def nominal_truth(self) -> Truth:
         """Principal distances and intersection angle of the unperturbed instrument."""
-        return trace_truth(self.instrument, self.backend, [{}])
+        return self.sight.truth([{}])
+
+    @cached_property
+    def sight(self) -> LineSight:
+        """What the line CCDs see."""
+        return LineSight(self.instrument, self.backend)
 
     @cached_property
     def _truth_by_family(self) -> dict[str, np.ndarray]:

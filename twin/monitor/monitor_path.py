@@ -8,7 +8,7 @@ imaged at unit scale.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,13 +22,14 @@ from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.element_numbers import touched_bodies
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pixel_response import PixelResponse
 from optics.waves.wavefront import eikonal
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import Channel
+from scenes.specs.channel import BASE, Channel
 
 MAP_TERMS = 15
 """Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
@@ -46,6 +47,9 @@ SCOUT_RINGS = 4
 AIM_TOLERANCE = 1e-9
 """Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
 radius."""
+
+CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
+"""Likewise of the rays from which those of other states are predicted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,12 +135,20 @@ class MonitorPath:
         backend: where to trace.
         nodes: pupil quadrature; by default one that is right to 1e-6 of the peak for spots anywhere in the last of
             ``SPOT_RANGES`` of the CCD, out to the far corner, and for images those of ``classes``.
+        cameras: whose channels; None for all. Numbers of a channel do not depend on which others there are.
     """
 
-    def __init__(self, instrument: Instrument, backend: Backend, nodes: PupilNodes | None = None) -> None:
+    def __init__(
+        self,
+        instrument: Instrument,
+        backend: Backend,
+        nodes: PupilNodes | None = None,
+        cameras: Collection[str] | None = None,
+    ) -> None:
         self.instrument = instrument
         self.backend = backend
-        self.channels: tuple[Channel, ...] = instrument.channels
+        self.cameras = tuple(name for name in instrument.cameras if cameras is None or name in cameras)
+        self.channels: tuple[Channel, ...] = tuple(c for c in instrument.channels if c.camera in self.cameras)
         ccd = instrument.spec.monitor.area_ccd
         self.shape = (ccd.rows, ccd.columns)
         self.pitch: float = ccd.pitch
@@ -155,8 +167,10 @@ class MonitorPath:
         """Paths with as many nodes as the spots in each of ``SPOT_RANGES`` need; the last one is this path."""
         if not self._sized:
             return (self,)
-        inner = (MonitorPath(self.instrument, self.backend, self._nodes_for(share)) for share in SPOT_RANGES[:-1])
-        return (*inner, self)
+        return (*(self._with(self._nodes_for(share)) for share in SPOT_RANGES[:-1]), self)
+
+    def _with(self, nodes: PupilNodes) -> MonitorPath:
+        return MonitorPath(self.instrument, self.backend, nodes, self.cameras)
 
     def class_of(self, place: np.ndarray, margin: int = 0) -> np.ndarray:
         """Number of the first of ``classes`` that is right for all spots of each state, (S,).
@@ -174,17 +188,18 @@ class MonitorPath:
     def numerical_aperture(self) -> float:
         """Of the returned beam at the CCD, the largest among the cameras."""
         scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
-        return float(np.max(self.face_radius)) / float(np.min(scales))
+        widest = max(channel.aperture for channel in self.instrument.channels)
+        return 0.5 * widest / float(np.min(scales))
 
     @cached_property
     def coarse(self) -> MonitorPath:
         """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
-        return MonitorPath(self.instrument, self.backend, quadrature.disk(COARSE_RINGS))
+        return self._with(quadrature.disk(COARSE_RINGS))
 
     @cached_property
     def scout(self) -> MonitorPath:
         """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
-        return MonitorPath(self.instrument, self.backend, quadrature.disk(SCOUT_RINGS))
+        return self._with(quadrature.disk(SCOUT_RINGS))
 
     @cached_property
     def nominal(self) -> Aimed:
@@ -231,9 +246,9 @@ class MonitorPath:
     def _aim_nominal(self) -> Aimed:
         """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
-        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
+        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=CLOSE_TOLERANCE)
         near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
-        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, AIM_TOLERANCE)
+        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, CLOSE_TOLERANCE)
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
 
@@ -250,7 +265,7 @@ class MonitorPath:
         back = assemble(self.instrument.assembly, names, states, placed=placed)
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
-        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, AIM_TOLERANCE)
+        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, CLOSE_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
@@ -390,11 +405,74 @@ class MonitorPath:
                 photons = self._render(some, margin, single)
             yield slice(start, start + len(some)), photons
 
-    def _render(self, states: Sequence[State], margin: int, single: bool) -> np.ndarray:
+    def photons_of(self, state: State) -> np.ndarray:
+        """Expected photons per pixel and frame of one state in double precision, (C, rows, columns).
+
+        The same as ``expected_photons``, to the bit; channels of cameras whose bodies all stay are rendered once.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        with one_blas_thread():
+            moved = self.moved_cameras(state)
+            if not moved:
+                return self._at_rest[0].copy()
+            if len(moved) < len(self.cameras):
+                part = self._of_cameras(moved)
+                coarse = part.coarse_trace([state])
+                photons, usual = self._at_rest
+                # spots far off need more nodes, and then all channels get them
+                if part.class_of(coarse.place)[0] == usual:
+                    out = photons.copy()
+                    out[[c.camera in moved for c in self.channels]] = part._render([state], 0, False, coarse)[0]
+                    return out
+            return np.asarray(self._render([state], 0, single=False)[0])
+
+    def moved_cameras(self, state: State) -> tuple[str, ...]:
+        """Cameras of whose channels' light some body is moved or otherwise changed."""
+        assembly = self.instrument.assembly
+        touched = touched_bodies(assembly, [state], assembly.place([state]))
+        return tuple(name for name in self.cameras if not touched.isdisjoint(self._bodies[name]))
+
+    @cached_property
+    def _bodies(self) -> dict[str, set[str]]:
+        """Camera -> bodies that the light of its channels meets or passes."""
+        assembly = self.instrument.assembly
+        out: dict[str, set[str]] = {name: set() for name in self.cameras}
+        for channel in self.channels:
+            own = out[channel.camera]
+            own |= {channel.reticle_body, f"{BASE}/{channel.camera}/focal_plane"}
+            for way in ("outgoing", "monitor"):
+                for element in assembly.sequence(f"{channel.key}/{way}"):
+                    own.add(element.body)
+                    if element.solid is not None:
+                        own.add(element.solid)
+        return out
+
+    def _of_cameras(self, names: tuple[str, ...]) -> MonitorPath:
+        """The path of these cameras alone."""
+        if names not in self._parts:
+            nodes = None if self._sized else self.nodes
+            self._parts[names] = MonitorPath(self.instrument, self.backend, nodes, names)
+        return self._parts[names]
+
+    @cached_property
+    def _parts(self) -> dict[tuple[str, ...], MonitorPath]:
+        return {}
+
+    @cached_property
+    def _at_rest(self) -> tuple[np.ndarray, int]:
+        """Photons of the unperturbed instrument (C, rows, columns), and the number of their class."""
+        coarse = self.coarse_trace([{}])
+        return self._render([{}], 0, False, coarse)[0], int(self.class_of(coarse.place)[0])
+
+    def _render(
+        self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
+    ) -> np.ndarray:
         """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class."""
         channels, response = len(self.channels), self.response
         y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
-        coarse = self.coarse_trace(states)
+        coarse = self.coarse_trace(states) if coarse is None else coarse
         chosen = self.class_of(coarse.place, margin)
         out = np.empty((len(states), channels, *(n + 2 * margin for n in self.shape)))
         for number in np.unique(chosen):

@@ -25,7 +25,6 @@ from scenes.specs.channel import BASE
 from scenes.specs.instrument import ErrorBudgetSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import trace_truth
 
 CENTROID = "centroid"
 """The line that nothing causes but the noise of the image."""
@@ -166,7 +165,7 @@ class ErrorBudget:
         experiment, change = self.experiment, Temperature(warmer)
         names = list(experiment.instrument.cameras)
         state = experiment.thermal.state({f"{BASE}/{camera}/focal_plane": change for camera in names})
-        true = trace_truth(experiment.instrument, experiment.backend, [state]).cameras[names[0]].d_f[0]
+        true = experiment.sight.truth([state]).cameras[names[0]].d_f[0]
         shift = _shifts(experiment, [state])[0, :2].ravel()
         geometry = experiment.calibration.cameras[names[0]].geometry
         return float(true), float(coefficients("paper_single", geometry)[3] @ shift)
@@ -255,7 +254,7 @@ class ErrorBudget:
         states = self.states(self.causes, self.spec.all_together, len(self.lines))
         calibration = self.experiment.calibration
         before = self.experiment.frames_before(self.spec.frames, self.seed)
-        truth = trace_truth(self.experiment.instrument, self.experiment.backend, states).cameras
+        truth = self.experiment.sight.truth(states).cameras
         pieces: list[Recovery] = []
         for piece, photons in self.experiment.path.iterate_photons(states, chunk=25):
             progress(0.1 + 0.9 * piece.start / len(states), "all causes: render and measure")

@@ -17,7 +17,7 @@ from analysis.spots.spot_positions import SpotPositions, difference_covariance
 from optics.geometry.tree import State
 from optics.numerics.threads import one_blas_thread
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import Truth, trace_truth
+from twin.monitor.truth import Truth
 
 __all__ = ["StateReader", "StateReading"]
 
@@ -79,8 +79,8 @@ class StateReader:
         """
         experiment = self.experiment
         with one_blas_thread():
-            truth = trace_truth(experiment.instrument, experiment.backend, [state])
-            photons = experiment.path.expected_photons([state], single=False)
+            truth = experiment.sight.truth([state])
+            photons = experiment.path.photons_of(state)[None]
             frames = experiment.frames_after(photons, self.frames, self.seed, number)[0] if noise else None
             mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
             first, second = self._clean_before if frames is None else self._spots_before, self._spots(mean)

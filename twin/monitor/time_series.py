@@ -27,7 +27,7 @@ from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
-from twin.monitor.truth import Truth, trace_truth
+from twin.monitor.truth import Truth
 
 CHUNK = 25
 """States rendered at once, to bound memory; fewer when their frames are large."""
@@ -196,7 +196,7 @@ def run_series(
     for piece in pieces(len(states), each * frames):
         some = states[piece]
         try:
-            truths.append(trace_truth(experiment.instrument, experiment.backend, some))
+            truths.append(experiment.sight.truth(some))
             expected = experiment.path.expected_photons(some, chunk=CHUNK)
         except (AimError, BeamMissedError) as error:
             raise _lost(experiment, job, some, piece.start, error) from error
@@ -295,7 +295,7 @@ def _lost(
     """The error of the first of some states in which light is lost, found by trying each alone."""
     for k, state in enumerate(states):
         try:
-            trace_truth(experiment.instrument, experiment.backend, [state])
+            experiment.sight.truth([state])
             experiment.path.rays([state])
         except (AimError, BeamMissedError) as reason:
             return too_large(job, first + k, str(reason))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from analysis.monitor.ground_error import GroundGeometry
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import LineChange, chief_directions, line_change
-from optics.raytrace.system import assemble
+from optics.raytrace.line_of_sight import LineChange, aim_chief_rays, chief_directions, line_change
+from optics.raytrace.system import SystemBatch, assemble
 from scenes.models.camera_assembly import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.channel import BASE
@@ -20,6 +21,9 @@ from twin.monitor.motions import ElementaryMotion
 
 LINE_POINTS = 41
 """Points of the line CCD over which roll and principal distance are taken."""
+
+ACROSS = np.array([0.0, 1.0, 0.0])
+"""Near which, in the world, the first transverse axis of a chief ray is taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +88,6 @@ def ground_geometry(instrument: Instrument, distance: Mapping[str, float]) -> Gr
         raise spec.error(text, ("altitude",), allowed="cameras that look at the Earth from two sides") from error
 
 
-def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
-    """Trace the lines of sight of all cameras in all states.
-
-    Raises:
-        AimError, BeamMissedError: a perturbation moves the image off the mirrors.
-    """
-    return truth_of_sight(instrument, trace_sight(instrument, backend, [{}, *states]))
-
-
 def line_points(instrument: Instrument, camera: str) -> np.ndarray:
     """Where along camera Y the points of the nominal line CCD lie, (LINE_POINTS,), metres."""
     line = instrument.cameras[camera].spec.line
@@ -107,26 +102,68 @@ def line_in_world(instrument: Instrument, camera: str, placed: PlacedBodies) -> 
     return points_to_world(placed, line_body(f"{BASE}/{camera}"), line)
 
 
-def trace_sight(instrument: Instrument, backend: Backend, states: Sequence[State]) -> np.ndarray:
-    """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+class LineSight:
+    """Traces what the points of the line CCDs see; of the unperturbed instrument once.
 
-    Raises:
-        AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
     """
-    assembly = instrument.assembly
-    placed = assembly.place(states)
-    names = list(instrument.cameras)
-    points = [line_in_world(instrument, name, placed) for name in names]
-    guesses = [instrument.toward_optics(placed, name) for name in names]
-    sight = chief_directions(
-        backend,
-        assemble(assembly, [f"{name}/image_to_stop" for name in names], states, placed=placed),
-        assemble(assembly, [f"{name}/image_to_object" for name in names], states, placed=placed),
-        np.concatenate(points),
-        np.concatenate(guesses)[:, None],
-        np.array([0.0, 1.0, 0.0]),
-    )
-    return sight.reshape(len(names), len(states), LINE_POINTS, 3)
+
+    def __init__(self, instrument: Instrument, backend: Backend) -> None:
+        self.instrument = instrument
+        self.backend = backend
+
+    def trace(self, states: Sequence[State]) -> np.ndarray:
+        """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+
+        Raises:
+            AimError, BeamMissedError: a perturbation moves the image off the mirrors.
+        """
+        instrument, names = self.instrument, list(self.instrument.cameras)
+        placed, to_stop, points, guess = self._from_the_image(states)
+        to_object = assemble(instrument.assembly, [f"{n}/image_to_object" for n in names], states, placed=placed)
+        start = [np.repeat(a, len(states), axis=0) for a in self._aimed]
+        sight = chief_directions(self.backend, to_stop, to_object, points, guess, ACROSS, (start[0], start[1]))
+        return sight.reshape(len(names), len(states), LINE_POINTS, 3)
+
+    def truth(self, states: Sequence[State]) -> Truth:
+        """What states do to all cameras.
+
+        Raises:
+            AimError, BeamMissedError: as `trace`.
+        """
+        sight = self.nominal if not states else np.concatenate([self.nominal, self.trace(states)], axis=1)
+        return truth_of_sight(self.instrument, sight, self._axes)
+
+    @cached_property
+    def nominal(self) -> np.ndarray:
+        """`trace` of the unperturbed instrument, (cameras, 1, LINE_POINTS, 3)."""
+        return self.trace([{}])
+
+    @cached_property
+    def _aimed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters and Jacobian of the unperturbed instrument's chief rays, from which all others are aimed."""
+        _, to_stop, points, guess = self._from_the_image([{}])
+        return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
+
+    @cached_property
+    def _axes(self) -> dict[str, np.ndarray]:
+        return {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
+
+    def _from_the_image(self, states: Sequence[State]) -> tuple[PlacedBodies, SystemBatch, np.ndarray, np.ndarray]:
+        """Bodies, systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), directions from them (B, 1, 3)."""
+        instrument, names = self.instrument, list(self.instrument.cameras)
+        placed = instrument.assembly.place(states)
+        to_stop = assemble(instrument.assembly, [f"{n}/image_to_stop" for n in names], states, placed=placed)
+        points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
+        guess = np.concatenate([instrument.toward_optics(placed, name) for name in names])[:, None]
+        return placed, to_stop, points, guess
+
+
+def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
+    """`LineSight.truth`, for one call."""
+    return LineSight(instrument, backend).truth(states)
 
 
 def truth_of_sight(instrument: Instrument, sight: np.ndarray, axes: Mapping[str, np.ndarray] | None = None) -> Truth:

@@ -21,7 +21,7 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.models.disturbances import state_of
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import Truth, trace_truth
+from twin.monitor.truth import Truth
 from twin.run.procedure import Advance, silent
 from twin.run.random_streams import stream
 
@@ -169,7 +169,7 @@ def run_states(
         if found is None:
             continue
         some = [some[k] for k in good]
-        true.append(_true(trace_truth(experiment.instrument, experiment.backend, some), experiment, quantities))
+        true.append(_true(experiment.sight.truth(some), experiment, quantities))
         for name, values, sigmas in _read(found, quantities):
             read.setdefault(name, []).append(values)
             sigma.setdefault(name, []).append(sigmas)

@@ -25,7 +25,6 @@ from scenes.models.thermal_model import TemperatureError
 from scenes.specs.channel import BASE
 from scenes.specs.course import moment
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import trace_truth
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
@@ -254,7 +253,7 @@ def _changes(
     two arcseconds, 1e-11 rad.
     """
     out, distance = {}, {}
-    for name, change in trace_truth(experiment.instrument, experiment.backend, states).cameras.items():
+    for name, change in experiment.sight.truth(states).cameras.items():
         values = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
         out[name] = values - values[reference]
         distance[name] = float(change.principal_distance[reference])

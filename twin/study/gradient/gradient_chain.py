@@ -27,7 +27,7 @@ from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import hit_slopes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
-from twin.monitor.truth import LINE_POINTS, line_in_world, trace_sight, truth_of_sight
+from twin.monitor.truth import LINE_POINTS, line_in_world, truth_of_sight
 from twin.study.runs.render_base import monitor_results
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
@@ -98,7 +98,7 @@ class Chain:
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
         """Directions of the line CCDs' points, (S, cameras, points, 3). Raises AimError, BeamMissedError."""
-        return np.swapaxes(trace_sight(self.experiment.instrument, self.experiment.backend, states), 0, 1)
+        return np.swapaxes(self.experiment.sight.trace(states), 0, 1)
 
     @cached_property
     def nominal(self) -> tuple[np.ndarray, np.ndarray]:
@@ -153,7 +153,7 @@ def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarra
 def sight_gradient(
     instrument: Instrument, backend: Backend, motions: Sequence[ElementaryMotion], about: State
 ) -> np.ndarray:
-    """Derivative of the directions of ``twin.monitor.truth.trace_sight``.
+    """Derivative of the directions of ``twin.monitor.truth.LineSight.trace``.
 
     Args:
         instrument: the instrument.
@@ -193,8 +193,7 @@ def sight_gradient(
     local = pushed.traced.numpy()[1]
     # from the frame of the last element, which moves too, to the world
     assert to_object.world_tangents is not None
-    pose, _ = to_object.world[-1].arrays()
-    pose_step, _ = to_object.world_tangents[-1].arrays()
+    pose, pose_step = (poses.rotation[:, -1] for poses in (to_object.world, to_object.world_tangents))
     world = np.einsum("bij,bnj->bni", pose, pushed.direction) + np.einsum("bij,bnj->bni", pose_step, local)
     return np.asarray(world).reshape(len(names), m, LINE_POINTS, 3)
 

@@ -27,7 +27,7 @@ from scenes.yaml.spec import Spec
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import Truth, trace_truth
+from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, one_line
 from twin.study.runs.config_tree import Tree
 from twin.study.runs.perturbed_job import PERTURB, JobMaker, needs_more, read_job
@@ -172,7 +172,7 @@ def _traced(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Tru
 
 def _trace(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Truth, np.ndarray]:
     """Truth, and expected photons (S, C, rows, columns)."""
-    truth = trace_truth(experiment.instrument, experiment.backend, states)
+    truth = experiment.sight.truth(states)
     return truth, experiment.path.expected_photons(states, chunk=len(states))
 
 

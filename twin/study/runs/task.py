@@ -11,7 +11,7 @@ from functools import lru_cache
 from typing import Any
 
 from optics.numerics.backend import Backend, load_backend
-from optics.numerics.threads import LIMIT
+from optics.numerics.threads import LIMIT, kernel_threads
 from scenes.yaml.errors import InputError
 from twin.run.versions import source_digest
 from twin.study.runs.base_job import Failure, Run
@@ -140,12 +140,11 @@ def one_thread() -> None:
     os.environ.update(ONE_THREAD)
     ensure_llvm()
     import cv2
-    import drjit
     import scipy.linalg  # noqa: F401 (it brings linear algebra of its own, which is then limited with the rest)
 
     ThreadpoolController().limit(limits=1)
     cv2.setNumThreads(1)
-    drjit.set_thread_count(1)
+    kernel_threads(1)
 
 
 def _largest_memory() -> float:

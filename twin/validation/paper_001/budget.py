@@ -19,7 +19,7 @@ from scenes.specs.channel import BASE
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
-from twin.monitor.truth import line_points, trace_sight
+from twin.monitor.truth import line_points
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import load_printed
 
@@ -191,7 +191,7 @@ def line_end_shift(budget: ErrorBudget) -> float:
     experiment = budget.experiment
     camera = next(iter(experiment.instrument.cameras))
     state = {f"{BASE}/{camera}/focal_plane": Motion(rotate=(0.0, 0.0, ROLL))}
-    sight = trace_sight(experiment.instrument, experiment.backend, [{}, state])[0]
+    sight = experiment.sight.trace([{}, state])[0]
     ends = line_points(experiment.instrument, camera)[-2:]
     pixel = experiment.instrument.cameras[camera].spec.line.pitch
     per_pixel = float(np.linalg.norm(sight[0, -1] - sight[0, -2])) / float(ends[1] - ends[0]) * pixel

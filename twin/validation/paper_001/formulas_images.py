@@ -19,7 +19,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.channel import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import Truth, trace_truth
+from twin.monitor.truth import Truth
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
 
 Value = TypeVar("Value", float, np.ndarray)
@@ -117,7 +117,7 @@ class MonitorImages:
         self.motions = list(states)
         every = list(states.values())
         progress(0.0, "trace the truth")
-        self.truth: Truth = trace_truth(experiment.instrument, experiment.backend, every)
+        self.truth: Truth = experiment.sight.truth(every)
         progress(0.4, "render and measure the spots")
         pieces = [piece for _, piece in experiment.measure(every, FRAMES, seed)]
         self.before = np.concatenate([p.before for p in pieces])

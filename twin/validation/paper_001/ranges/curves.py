@@ -16,7 +16,6 @@ from optics.geometry.tree import State
 from optics.numerics.threads import cores
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import trace_truth
 
 PRINTED, JOINT, CORRECTED, CALIBRATED = "printed", "Table 1", "corrected", "calibrated"
 FORMS = (PRINTED, JOINT, CORRECTED, CALIBRATED)
@@ -116,7 +115,7 @@ class Bench:
 
     def truth(self, states: Sequence[State]) -> dict[str, np.ndarray]:
         """Camera -> (S, 4) traced changes in the units of ``monitoring.PARAMETERS``."""
-        found = trace_truth(self.experiment.instrument, self.experiment.backend, states)
+        found = self.experiment.sight.truth(states)
         return {
             name: np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) * PER_SI
             for name, c in found.cameras.items()
