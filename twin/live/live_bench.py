@@ -267,7 +267,8 @@ class LiveBench:
         experiment = self.twin.experiment
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
-        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0)
+        of_course = asked.time is not None and self.twin.resolved.job.course is not None
+        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
         after = self._shown(found.frames, found.photons)
         run = RenderRun(
             resolved=self.twin.resolved,
