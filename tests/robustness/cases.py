@@ -27,7 +27,7 @@ from twin.run.cli import explained
 from twin.study.__main__ import app as study
 
 CUTS = (
-    "twin.main_job.render_job.trace_truth",
+    "twin.monitor.truth.LineSight.truth",
     "twin.laboratory.focus_alignment.align",
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
