@@ -83,8 +83,9 @@ def main(
     can be given as the job to repeat it. The terminal, the report and recovered.json begin or end with a verdict: one
     sentence about what was recovered, how well, and what limits it.
 
-    A job with a course, a table of temperatures over time (scenes/examples/orbit.yaml), also gets every time's
-    numbers and images: course.json, course.nc and images/CAMERA_SIDE_course.tiff.
+    A job with a course, a table of temperatures and motions over time (scenes/examples/orbit.yaml, launch.yaml and
+    heat_soak.yaml), also gets every time's numbers and images: course.json, course.nc and
+    images/CAMERA_SIDE_course.tiff.
 
     With `render: {images: [spots, knife_edge, bars]}` (also star and pinhole) test targets at infinity are imaged on
     every camera's panchromatic line CCD, in its middle and near its ends, before and after; mtf.json has the MTF

@@ -146,7 +146,8 @@ def _renders() -> Iterator[Case]:
     quick = ("--frames", "1")
     for stem in ("perturb", "aligned", "steady", "image_quality", "targets"):
         yield _of_one(f"render-{stem}", render, "", f"examples/{stem}.yaml", options=quick)
-    yield _of_one("render-orbit", render, "", "examples/orbit.yaml", options=quick, weight=0.5)
+    for stem, weight in (("orbit", 0.5), ("launch", 0.3), ("heat_soak", 0.2)):
+        yield _of_one(f"render-{stem}", render, "", f"examples/{stem}.yaml", options=quick, weight=weight)
     stray = _with(_text("examples/aligned.yaml"), ("frames: 9", "stray: {paths: 10000}, frames: 9"))
     yield Case("render-stray", render, (), {"stray.yaml": stray}, "stray.yaml", quick)
     own = {

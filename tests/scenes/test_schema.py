@@ -126,7 +126,8 @@ def test_the_schema_of_jobs_knows_the_nodes_of_shipped_instruments(nodes) -> Non
         assert problems(schema, {**JOB, **fault}) > 0, name
     # of an own instrument nobody knows the nodes
     assert problems(schema, {"instrument": "own.yaml", **FAULTS["node"]}) == 0
-    for path in (EXAMPLES / name for name in ("perturb.yaml", "orbit.yaml", "targets.yaml", "steady.yaml")):
+    stems = ("perturb", "orbit", "launch", "heat_soak", "targets", "steady")
+    for path in (EXAMPLES / f"{stem}.yaml" for stem in stems):
         assert problems(schema, read_yaml(path).data) == 0, path
 
 

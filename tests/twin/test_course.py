@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 import twin.render as command
 from optics.thermal.heat import Temperature
-from scenes.specs.course import CourseSpec, moment
+from scenes.specs.course import moment
 from scenes.specs.job import check_nodes
-from scenes.specs.load import EXAMPLES, load_job
+from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from twin.main_job.monitor_reading import stated
@@ -267,15 +267,6 @@ def test_config_holds_the_course(folder) -> None:
     again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
     assert again == first
     assert again.to_yaml() == (folder / "config.yaml").read_text()
-
-
-def test_the_example_is_an_orbit() -> None:
-    resolved = resolve(EXAMPLES / "orbit.yaml")
-    course = resolved.job.course
-    assert isinstance(course, CourseSpec)
-    assert (len(course.times), course.times[-1]) == (21, 6000.0)
-    first, last = course.fields(0), course.fields(20)
-    assert first == last  # a whole period
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

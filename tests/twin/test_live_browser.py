@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,9 @@ from scenes.specs.resolved import resolve
 from tests.twin.live_page import CHROMIUM, FLAGS, Command, Page, running
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
+from twin.run.run_folder import RunFolder, write_manifest
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
 pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
@@ -328,6 +332,14 @@ def test_a_course_is_played(browser):
         assert command.process.wait(30) == 0
 
 
+def studied(folder: Path) -> Path:
+    """A study's folder, as it is from the study's beginning."""
+    with RunFolder(folder / "study") as made:
+        made.write_text("config.yaml", resolve_study("scenes/examples/study_aperture.yaml").to_yaml())
+        write_manifest(made, "twin.study", 0.0, 1.0)
+    return folder / "study"
+
+
 def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
     render = [sys.executable, "-m", "twin.render", "scenes/examples/perturb.yaml", "--out", str(tmp_path / "run")]
     assert subprocess.run(render, check=False, capture_output=True).returncode == 0
@@ -337,6 +349,16 @@ def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
         told = page.page.evaluate("liveTwin.last.readings")
         file = json.loads((tmp_path / "run" / "recovered.json").read_text())
         assert told == {key: file[key] for key in told}
+        page.close()
+    with running(str(studied(tmp_path)), "--run", "1234", "--port", "0") as command:
+        page = Page(browser, command.address)
+        page.ready()
+        plan = Plan.of(resolve_study(tmp_path / "study" / "config.yaml"))
+        for column in plan.columns:
+            row = page.page.locator("#factors .knob", has_text=column.name).locator("input[type=number]").first
+            assert float(row.input_value()) == pytest.approx(float(column.values[1234]))
+        assert "run 1234 of the study study_aperture" in page.page.get_attribute("#name", "title")
+        assert page.wrong == []
         page.close()
     with running("scenes/examples/study_aperture.yaml", "--port", "0") as command:
         page = Page(browser, command.address)

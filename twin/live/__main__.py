@@ -7,7 +7,7 @@ if __name__ == "__main__":
 
     end_quietly()
 
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -29,9 +29,12 @@ def main(
     what: Annotated[
         str,
         typer.Argument(
-            help="Instrument of the library or its file, a job's file, a run folder of twin.render, a study."
+            help="Instrument of the library or its file, a job's file, a measurement's, a study's, or a run folder."
         ),
     ],
+    run: Annotated[
+        int | None, typer.Option(min=0, help="Of a study: number of the run to begin with, from 0. Default: its base.")
+    ] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="To listen on; 0 takes one that is free.")] = PORT,
     host: Annotated[
         str, typer.Option(help="Address to listen on. Others than this machine can reach it if it is not 127.0.0.1.")
@@ -48,9 +51,14 @@ def main(
 
     Example: `python -m twin.live gf7_pair`
 
-    Of a job with a course the course can be played: `python -m twin.live scenes/examples/orbit.yaml`. A study's factors
-    become knobs: `python -m twin.live scenes/examples/study_aperture.yaml`. A run folder of twin.render is opened in
-    the state that it shows.
+    Of a job with a course the course can be played: `python -m twin.live scenes/examples/orbit.yaml`, or launch.yaml
+    and heat_soak.yaml beside it. A study's factors become knobs:
+    `python -m twin.live scenes/examples/study_aperture.yaml`.
+
+    Run folders are opened, too, by name or by their config.yaml: of twin.render in the state that it shows, with the
+    same frames and readings; of a study with its factors, and with --run in the state of one of its runs; of
+    twin.uncertainty, and of twin.recover with the instrument as designed; of twin.orbit monitor as a course. Of any
+    other it says what it holds and what can be opened in its place.
 
     The command prints an address; open it in a browser on this machine. The address holds a token: whoever has it can
     turn the knobs. The environment variable TWIN_LIVE_TOKEN sets a token that stays when the command is started again.
@@ -63,32 +71,32 @@ def main(
     errors = Console(stderr=True)
     with explained(errors):
         check_backend(backend)
-        _serve(_readable(what), host, port, stay, backend, None if quiet else Console())
+        about = _readable(what, run)
+        _serve(what, run, host, port, stay, backend, about, None if quiet else Console())
 
 
-def _readable(what: str) -> str:
-    """What is to be opened, checked as far as reading it can tell.
+def _readable(what: str, run: int | None) -> tuple[str, ...]:
+    """What is to be opened, checked as far as reading it can tell, in words.
 
     Raises:
-        InputError: it cannot be read or is not valid.
-        InputErrorText: it is a folder without a run.
+        InputError: it cannot be read, is not valid, or is nothing that can be opened.
     """
-    from scenes.specs.load import INSTRUMENTS, library_names
+    from twin.live.source import read_source
 
-    path = Path(what)
-    if path.is_dir():
-        config = path / "config.yaml"
-        if not config.is_file():
-            raise InputErrorText(f"{what} is not a run folder: it has no config.yaml; name a run of twin.render")
-        what = str(config)
-    if what not in library_names(INSTRUMENTS):
-        from twin.live.source import read_source
-
-        read_source(what)
-    return what
+    source = read_source(what, run)
+    return (source.about, *source.notes)
 
 
-def _serve(what: str, host: str, port: int, stay: bool, backend: str, console: Console | None) -> None:
+def _serve(
+    what: str,
+    run: int | None,
+    host: str,
+    port: int,
+    stay: bool,
+    backend: str,
+    about: Sequence[str],
+    console: Console | None,
+) -> None:
     """Build, listen, print the address, serve.
 
     Raises:
@@ -108,7 +116,7 @@ def _serve(what: str, host: str, port: int, stay: bool, backend: str, console: C
         raise InputErrorText(str(error)) from None
     except OSError as error:
         raise InputErrorText(f"cannot listen on {host}:{port}: {error.strerror}; choose another --port") from None
-    computer = Computer(what, backend)
+    computer = Computer(what, backend, run)
     try:
         if console is None:
             computer.start()
@@ -118,6 +126,8 @@ def _serve(what: str, host: str, port: int, stay: bool, backend: str, console: C
         bound = listening.getsockname()[1]
         guard = Guard.of(token, host, bound)
         if console is not None:
+            for line in about:
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
             shown = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
             console.print(f"open http://{shown}:{bound}/?token={token}", highlight=False, soft_wrap=True)
             console.print("Ctrl-C ends it" + ("." if stay else ", and so does closing the last page."))

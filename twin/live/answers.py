@@ -29,14 +29,15 @@ class Answers:
         what: as of `twin.live.source.read_source`.
         backend: where to trace.
         advance: told of each part of the preparation.
+        run: of a study, as of `twin.live.source.read_source`.
 
     Raises:
         InputError, BackendUnavailable, LibraryMissing: it cannot be built.
     """
 
-    def __init__(self, what: str, backend: str, advance: Callable[[str], None]) -> None:
+    def __init__(self, what: str, backend: str, advance: Callable[[str], None], run: int | None = None) -> None:
         advance("build the instrument")
-        self.source = read_source(what)
+        self.source = read_source(what, run)
         self._backend = backend
         self._built: OrderedDict[str, tuple[LiveBench, CameraPictures, Opened]] = OrderedDict()
         self.bench, self.pictures, self.opened = self._open({}, advance)
@@ -55,6 +56,7 @@ class Answers:
             bench.warm(advance)
             greeting = {
                 **bench.greeting(),
+                "about": " ".join((f"{self.source.about}.", *(f"{note}." for note in self.source.notes))),
                 "factors": [
                     {**knob.plain(), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors
                 ],
@@ -99,7 +101,12 @@ class Answers:
         try:
             state = self.bench.states(asked.state)
             told["svg"] = self.pictures.draw(
-                asked.view, asked.camera, asked.field, state, asked.state.frames, asked.state.seed
+                asked.view,
+                asked.camera,
+                asked.field,
+                state,
+                asked.state.frames,
+                self.bench.seed_of(asked.state.seed),
             )
         except LOST as error:
             told["problem"] = str(error)[:1000]

@@ -38,10 +38,11 @@ class Computer:
     Args:
         what: as of `twin.live.source.read_source`.
         backend: where to trace.
+        run: of a study, likewise.
     """
 
-    def __init__(self, what: str, backend: str) -> None:
-        self._what, self._backend = what, backend
+    def __init__(self, what: str, backend: str, run: int | None = None) -> None:
+        self._what, self._backend, self._run = what, backend, run
         self._process: Any = None
         self._pipe: Connection | None = None
         self._turn = asyncio.Lock()
@@ -58,7 +59,9 @@ class Computer:
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=compute, args=(theirs, self._what, self._backend), daemon=True)
+        self._process = context.Process(
+            target=compute, args=(theirs, self._what, self._backend, self._run), daemon=True
+        )
         self._process.start()
         theirs.close()
         try:
@@ -112,13 +115,14 @@ class Computer:
                 self._process.join()
 
 
-def compute(pipe: Connection, what: str, backend: str) -> None:
+def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     """What the process does: build the instrument, then answer until the pipe is closed.
 
     Args:
         pipe: to the server.
         what: as of `Computer`.
         backend: likewise.
+        run: likewise.
     """
     # Ctrl-C goes to the whole group of the terminal; the server ends this process by closing the pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -131,7 +135,7 @@ def compute(pipe: Connection, what: str, backend: str) -> None:
 
     with one_blas_thread():
         try:
-            answers = Answers(what, backend, lambda part: pipe.send(("part", part)))
+            answers = Answers(what, backend, lambda part: pipe.send(("part", part)), run)
             pipe.send(("ready", answers.opened))
             # what is built stays; looking through it again and again would cost every state some milliseconds
             gc.collect()

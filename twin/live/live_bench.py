@@ -24,7 +24,7 @@ from scenes.specs.course import DEFAULT_PIVOT, moment
 from scenes.specs.job import check_nodes
 from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
-from twin.live.messages import MOST_FRAMES, AskedState, BlindState, Course
+from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState, Course
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT
 from twin.main_job.render_results import RenderRun
@@ -82,7 +82,7 @@ class LiveBench:
             knobs={knob.name: knob.value for knob in self.knobs.values() if knob.value},
             pivots={path: what.pivot for path, what in job.perturb.items() if what.pivot != DEFAULT_PIVOT},
             frames=min(self.twin.resolved.frames, MOST_FRAMES),
-            seed=job.render.seed,
+            seed=job.render.seed & LARGEST_SEED,
             time=None if course is None else course.shown,
         )
 
@@ -129,7 +129,7 @@ class LiveBench:
             "nodes": nodes,
             "knobs": [knob.plain() for knob in self.knobs.values()],
             "frames": twin.resolved.frames,
-            "seed": job.render.seed,
+            "seed": self.at_rest.seed,
             "estimators": list(run.estimators),
             "judged": run.judged,
             "parameters": [_label(p) for p in PARAMETERS],
@@ -245,8 +245,15 @@ class LiveBench:
             ],
         }
 
+    def seed_of(self, asked: int) -> int:
+        """The seed that a page means. The job's own may be larger than what a number of a page holds exactly, as that
+        of a study's run is; the page is then told its last bits, by which it is known again.
+        """
+        own = self.twin.resolved.job.render.seed
+        return own if asked == own & LARGEST_SEED else asked
+
     def _new_reader(self, frames: int, seed: int) -> StateReader:
-        return StateReader(self.twin.experiment, frames, seed, self.twin.resolved.job.analysis.centroid)
+        return StateReader(self.twin.experiment, frames, self.seed_of(seed), self.twin.resolved.job.analysis.centroid)
 
     def _shown(self, frames: np.ndarray | None, photons: np.ndarray) -> np.ndarray:
         """What the page shows of a state, uint16 (C, H, W): the first of its frames, or the rounded expected image."""
@@ -260,14 +267,15 @@ class LiveBench:
         experiment = self.twin.experiment
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
-        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0)
+        of_course = asked.time is not None and self.twin.resolved.job.course is not None
+        found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
         after = self._shown(found.frames, found.photons)
         run = RenderRun(
             resolved=self.twin.resolved,
             experiment=experiment,
             state=state,
             frames=asked.frames,
-            seed=asked.seed,
+            seed=self.seed_of(asked.seed),
             truth=found.truth,
             photons_before=experiment.nominal_photons,
             photons_after=found.photons,

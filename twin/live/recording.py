@@ -27,7 +27,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     Raises:
         InputError: a value that a job's file could not have.
     """
-    resolved = bench.perturbed(asked).resolved.with_render(asked.frames, asked.seed)
+    resolved = bench.perturbed(asked).resolved.with_render(asked.frames, bench.seed_of(asked.seed))
     plain = resolved.plain()
     if asked.time is not None and resolved.job.course is not None:
         plain["job"]["course"]["detail"] = moment(resolved.job.course.times[asked.time])
@@ -54,7 +54,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
         raise ValueError("a course turns each body about one pivot at all times; record again without changing pivots")
     knobs = bench.knobs
     fixed, moving = _split([dict(step.knobs) for _, step in steps], knobs)
-    resolved = bench.twin.resolved.with_render(first.frames, first.seed)
+    resolved = bench.twin.resolved.with_render(first.frames, bench.seed_of(first.seed))
     plain = resolved.plain()
     job = plain["job"]
     job["perturb"] = perturbation(fixed, first.pivots, knobs, resolved.job)

@@ -1,55 +1,40 @@
-"""What the live twin is opened with: an instrument, a job, a run folder, or a study whose factors become knobs."""
+"""What the live twin is opened with: an instrument, a job, a measurement, a study whose factors become knobs, or a run
+folder of any command whose instrument can be shown.
+"""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenes.kinds.file_kinds import kind_of, read_for
+from scenes.kinds.file_kinds import FileKind, kind_of, read_for
 from scenes.specs.job import JobSpec
 from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.orbit_setup import MonitorSetup, resolve_monitor
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
-from scenes.specs.study import DesignSpec
-from scenes.specs.study_factor import FactorSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.translate import validate
-from scenes.yaml.units import split_quantity, unit_ratio, with_unit
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
-from twin.live.knobs import AXES, KINDS, knob_name
-from twin.study.runs.config_tree import leaf, with_values
+from twin.live.messages import MOST_FRAMES
+from twin.live.study_factors import FactorKnob, base_with, factor_knobs
+from twin.run.run_folder import Manifest, read_manifest
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, resolve_study
 
 PROGRAM = "twin.live"
-
-
-@dataclass(frozen=True)
-class FactorKnob:
-    """A study's factor that is a number.
-
-    Attributes:
-        name: as the study calls it.
-        unit: of the numbers; empty for pure numbers.
-        low, high: the study's smallest and largest value.
-        value: in the study's base; for a ratio 1.
-        whole: whether it counts.
-        knobs: knob of a body -> how many of its units one of the factor's is; empty for what changes the instrument
-            itself, which is then built anew.
-    """
-
-    name: str
-    unit: str
-    low: float
-    high: float
-    value: float
-    whole: bool
-    knobs: Mapping[str, float]
-
-    def plain(self) -> dict[str, Any]:
-        """As the page gets it."""
-        return asdict(self)
+CONFIG, REPORT = "config.yaml", "report.html"
+OPENED = (
+    "an instrument with a monitor, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
+    "twin.recover, twin.uncertainty, twin.orbit monitor or such a study"
+)
+"""What may be given."""
+NAMED = 3
+"""Run folders that are named where a folder of them was given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,19 +43,27 @@ class Source:
 
     Attributes:
         resolved: the job.
-        study: whose base it is; None for others.
+        about: what it is, in a few words.
+        notes: in what the page differs from what was opened, sentences.
+        study: whose base, or run, it is; None for others.
         factors: those of the study that are numbers.
+        scalars: factor -> its value in the run of the study that was opened; None for its base.
+        own_noise: that run has a seed of its own, which is the job's then.
     """
 
     resolved: ResolvedJob
+    about: str = ""
+    notes: tuple[str, ...] = ()
     study: StudySetup | None = None
     factors: tuple[FactorKnob, ...] = ()
+    scalars: Mapping[str, Any] | None = None
+    own_noise: bool = False
 
     def with_factors(self, values: Mapping[str, float]) -> ResolvedJob:
         """The job with other values of factors, as a run of the study has it, values that follow them included.
 
         Args:
-            values: factor -> number in its unit; others keep the base's.
+            values: factor -> number in its unit; others keep those of the base, or of the run that was opened.
 
         Raises:
             InputError: no such factor, or a value that cannot be.
@@ -84,105 +77,199 @@ class Source:
                 raise InputError(
                     Issue("no such factor", found=repr(name), allowed=names, suggestion=nearest(name, known))
                 )
-        study = self.study.study
-        factors = {name: _fixed(study.factors[name], known[name], value) for name, value in values.items()}
-        one = study.model_copy(update={"factors": factors, "design": DesignSpec(kind="grid")})
-        run = Plan.of(StudySetup(one, self.study.tree)).run(0)
-        return validate(ResolvedJob, YamlFile("", with_values(self.study.tree, run.values), {}))
+        scalars = {**(self.scalars or {}), **{name: known[name].scalar(value) for name, value in values.items()}}
+        made: ResolvedJob = validate(ResolvedJob, YamlFile("", base_with(self.study, scalars), {}))
+        return made.with_render(made.frames, self.resolved.job.render.seed) if self.own_noise else made
 
 
-def read_source(what: str) -> Source:
+def read_source(what: str, run: int | None = None) -> Source:
     """Read what the live twin is opened with.
 
     Args:
-        what: name of an instrument in the library, or path of an instrument's file, of a job, of a study, or of the
-            config.yaml of a run.
+        what: name of an instrument in the library, or path of an instrument's file, of a job, a measurement or a study,
+            of a run folder or of its config.yaml.
+        run: number of one of a study's runs, from 0; None for its base.
 
     Raises:
         InputError: it cannot be read, is not valid, or is nothing that can be opened.
     """
     if what in library_names(INSTRUMENTS):
-        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))))
-    kind = kind_of(read_yaml(Path(what)).data)
-    if kind is not None and kind.name == "study":
-        return _of_study(what)
-    if kind is not None and kind.name == "instrument":
-        path = str(Path(what).resolve())
-        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))))
-    return Source(read_for(PROGRAM, Path(what), resolve))
+        _no_runs(what, run)
+        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))), what)
+    path = Path(what)
+    if path.is_dir():
+        return _of_folder(path, run)
+    if path.name == CONFIG and read_manifest(path.parent) is not None:
+        return _of_folder(path.parent, run)
+    return _for_a_page(_of_file(path, run))
 
 
-def _of_study(what: str) -> Source:
-    setup = resolve_study(what)
+def _of_folder(folder: Path, run: int | None) -> Source:
+    """From a run folder."""
+    config, manifest = folder / CONFIG, read_manifest(folder)
+    if not config.is_file():
+        raise InputError(_no_config(folder, manifest))
+    source = _of_file(config, run, manifest)
+    notes = list(source.notes)
+    listed = None if manifest is None else manifest.sha256.get(CONFIG)
+    if listed is not None and listed != hashlib.sha256(config.read_bytes()).hexdigest():
+        notes.append(f"{config} was changed after the run: the page shows what it says now, and not what the run did")
+    return _for_a_page(replace(source, about=f"{folder.name}: {source.about}", notes=tuple(notes)))
+
+
+def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
+    if manifest is not None:
+        return _nothing_to_show(folder, f"a run folder of {manifest.program}", folder)
+    try:
+        inside = sorted(one.name for one in folder.iterdir() if (one / CONFIG).is_file())
+    except OSError:
+        inside = []
+    meant = names_text(str(folder / name) for name in inside[:NAMED])
+    hint = f"one of the run folders in it, as {meant}" if inside else OPENED
+    return Issue(f"this is not a run folder: it has no {CONFIG}", str(folder), allowed=hint)
+
+
+def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> Source:
+    """From a file; a run's config.yaml is told by what it holds.
+
+    Args:
+        file: to be read.
+        run: of a study.
+        manifest: of the run folder that the file is the config.yaml of; None for any other file.
+    """
+    data = read_yaml(file).data
+    kind = kind_of(data)
+    name = "" if kind is None else kind.name
+    if name == "study":
+        return _of_study(file, run)
+    _no_runs(str(file), run)
+    if name == "job":
+        return Source(resolve(file), "a job of the monitor")
+    if name == "measurement":
+        return _of_measurement(file)
+    if name == "orbit_monitor":
+        return _of_orbit(file)
+    if name == "instrument":
+        path = str(file.resolve())
+        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))), file.stem)
+    if manifest is not None and manifest.program != "twin.render":
+        raise InputError(_nothing_to_show(file, _run_of(kind, manifest), file.parent, data))
+    return Source(read_for(PROGRAM, file, resolve), "a job of the monitor")
+
+
+def _no_runs(what: str, run: int | None) -> None:
+    if run is not None:
+        raise InputError(Issue("--run chooses a run of a study, and this is none", what, found=f"--run {run}"))
+
+
+def _run_of(kind: FileKind | None, manifest: Manifest) -> str:
+    """Whose run folder it is, in words."""
+    if kind is not None and kind.command.startswith(manifest.program):
+        return f"the run folder of {kind.what} ({kind.command})"
+    return f"a run folder of {manifest.program}"
+
+
+def _nothing_to_show(place: Path, what: str, folder: Path, data: Any = None) -> Issue:
+    """Why a run folder cannot be opened, and what can be done."""
+    remedies = []
+    if (folder / REPORT).is_file():
+        remedies.append(f"its results are in {folder / REPORT}")
+    found = sorted(one for one in (folder / "artefacts").glob("*.yaml") if _is_instrument(one))
+    given = data.get("instrument") if isinstance(data, dict) else None
+    name = given.get("name") if isinstance(given, dict) else None
+    if found:
+        remedies.append(f"python -m {PROGRAM} {found[0]} opens an instrument that it made")
+    elif name in library_names(INSTRUMENTS):
+        remedies.append(f"python -m {PROGRAM} {name} opens its instrument")
+    told = "; ".join(["this is " + what + ", which holds no state of a monitor that could be shown", *remedies])
+    return Issue(told, str(place), allowed=OPENED)
+
+
+def _is_instrument(file: Path) -> bool:
+    try:
+        kind = kind_of(read_yaml(file).data)
+    except InputError:
+        return False
+    return kind is not None and kind.name == "instrument"
+
+
+def _of_measurement(file: Path) -> Source:
+    """The instrument of measured frames, to which nothing happens: what happened is what was asked."""
+    model = resolve_measurement(file).model
+    if model is None:
+        text = (
+            "this measurement was read by the geometry of the cameras alone, without an instrument that could be shown"
+        )
+        raise InputError(Issue(text, str(file), allowed=OPENED))
+    note = (
+        "frames were measured; the page renders those of the instrument as designed, and the knobs are a guess of what "
+        "moved"
+    )
+    return Source(model, "a measurement", (note,))
+
+
+def _of_orbit(file: Path) -> Source:
+    """A monitored orbit as a course, its motions in steps among it."""
+    setup = resolve_monitor(file)
+    note = "changes are told against the instrument as designed, and not against the reference time of the orbit's test"
+    return Source(_with_motions(setup), "a monitored orbit", (note,))
+
+
+def _with_motions(setup: MonitorSetup) -> ResolvedJob:
+    """The job of a monitored orbit with the mounts' motions at each of its times, which its file gives as functions.
+
+    Raises:
+        InputError: a body turns about another pivot than under ``perturb``.
+    """
+    resolved, test = setup.resolved, setup.test
+    if not test.motion:
+        return resolved
+    plain = resolved.plain()
+    motions: dict[str, Any] = {}
+    for node, motion in test.motion.items():
+        shares = [motion.share(time) for time in test.course.times]
+        motions[node] = {"pivot": motion.pivot}
+        for name, kind, values in (("rotate", ANGLE, motion.rotate), ("shift", LENGTH, motion.shift)):
+            if any(values):
+                motions[node][name] = [[format_quantity(share * value, kind) for value in values] for share in shares]
+    plain["job"]["course"]["motion"] = motions
+    made: ResolvedJob = validate(ResolvedJob, YamlFile(test.source.file, plain, {}))
+    return made
+
+
+def _of_study(file: Path, run: int | None) -> Source:
+    setup = resolve_study(file)
     if setup.study.base.command != "render":
         found, allowed = setup.study.base.command, "a study of base: {command: render}"
         raise setup.error(
-            Problem("this study varies no instrument that could be shown", found, allowed), ("base", "command")
+            Problem("this study varies no job of a monitor, whose states could be shown", found, allowed),
+            ("base", "command"),
         )
-    resolved = validate(ResolvedJob, YamlFile("", setup.tree, {}))
-    turned = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
-    return Source(resolved, setup, tuple(factor for factor in turned if factor is not None))
+    factors, name = factor_knobs(setup), setup.study.name
+    if run is None:
+        resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.tree, {}))
+        return Source(resolved, f"the base of the study {name}", (), setup, factors)
+    plan = Plan.of(setup)
+    if not 0 <= run < plan.runs:
+        text = "the study has no such run"
+        raise InputError(Issue(text, str(file), found=f"--run {run}", allowed=f"0 to {plan.runs - 1}"))
+    one, scalars = plan.run(run), {column.name: column.cell(run) for column in plan.columns}
+    try:
+        resolved = validate(ResolvedJob, YamlFile("", base_with(setup, scalars), {}))
+    except InputError as error:
+        raise setup.blamed(error) from None
+    if one.seed is not None:
+        resolved = resolved.with_render(resolved.frames, one.seed)
+    factors = tuple(factor.beginning(scalars[factor.name]) for factor in factors)
+    values = ", ".join(f"{key} {value}" for key, value in scalars.items())
+    return Source(
+        resolved, f"run {run} of the study {name}: {values}", (), setup, factors, scalars, one.seed is not None
+    )
 
 
-def _factor(name: str, factor: FactorSpec, setup: StudySetup) -> FactorKnob | None:
-    """The knob of a factor; None where it is no number."""
-    numbers = factor.numbers()
-    if not numbers.numeric or not len(numbers):
-        return None
-    unit = numbers.unit or ""
-    values = list(numbers.values)
-    if factor.kind in ("normal", "truncated"):
-        mean, sigma = values[:2]
-        values = [mean - 4.0 * sigma, mean + 4.0 * sigma] if factor.kind == "normal" else values[2:]
-    base = 1.0
-    if factor.places:
-        base = _number(leaf(setup.tree, factor.places[0]), unit, values[0])
-    knobs = {} if factor.scales else _knobs(factor.places, unit)
-    return FactorKnob(name, unit, min(*values, base), max(*values, base), base, numbers.whole, knobs)
-
-
-def _number(value: Any, unit: str, otherwise: float) -> float:
-    """A value of the base in the factor's unit."""
-    if isinstance(value, int | float):
-        return float(value)
-    part = split_quantity(value)
-    if part is None:
-        return otherwise
-    number, own = part
-    return float(number) if own == unit else float(number) / unit_ratio(unit, own)
-
-
-def _knobs(places: tuple[KeyPath, ...], unit: str) -> dict[str, float]:
-    """Knobs that stand for the places of a factor; none where any is something else."""
-    out = {}
-    for place in places:
-        found = _knob(place)
-        if found is None:
-            return {}
-        name, own = found
-        out[name] = 1.0 if unit == own else unit_ratio(unit, own) if unit else 0.0
-    return out
-
-
-def _knob(place: KeyPath) -> tuple[str, str] | None:
-    """Name and unit of the knob that a place in a resolved job is."""
-    match place:
-        case ("job", "perturb", str(node), ("rotate" | "shift") as kind, int(axis)):
-            return knob_name(node, kind, AXES[axis]), KINDS[kind].unit
-        case ("job", "perturb", str(node), "figure", str(term)):
-            return knob_name(node, "figure", term), KINDS["figure"].unit
-        case ("job", "perturb", str(node), "scale"):
-            return knob_name(node, "scale", ""), KINDS["scale"].unit
-        case ("job", "perturb", str(node), "temperature", "change"):
-            return knob_name(node, "temperature", ""), KINDS["temperature"].unit
-        case ("job", "perturb", str(node), "temperature", "gradient", int(axis)):
-            return knob_name(node, "gradient", AXES[axis]), KINDS["gradient"].unit
-    return None
-
-
-def _fixed(factor: FactorSpec, knob: FactorKnob, value: float) -> FactorSpec:
-    """The factor with this value alone."""
-    number = int(value) if knob.whole and value == int(value) else value
-    scalar = with_unit(number, knob.unit) if knob.unit else number
-    kept = {"key": factor.key, "keys": factor.keys, "scales": factor.scales}
-    return FactorSpec.model_validate({**{k: v for k, v in kept.items() if v}, "values": (scalar,)})
+def _for_a_page(source: Source) -> Source:
+    """The source, and what a page changes of it told."""
+    frames = source.resolved.frames
+    if frames <= MOST_FRAMES:
+        return source
+    return replace(source, notes=(*source.notes, f"the page takes {MOST_FRAMES} frames in place of {frames}"))

@@ -65,13 +65,14 @@ class StateReader:
     def _clean_before(self) -> SpotPositions:
         return self._spots(self.experiment.expected_frames(self.experiment.nominal_photons))
 
-    def read(self, state: State, noise: bool = True, number: int = 0) -> StateReading:
+    def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> StateReading:
         """Trace, render and recover a state.
 
         Args:
             state: body -> motion, as of ``MonitorExperiment.state``.
             noise: expose frames; else the expected images are measured.
             number: of the state, each of which has a random stream of its own; of a course that of the time.
+            single: render in single precision, as all times of a course are.
 
         Raises:
             BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD; where, is in the message.
@@ -80,7 +81,8 @@ class StateReader:
         experiment = self.experiment
         with one_blas_thread():
             truth = experiment.sight.truth([state])
-            photons = experiment.path.photons_of(state)[None]
+            path = experiment.path
+            photons = path.expected_photons([state]) if single else path.photons_of(state)[None]
             frames = experiment.frames_after(photons, self.frames, self.seed, number)[0] if noise else None
             mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
             first, second = self._clean_before if frames is None else self._spots_before, self._spots(mean)

@@ -199,6 +199,7 @@ class Live {
     this.wait = 500;
     this.waiting.clear();
     byId('name').textContent = hello.instrument;
+    byId('name').title = hello.about;
     document.title = `${hello.instrument} · live twin`;
     if (first) {
       byId('frames').value = Math.min(64, hello.frames);

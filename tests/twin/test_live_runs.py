@@ -1,0 +1,469 @@
+"""Run folders in the live twin: what was saved is what is shown, and what cannot be shown says so with a remedy."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import twin
+import twin.live.__main__ as command
+from scenes.models.monitor_layout import resolve_monitor_design
+from scenes.specs.camera_setup import resolve_camera
+from scenes.specs.lab_setup import resolve_turntable
+from scenes.specs.load import EXAMPLES, SCENES
+from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.orbit_setup import resolve_angle, resolve_monitor
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.test_course import JOB as COURSE
+from twin.live.live_bench import LiveBench
+from twin.live.messages import MOST_FRAMES, AskedState
+from twin.live.recording import job_text
+from twin.live.source import Source, read_source
+from twin.main_job.job_tables import config_text
+from twin.main_job.monitor_reading import stated
+from twin.main_job.render_job import render_job
+from twin.orbit.monitoring.monitoring_flight import states_of
+from twin.run.run_folder import RunFolder, write_manifest
+from twin.scripting.instrument_twin import InstrumentTwin
+from twin.study.runs.config_tree import with_values
+from twin.study.runs.perturbed_job import read_job
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
+
+ROOT = Path(__file__).resolve().parents[2]
+JOB = """instrument: gf7_pair
+perturb:
+  base/forward/M2: {shift: [0 um, 1 um, 3 um], figure: {Z7: 4 nm}}
+  base/backward/focal_plane: {rotate: [2 arcsec, -1.5 arcsec, 10 arcsec], pivot: rear_node}
+  base/central_prism: {temperature: {change: 0.1 K, gradient: [0 K/m, 0 K/m, 30 mK/m]}}
+disturbances: launch
+render: {frames: 2, seed: 1}
+"""
+STUDY = """name: choices
+base: {command: render, file: job.yaml}
+factors:
+  despace: {key: [job, perturb, base/forward/M2, shift, 2], normal: {mean: 0 um, sigma: 2 um}}
+  light: {scales: [{key: [instrument, monitor, reticle, photons_per_frame], power: 2}], uniform: [0.5, 2]}
+  aperture:
+    key: [instrument, monitor, return_face, aperture]
+    uniform: [3 cm, 5 cm]
+    scales: [{key: [instrument, monitor, reticle, photons_per_frame], power: 2}]
+  frames: {key: [job, render, frames], values: [1, 4]}
+  centroid: {key: [job, analysis, centroid], values: [ml, gaussian]}
+design: {kind: monte_carlo, runs: 8, seed: 5}
+responses: {df: {key: [recovered, cameras, forward, model, d_f_um]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def pair() -> InstrumentTwin:
+    return twin.load("gf7_pair")
+
+
+def bench_of(source: Source, pair: InstrumentTwin) -> LiveBench:
+    return LiveBench(InstrumentTwin.of(source.resolved, like=pair))
+
+
+def written(folder: Path, text: str, name: str = "job.yaml") -> Path:
+    file = folder / name
+    file.write_text(text, "utf-8")
+    return file
+
+
+def run_folder(place: Path, program: str, config: str | None, test: str = "", **files: str) -> Path:
+    """A run folder as the commands make them, with a report that says nothing."""
+    with RunFolder(place) as folder:
+        if config is not None:
+            folder.write_text("config.yaml", config)
+        folder.write_text("report.html", "<p>report</p>")
+        for name, text in files.items():
+            folder.write_text(f"artefacts/{name}.yaml", text)
+        write_manifest(folder, program, 0.0, 1.0, test=test)
+    return place
+
+
+def told(*arguments: object) -> tuple[int, str]:
+    """Exit code of the command and what it says on stderr, in one line."""
+    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    return result.exit_code, " ".join(result.stderr.split())
+
+
+# --- what was saved ---------------------------------------------------------------------------------------------------
+
+
+def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkeypatch):
+    """State, seed and number of frames, the command's own --frames and --seed among them; all frames and readings to
+    the bit, however the folder is named.
+    """
+    run = render_job(resolve(written(tmp_path, JOB)), backend, 3, 11, experiment=bench_experiment(pair, tmp_path))
+    folder = run_folder(tmp_path / "run", "twin.render", config_text(run.resolved))
+    monkeypatch.chdir(tmp_path)
+    for name in (folder, folder / "config.yaml", "run", "run/", "./run/config.yaml"):
+        source = read_source(str(name))
+        assert source.resolved == resolve(folder / "config.yaml")
+        assert source.notes == ()
+        assert source.about == "run: a job of the monitor"
+    bench = bench_of(source, pair)
+    assert (bench.at_rest.frames, bench.at_rest.seed, bench.at_rest.time) == (3, 11, None)
+    shown, after = bench.state(bench.at_rest)
+    assert shown["readings"] == stated(run.recovered_dict())
+    assert shown["truth"] == run.truth_dict()
+    assert np.array_equal(after, run.after[:, 0])
+    assert np.array_equal(bench.before(bench.at_rest), run.before[:, 0])
+
+
+def bench_experiment(pair: InstrumentTwin, folder: Path) -> Any:
+    """The instrument with what the folder's job states, not built again."""
+    return InstrumentTwin.of(resolve(folder / "job.yaml"), like=pair).experiment
+
+
+def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
+    """The time that is shown, all to the bit; and any other time as the run has it, and as its saved job repeats it."""
+    run = render_job(resolve(written(tmp_path, COURSE)), backend, experiment=bench_experiment(pair, tmp_path))
+    folder = run_folder(tmp_path / "run", "twin.render", config_text(run.resolved))
+    bench = bench_of(read_source(str(folder)), pair)
+    assert bench.course is not None
+    assert bench.course.names[bench.at_rest.time or 0] == "12 min"
+    shown, after = bench.state(bench.at_rest)
+    assert shown["readings"] == stated(run.recovered_dict())
+    assert shown["truth"] == run.truth_dict()
+    assert np.array_equal(after, run.after[:, 0])
+    assert np.array_equal(bench.before(bench.at_rest), run.before[:, 0])
+    assert run.series is not None
+    for time in (0, 2):
+        asked = AskedState(**{**bench.at_rest.model_dump(), "time": time})
+        other, frames = bench.state(asked)
+        assert np.array_equal(frames, run.series.frames[time])
+        assert other["truth"]["cameras"]["forward"]["d_f_um"] == 1e6 * run.series.truth["forward"][3, time]
+    saved = render_job(resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")), backend)
+    assert other["readings"] == stated(saved.recovered_dict())
+
+
+def test_what_was_changed_after_the_run_is_told(tmp_path):
+    text = resolve(written(tmp_path, JOB)).to_yaml()
+    folder = run_folder(tmp_path / "run", "twin.render", text)
+    assert text.count("seed: 1\n") == 1
+    (folder / "config.yaml").write_text(text.replace("seed: 1\n", "seed: 2\n"), "utf-8")
+    source = read_source(str(folder))
+    assert source.resolved.job.render.seed == 2
+    assert "was changed after the run" in source.notes[0]
+
+
+def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
+    many = JOB.replace("frames: 2", f"frames: {MOST_FRAMES + 1}")
+    source = read_source(str(written(tmp_path, many)))
+    assert source.notes == (f"the page takes {MOST_FRAMES} frames in place of {MOST_FRAMES + 1}",)
+    assert bench_of(source, pair).at_rest.frames == MOST_FRAMES
+    assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
+
+
+def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, backend, tmp_path):
+    """A number in JSON holds 53; the noise is that of all, and the saved job has all."""
+    seed = 2**62 + 2**55 + 12345
+    file = written(tmp_path, JOB.replace("seed: 1", f"seed: {seed}"))
+    bench = bench_of(read_source(str(file)), pair)
+    asked = AskedState(**json.loads(bench.at_rest.model_dump_json()))
+    assert asked.seed == 12345
+    assert bench.greeting()["seed"] == 12345
+    run = render_job(resolve(file), backend, experiment=bench_experiment(pair, tmp_path))
+    shown, after = bench.state(asked)
+    assert shown["readings"] == stated(run.recovered_dict())
+    assert np.array_equal(after, run.after[:, 0])
+    assert np.array_equal(bench.before(asked), run.before[:, 0])
+    assert resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")).job.render.seed == seed
+    other = AskedState(**{**asked.model_dump(), "seed": 12346})
+    assert resolve(written(tmp_path, job_text(bench, other), "saved.yaml")).job.render.seed == 12346
+
+
+def test_a_folder_does_not_hide_an_instrument_of_the_library(tmp_path, monkeypatch):
+    (tmp_path / "gf7_pair").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert read_source("gf7_pair").resolved.instrument.name == "gf7_pair"
+
+
+# --- run folders of other commands ------------------------------------------------------------------------------------
+
+
+def frames_beside(folder: Path) -> Path:
+    """A measurement's file with its frames, which nobody reads here."""
+    (folder / "frames").mkdir()
+    for channel in ("forward_left", "forward_right", "backward_left", "backward_right"):
+        for when in ("before", "after"):
+            (folder / "frames" / f"{channel}_{when}.tiff").write_bytes(b"")
+    text = "instrument: gf7_pair\nframes: frames\ndisturbances: launch\nexposure: 20 ms\n"
+    return written(folder, text, "measurement.yaml")
+
+
+def test_a_measurement_opens_its_instrument_as_designed(tmp_path):
+    """With its exposure and what it states to move, also when the frames are no longer where they were."""
+    file = frames_beside(tmp_path)
+    setup = resolve_measurement(file)
+    folder = run_folder(tmp_path / "run", "twin.recover", setup.to_yaml(), "recovered")
+    for frame in (tmp_path / "frames").iterdir():
+        frame.unlink()
+    for name in (folder, folder / "config.yaml"):
+        source = read_source(str(name))
+        assert source.resolved == setup.model
+        assert "frames were measured" in source.notes[0]
+    assert source.resolved.instrument.monitor.area_ccd.exposure == pytest.approx(0.02)
+    assert source.resolved.disturbances is not None
+    assert source.resolved.disturbances.name == "launch"
+    assert not source.resolved.job.perturb
+    with pytest.raises(InputError, match="no frames of forward/left"):
+        read_source(str(file))
+
+
+def test_a_measurement_without_an_instrument(tmp_path):
+    """One that gives the cameras' geometry alone has nothing to be shown."""
+    file = frames_beside(tmp_path)
+    geometry = "{focal_length: 5.5 m, separation: 0.24 m, pixel: 12 um}"
+    text = file.read_text().replace(
+        "instrument: gf7_pair\n", f"geometry: {{forward: {geometry}, backward: {geometry}}}\ntemplate: measured\n"
+    )
+    text = text.replace("disturbances: launch\n", "detector: monitor_ccd\n")
+    config = resolve_measurement(written(tmp_path, text, "measurement.yaml")).to_yaml()
+    code, said = told(run_folder(tmp_path / "run", "twin.recover", config, "recovered"))
+    assert code == 2
+    assert "geometry of the cameras alone" in said
+
+
+def test_a_run_of_uncertainty_opens_its_job(tmp_path):
+    resolved = resolve(written(tmp_path, JOB))
+    folder = run_folder(tmp_path / "run", "twin.uncertainty", resolved.to_yaml(), "uncertainty")
+    assert read_source(str(folder)).resolved == resolve(folder / "config.yaml")
+
+
+def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_path):
+    """States of the test itself: temperatures, swings and ramps; poses to rounding."""
+    setup = resolve_monitor(SCENES / "orbit" / "monitor.yaml")
+    folder = run_folder(tmp_path / "run", "twin.orbit", setup.to_yaml(), "monitor")
+    bench = bench_of(read_source(str(folder)), pair)
+    numbers = [0, 9, 14]
+    expected = states_of(bench.twin.experiment, setup.test, numbers)
+    assembly = bench.twin.experiment.instrument.assembly
+    moved = "base/backward/focal_plane"
+    for k, state in zip(numbers, expected, strict=True):
+        shown = bench.states(AskedState(**{**bench.at_rest.model_dump(), "time": k}))
+        assert set(shown) == set(state)
+        one, two = assembly.place([shown]), assembly.place([state])
+        for path in state:
+            assert np.asarray(one.pose(path).translation) == pytest.approx(two.pose(path).translation, abs=1e-15)
+            assert np.asarray(one.pose(path).rotation) == pytest.approx(two.pose(path).rotation, abs=1e-15)
+            assert shown[path].figure == state[path].figure
+        # the settling begins at 40 min; heat turns the body by some nanoradians at all times
+        assert (max(map(abs, shown[moved].rotate)) > 1e-7) == (k > 8)
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def studied(tmp_path_factory) -> Path:
+    """A study's folder, as it is from the study's beginning."""
+    place = tmp_path_factory.mktemp("study")
+    written(place, JOB)
+    setup = resolve_study(written(place, STUDY, "study.yaml"))
+    return run_folder(place / "run", "twin.study", setup.to_yaml())
+
+
+def test_a_study_folder_opens_its_base_with_factors_as_knobs(studied):
+    source = read_source(str(studied))
+    assert source.resolved == read_job(resolve_study(studied / "config.yaml").tree)
+    factors = {factor.name: factor for factor in source.factors}
+    assert set(factors) == {"despace", "light", "aperture", "frames"}
+    assert factors["despace"].knobs == {"base/forward/M2 shift z": 1.0}
+    assert (factors["despace"].value, factors["light"].value, factors["aperture"].value) == (3.0, 1.0, 5.0)
+    assert "base of the study choices" in source.about
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_a_run_of_a_study_opens_as_it_was_run(studied, number):
+    """Everything that its factors set, texts and ratios among it, and its seed."""
+    setup = resolve_study(studied / "config.yaml")
+    plan = Plan.of(setup)
+    run = plan.run(number)
+    expected = read_job(with_values(setup.tree, run.values))
+    assert run.seed is not None
+    source = read_source(str(studied), number)
+    assert source.resolved == expected.with_render(expected.frames, run.seed)
+    assert source.notes == ()
+    values = {column.name: column.values[number].item() for column in plan.columns}
+    for factor in source.factors:
+        assert factor.value == values[factor.name]
+        assert factor.low <= factor.value <= factor.high
+    assert f"run {number} of the study" in source.about
+    # another value of one factor: the others stay those of the run, also what follows them
+    light, aperture = values["light"], values["aperture"]
+    turned = source.with_factors({"aperture": 4.0})
+    assert turned.instrument.monitor.return_face.aperture == pytest.approx(0.04)
+    photons = source.resolved.instrument.monitor.reticle.photons_per_frame
+    assert photons == pytest.approx(4e6 * light**2 * (aperture / 5.0) ** 2)
+    assert turned.instrument.monitor.reticle.photons_per_frame == pytest.approx(4e6 * light**2 * 0.8**2)
+    assert turned.job == source.resolved.job
+
+
+def test_a_run_that_a_study_does_not_have(studied, tmp_path):
+    for number in (8, -1):
+        with pytest.raises(InputError, match="no such run") as error:
+            read_source(str(studied), number)
+        assert error.value.allowed == "0 to 7"
+    for what in ("gf7_pair", str(written(tmp_path, JOB))):
+        with pytest.raises(InputError, match="a run of a study"):
+            read_source(what, 0)
+    assert told(studied, "--run", "8")[0] == 2
+    assert told(studied, "--run", "-1")[0] == 2
+
+
+# --- what cannot be shown ---------------------------------------------------------------------------------------------
+
+
+def angle_config() -> str:
+    return resolve_angle(SCENES / "orbit" / "angle_gf7.yaml").to_yaml()
+
+
+def lab_config() -> str:
+    return resolve_turntable(SCENES / "lab" / "turntable.yaml").to_yaml()
+
+
+def camera_config() -> str:
+    return resolve_camera("gf7_pair", "forward").to_yaml()
+
+
+def study_config() -> str:
+    return resolve_study(EXAMPLES / "study_interval.yaml").to_yaml()
+
+
+REFUSED = {
+    "lab": ("twin.lab", "turntable", lab_config, ("a turntable test (twin.lab turntable)", "report.html")),
+    "angle": ("twin.orbit", "angle", angle_config, ("intersection angles", "twin.live gf7_pair opens its instrument")),
+    "camera": ("twin.camera", "optics", camera_config, ("twin.camera", "twin.live gf7_pair opens its instrument")),
+    "compare": ("twin.compare", "compare", lambda: dump_yaml({"runs": ["a", "b"]}), ("twin.compare", "report.html")),
+    "export": ("twin.export", "files", lambda: dump_yaml({"run": "a"}), ("twin.export", "report.html")),
+    "validate": ("twin.validate", "", None, ("twin.validate", "report.html")),
+    "study": ("twin.study", "", study_config, ("orbit monitor", "a study of base: {command: render}")),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_run_folders_without_a_monitors_state(tmp_path, name):
+    program, test, config, words = REFUSED[name]
+    folder = run_folder(tmp_path / "run", program, None if config is None else config(), test)
+    places = (folder,) if config is None else (folder, folder / "config.yaml")
+    for place in places:
+        code, said = told(place)
+        assert code == 2
+        assert str(folder) in said
+        for word in (*words, "allowed:"):
+            assert word in said
+        assert "Traceback" not in said
+
+
+def test_an_instrument_that_a_design_made_is_named(tmp_path):
+    """And opened: it is what the folder has to show."""
+    made = (SCENES / "library" / "instruments" / "gf7_pair_two.yaml").read_text("utf-8")
+    config = resolve_monitor_design(EXAMPLES / "design_monitor_two.yaml").to_yaml()
+    folder = run_folder(tmp_path / "run", "twin.design", config, "layouts", l1=made, notes="a: 1\n")
+    code, said = told(folder)
+    assert code == 2
+    assert f"twin.live {folder / 'artefacts' / 'l1.yaml'} opens an instrument that it made" in said
+    assert read_source(str(folder / "artefacts" / "l1.yaml")).resolved.instrument.name == "gf7_pair_two"
+
+
+def test_folders_that_are_none_of_a_run(tmp_path):
+    """A folder of run folders names some of them; an empty one says what may be given."""
+    code, said = told(tmp_path)
+    assert code == 2
+    assert "not a run folder: it has no config.yaml" in said
+    for name in ("b", "a"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.yaml").write_text("instrument: gf7_pair\n")
+    code, said = told(tmp_path)
+    assert code == 2
+    assert f"{tmp_path / 'a'}, {tmp_path / 'b'}" in said
+    assert told(tmp_path / "nowhere")[0] == 2
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: text[: len(text) // 2],
+        lambda text: text.replace("cameras:", "camaras:"),
+        lambda text: text.replace("gf7:", "gf9:"),
+        lambda text: "\0\1\2" + text,
+        lambda text: "[" * 2000,
+        lambda text: "&a [*a]",
+        lambda text: "- a\n- b\n",
+        lambda text: text.replace("3 um", "3 parsec"),
+    ],
+)
+def test_a_damaged_config_is_told_with_its_place(tmp_path, damage):
+    text = resolve(written(tmp_path, JOB)).to_yaml()
+    broken = damage(text)
+    assert broken != text
+    folder = run_folder(tmp_path / "run", "twin.render", text)
+    (folder / "config.yaml").write_text(broken, "utf-8")
+    for place in (folder, folder / "config.yaml"):
+        code, said = told(place)
+        assert code == 2
+        assert "config.yaml" in said
+        assert "Traceback" not in said
+
+
+def test_a_manifest_of_somebody_else_changes_nothing(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    written(folder, resolve(written(tmp_path, JOB)).to_yaml(), "config.yaml")
+    (folder / "manifest.json").write_text('{"program": "twin.camera", "sha256": 3}')
+    assert read_source(str(folder)).resolved == resolve(folder / "config.yaml")
+
+
+# --- the commands themselves ------------------------------------------------------------------------------------------
+
+
+def commanded(*arguments: object) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", *map(str, arguments)], cwd=ROOT, check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_folders_that_the_commands_made(pair, tmp_path):
+    """A study's run is what the study wrote of it; a measurement and a list of limits open; a camera's run does not."""
+    text = STUDY.replace("[1, 4]", "[2, 4]").replace("runs: 8", "runs: 3")
+    text = text.replace("  light:", "  #").replace("[ml, gaussian]", "[ml, ml]")
+    written(tmp_path, JOB)
+    commanded("twin.study", written(tmp_path, text, "study.yaml"), "--out", tmp_path / "study", "--workers", 1)
+    import xarray as xr
+
+    with xr.open_dataset(tmp_path / "study" / "study.nc", engine="h5netcdf") as data:
+        for k in range(3):
+            bench = LiveBench(InstrumentTwin.of(read_source(str(tmp_path / "study"), k).resolved))
+            shown, _ = bench.state(bench.at_rest)
+            values = shown["readings"]["cameras"]["forward"]["model"]
+            # single precision beside double: a pixel in ten thousand counts another electron
+            assert abs(float(data.df[k]) - values["d_f_um"]) < 0.1 * values["d_f_um_sigma_noise"]
+    commanded("twin.render", tmp_path / "job.yaml", "--out", tmp_path / "render")
+    bench = bench_of(read_source(str(tmp_path / "render")), pair)
+    shown, _ = bench.state(bench.at_rest)
+    file = json.loads((tmp_path / "render" / "recovered.json").read_text())
+    assert shown["readings"] == {key: file[key] for key in shown["readings"]}
+    frames = f"instrument: gf7_pair\nframes: {tmp_path / 'render' / 'images'}\ndisturbances: launch\n"
+    commanded("twin.recover", written(tmp_path, frames, "measured.yaml"), "--out", tmp_path / "recover")
+    assert read_source(str(tmp_path / "recover")).about == "recover: a measurement"
+    commanded("twin.uncertainty", "gf7_pair", "--out", tmp_path / "limits")
+    assert read_source(str(tmp_path / "limits")).about == "limits: a job of the monitor"
+    commanded("twin.camera", "gf7", "--out", tmp_path / "camera")
+    code, said = told(tmp_path / "camera")
+    assert (code, "a run folder of twin.camera" in said) == (2, True)
