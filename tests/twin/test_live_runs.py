@@ -19,7 +19,7 @@ from scenes.specs.camera_setup import resolve_camera
 from scenes.specs.lab_setup import resolve_turntable
 from scenes.specs.load import EXAMPLES, SCENES
 from scenes.specs.measured.monitor_frames_setup import resolve_measurement
-from scenes.specs.orbit_setup import resolve_angle, resolve_monitor
+from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
