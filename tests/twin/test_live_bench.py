@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 from pathlib import Path
@@ -47,6 +48,19 @@ def test_the_first_state_is_the_main_job(bench, first, backend):
     assert told["truth"] == run.truth_dict()
     assert np.array_equal(after, run.after[:, 0])
     assert np.array_equal(bench.before(first), run.before[:, 0])
+
+
+def test_a_state_leaves_nothing_that_only_refers_to_itself(bench, first):
+    """What does would stay, images and all, until Python looks for it, which it does the less the more there is."""
+    bench.state(first)
+    gc.collect()
+    gc.disable()
+    try:
+        for n in range(3):
+            bench.state(changed(first, {f"{M2} shift z": 0.5 + n}, noise=bool(n % 2)))
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
 
 
 def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):

@@ -25,7 +25,7 @@ from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_path import SpotFocus
+from twin.monitor.monitor_rays import SpotFocus
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost

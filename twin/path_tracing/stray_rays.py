@@ -20,7 +20,8 @@ from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.channel import Channel
-from twin.monitor.monitor_path import Aimed, MonitorPath
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.monitor_rays import Aimed
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.integrator import FAINT, Sampling
 from twin.path_tracing.path_result import Family, PathResult
