@@ -222,13 +222,13 @@ def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
 
 def test_every_knob_moves_what_it_names(bench):
     """One knob of every kind at every body gives a perturbation of this body alone, with the number as typed."""
-    job, nodes = bench.twin.resolved.job, bench.twin.experiment.instrument.nodes
+    first, nodes = bench.twin.resolved.job.plain()["perturb"], bench.twin.experiment.instrument.nodes
     seen = set()
     for name, knob in bench.knobs.items():
         if (knob.node, knob.kind) in seen:
             continue
         seen.add((knob.node, knob.kind))
-        made = bench.twin.perturbed(perturbation({name: 0.123}, {}, bench.knobs, job))
+        made = bench.twin.perturbed(perturbation({name: 0.123}, {}, bench.knobs, first))
         own = made.resolved.job.perturb[knob.node]
         assert own.uses() == (KINDS[knob.kind].key,)
         assert all(not what.uses() for node, what in made.resolved.job.perturb.items() if node != knob.node)
@@ -262,7 +262,7 @@ def test_knobs_keep_the_units_of_the_job(tmp_path):
 
 def test_an_unknown_knob_names_the_nearest(bench):
     with pytest.raises(InputError, match="shift z"):
-        perturbation({f"{M2} shft z": 1.0}, {}, bench.knobs, bench.twin.resolved.job)
+        perturbation({f"{M2} shft z": 1.0}, {}, bench.knobs, {})
     assert knob_name("base", "temperature", "") == "base temperature"
 
 

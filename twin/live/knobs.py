@@ -147,7 +147,7 @@ def _in_unit(quantity: Any, unit: str) -> float:
 
 
 def perturbation(
-    values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], job: JobSpec
+    values: Mapping[str, float], pivots: Mapping[str, str], knobs: Mapping[str, Knob], first: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
     """What knobs come to: ``perturb`` of a job's file, for every body that any of them moves or that the job moves.
 
@@ -155,13 +155,12 @@ def perturbation(
         values: name of a knob -> its value; others stand at zero.
         pivots: body -> name of the point about which it turns and grows; others keep the job's.
         knobs: all of the instrument's.
-        job: whose deformations by tables of nodes stay.
+        first: ``perturb`` of the job in which the knobs begin, whose deformations by tables of nodes stay.
 
     Raises:
         InputError: no such knob, or a value beyond its limit.
     """
-    plain = job.plain().get("perturb", {})
-    out: dict[str, dict[str, Any]] = {node: _kept(what) for node, what in plain.items()}
+    out: dict[str, dict[str, Any]] = {node: _kept(what) for node, what in first.items()}
     by_axis: dict[tuple[str, str], dict[str, float]] = {}
     for name, value in values.items():
         knob = knobs.get(name)

@@ -7,7 +7,7 @@ that what the page shows is what `python -m twin.render` would write for the kno
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -52,6 +52,8 @@ class LiveBench:
         self.twin = twin
         check_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
         self._reader = lru_cache(maxsize=4)(self._new_reader)
+        # while a course is played the knobs stand
+        self._standing = lru_cache(maxsize=2)(self._new_standing)
 
     @cached_property
     def knobs(self) -> dict[str, Knob]:
@@ -151,7 +153,16 @@ class LiveBench:
         Raises:
             InputError: no such knob, or a value that a job's file could not have.
         """
-        return self.twin.perturbed(perturbation(asked.knobs, asked.pivots, self.knobs, self.twin.resolved.job))
+        return self._standing(tuple(asked.knobs.items()), tuple(asked.pivots.items()))
+
+    def _new_standing(self, knobs: Sequence[tuple[str, float]], pivots: Sequence[tuple[str, str]]) -> InstrumentTwin:
+        return self.twin.perturbed(perturbation(dict(knobs), dict(pivots), self.knobs, self._moved_at_first))
+
+    @cached_property
+    def _moved_at_first(self) -> Mapping[str, Any]:
+        """``perturb`` of the job's file."""
+        moved: Mapping[str, Any] = self.twin.resolved.job.plain().get("perturb", {})
+        return moved
 
     def state(self, asked: AskedState) -> tuple[dict[str, Any], np.ndarray | None]:
         """What a state of the knobs comes to.

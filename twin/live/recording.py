@@ -57,7 +57,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     resolved = bench.twin.resolved.with_render(first.frames, bench.seed_of(first.seed))
     plain = resolved.plain()
     job = plain["job"]
-    job["perturb"] = perturbation(fixed, first.pivots, knobs, resolved.job)
+    job["perturb"] = perturbation(fixed, first.pivots, knobs, job.get("perturb", {}))
     job["course"] = {
         "times": [f"{time!r} s" for time, _ in steps],
         **_courses(moving, first.pivots, knobs, len(steps)),

@@ -100,7 +100,7 @@ class InstrumentTwin:
     @property
     def perturbations(self) -> Mapping[str, Any]:
         """Node -> what happens to it, with the keys and unit strings of the YAML."""
-        plain = self.resolved.job.plain().get("perturb", {})
+        plain = self._plain.get("perturb", {})
         return {
             node: {key: plain[node][key] for key in (*what.uses(), *_pivot(what.uses(), plain[node]))}
             for node, what in self.resolved.job.perturb.items()
@@ -143,8 +143,7 @@ class InstrumentTwin:
         Raises:
             InputError: no such node, or nothing that can be done to it.
         """
-        plain = self.resolved.job.plain()
-        plain["perturb"] = {**plain.get("perturb", {}), **perturb}
+        plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **perturb}}
         twin = self._with_job(plain)
         check_nodes(twin.resolved.job, self._nodes)
         return twin
@@ -160,8 +159,8 @@ class InstrumentTwin:
         Raises:
             InputError: no such file, or one that is not valid for this instrument.
         """
-        plain = self.resolved.job.plain()
-        plain["disturbances"] = disturbances if isinstance(disturbances, str) else dict(disturbances)
+        named = disturbances if isinstance(disturbances, str) else dict(disturbances)
+        plain = {**self._plain, "disturbances": named}
         job = self._with_job(plain).resolved.job
         stated = find_disturbances(job, self.resolved.instrument)
         resolved = self.resolved.model_copy(update={"job": job, "disturbances": stated})
@@ -181,14 +180,9 @@ class InstrumentTwin:
         Raises:
             InputError: a wrong key, or a perturbation so large that light misses the mirrors or a spot its CCD.
         """
-        plain = self.resolved.job.plain()
         given = {"frames": frames, "seed": seed}
-        plain["render"] = {
-            **plain.get("render", {}),
-            **{key: value for key, value in given.items() if value is not None},
-            **render,
-        }
-        job = self._with_job(plain).resolved
+        own = {key: value for key, value in given.items() if value is not None}
+        job = self._with_job({**self._plain, "render": {**self._plain.get("render", {}), **own, **render}}).resolved
         started, backend = time.time(), self._bench.backend
         return _shot_of(render_job(job, backend, experiment=self._bench.experiment), backend, started)
 
@@ -289,6 +283,11 @@ class InstrumentTwin:
     def to_yaml(self) -> str:
         """A job file that stands for this instrument and needs no other file; `load` and the commands read it."""
         return self.resolved.to_yaml()
+
+    @cached_property
+    def _plain(self) -> Mapping[str, Any]:
+        """The job as its file would have it."""
+        return self.resolved.job.plain()
 
     def _with_job(self, plain: Mapping[str, Any]) -> InstrumentTwin:
         source = self.resolved.job.source
