@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from analysis.spots.spot_positions import SpotError
-from optics.geometry.tree import State
+from optics.geometry.tree import PlacedBodies, State
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.clearance import Clearances
@@ -177,10 +177,10 @@ class LiveBench:
         began = time.perf_counter()
         told: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
         try:
-            run, after, state = self._run(asked, self._hidden(asked))
+            run, after, placed = self._run(asked, self._hidden(asked))
         except LOST as error:
             return {**told, **self._lost(asked, error), "ms": _ms(began)}, None
-        told |= self._told(run, asked, state)
+        told |= self._told(run, asked, placed)
         told["ms"] = _ms(began)
         return told, after
 
@@ -274,7 +274,7 @@ class LiveBench:
         expected = experiment.expected_frames(photons)
         return np.rint(np.clip(expected, 0, experiment.detector.max_dn)).astype(np.uint16)
 
-    def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, State]:
+    def _run(self, asked: AskedState, hidden: State) -> tuple[RenderRun, np.ndarray, PlacedBodies]:
         experiment = self.twin.experiment
         # the knobs are a guess of what is hidden, which stands beside it and not on top of it
         state = hidden or self.states(asked)
@@ -296,16 +296,15 @@ class LiveBench:
             crosstalk=self._crosstalk,
             warnings=(),
         )
-        return run, after, state
+        return run, after, found.placed
 
-    def _told(self, run: RenderRun, asked: AskedState, state: State) -> dict[str, Any]:
+    def _told(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
         experiment = self.twin.experiment
         instrument = experiment.instrument
-        placed = instrument.assembly.place([state])
         told: dict[str, Any] = {"readings": stated(run.recovered_dict())}
         if not isinstance(asked, BlindState):
             told["truth"] = run.truth_dict()
-            told["motions"] = motions(instrument, state, placed)
+            told["motions"] = motions(instrument, run.state, placed)
         else:
             told["guess"] = self._guess(asked)
         light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))

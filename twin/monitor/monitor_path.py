@@ -177,14 +177,18 @@ class MonitorPath:
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
 
-    def coarse_trace(self, states: Sequence[State]) -> CoarseTrace:
+    def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
         """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
+
+        Args:
+            states: S states.
+            placed: their bodies, when already placed.
 
         Raises:
             BeamMissedError, AimError: as ``rays``.
         """
         scout, count = self.scout, len(states)
-        placed = self.instrument.assembly.place(states)
+        placed = self.instrument.assembly.place(states) if placed is None else placed
         fan, outgoing = self._outgoing(placed, states)
         names = [f"{c.key}/monitor" for c in self.channels]
         back = assemble(self.instrument.assembly, names, states, placed=placed)
@@ -330,33 +334,44 @@ class MonitorPath:
                 photons = self._render(some, margin, single)
             yield slice(start, start + len(some)), photons
 
-    def photons_of(self, state: State) -> np.ndarray:
-        """Expected photons per pixel and frame of one state in double precision, (C, rows, columns).
+    def photons_of(self, state: State, placed: PlacedBodies | None = None, single: bool = False) -> np.ndarray:
+        """Expected photons per pixel and frame of one state, (C, rows, columns).
 
         The same as ``expected_photons``, to the bit; channels of cameras whose bodies all stay are rendered once.
+
+        Args:
+            state: the state.
+            placed: its bodies, when already placed.
+            single: in single precision, see ``optics.waves.diffraction.image``.
 
         Raises:
             BeamMissedError, AimError: as ``rays``.
         """
         with one_blas_thread():
-            moved = self.moved_cameras(state)
+            placed = self.instrument.assembly.place([state]) if placed is None else placed
+            moved = self.moved_cameras(state, placed)
             if not moved:
-                return self._at_rest[0].copy()
+                return self._at_rest(single)[0].copy()
             if len(moved) < len(self.cameras):
                 part = self._of_cameras(moved)
-                coarse = part.coarse_trace([state])
-                photons, usual = self._at_rest
+                coarse = part.coarse_trace([state], placed)
+                photons, usual = self._at_rest(single)
                 # spots far off need more nodes, and then all channels get them
                 if part.class_of(coarse.place)[0] == usual:
                     out = photons.copy()
-                    out[[c.camera in moved for c in self.channels]] = part._render([state], 0, False, coarse)[0]
+                    out[[c.camera in moved for c in self.channels]] = part._render([state], 0, single, coarse)[0]
                     return out
-            return np.asarray(self._render([state], 0, single=False)[0])
+            return np.asarray(self._render([state], 0, single, self.coarse_trace([state], placed))[0])
 
-    def moved_cameras(self, state: State) -> tuple[str, ...]:
-        """Cameras of whose channels' light some body is moved or otherwise changed."""
+    def moved_cameras(self, state: State, placed: PlacedBodies | None = None) -> tuple[str, ...]:
+        """Cameras of whose channels' light some body is moved or otherwise changed.
+
+        Args:
+            state: the state.
+            placed: its bodies, when already placed.
+        """
         assembly = self.instrument.assembly
-        touched = touched_bodies(assembly, [state], assembly.place([state]))
+        touched = touched_bodies(assembly, [state], assembly.place([state]) if placed is None else placed)
         return tuple(name for name in self.cameras if not touched.isdisjoint(self._bodies[name]))
 
     @cached_property
@@ -385,11 +400,16 @@ class MonitorPath:
     def _parts(self) -> dict[tuple[str, ...], MonitorPath]:
         return {}
 
-    @cached_property
-    def _at_rest(self) -> tuple[np.ndarray, int]:
+    def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
         """Photons of the unperturbed instrument (C, rows, columns), and the number of their class."""
-        coarse = self.coarse_trace([{}])
-        return self._render([{}], 0, False, coarse)[0], int(self.class_of(coarse.place)[0])
+        if single not in self._rested:
+            coarse = self.coarse_trace([{}])
+            self._rested[single] = self._render([{}], 0, single, coarse)[0], int(self.class_of(coarse.place)[0])
+        return self._rested[single]
+
+    @cached_property
+    def _rested(self) -> dict[bool, tuple[np.ndarray, int]]:
+        return {}
 
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None

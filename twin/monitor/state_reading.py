@@ -14,7 +14,7 @@ import numpy as np
 from analysis.monitor.recovery import Recovery, measure_spots, recovery_of
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotPositions, difference_covariance
-from optics.geometry.tree import State
+from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.threads import one_blas_thread
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
@@ -27,12 +27,14 @@ class StateReading:
     """What one state does and what its images say.
 
     Attributes:
-        truth: of this one state.
+        placed: bodies of this one state.
+        truth: of it.
         photons: expected photons per pixel and frame, (C, rows, columns).
         frames: uint16 (C, frames, rows, columns); None without noise.
         recovery: of this one state; without noise its sigmas are those that the noise of the frames would give.
     """
 
+    placed: PlacedBodies
     truth: Truth
     photons: np.ndarray
     frames: np.ndarray | None
@@ -80,16 +82,16 @@ class StateReader:
         """
         experiment = self.experiment
         with one_blas_thread():
-            truth = experiment.sight.truth([state])
-            path = experiment.path
-            photons = path.expected_photons([state]) if single else path.photons_of(state)[None]
+            placed = experiment.instrument.assembly.place([state])
+            truth = experiment.sight.truth([state], placed)
+            photons = experiment.path.photons_of(state, placed, single)[None]
             frames = experiment.frames_after(photons, self.frames, self.seed, number)[0] if noise else None
             mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
             first, second = self._clean_before if frames is None else self._spots_before, self._spots(mean)
             calibration, stated = experiment.calibration, experiment.disturbances
             spread = difference_covariance(first, second, calibration.noise)
             recovery = recovery_of(first, second, spread, calibration, stated)
-        return StateReading(truth, photons[0], frames, recovery)
+        return StateReading(placed, truth, photons[0], frames, recovery)
 
     def _spots(self, mean: np.ndarray) -> SpotPositions:
         """Of mean frames or expected images (C, rows, columns), grey values."""

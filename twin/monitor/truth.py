@@ -114,26 +114,35 @@ class LineSight:
         self.instrument = instrument
         self.backend = backend
 
-    def trace(self, states: Sequence[State]) -> np.ndarray:
+    def trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> np.ndarray:
         """Object-space directions of the line CCDs' points toward the scene, world, (cameras, S, LINE_POINTS, 3).
+
+        Args:
+            states: S states.
+            placed: their bodies, when already placed.
 
         Raises:
             AimError, BeamMissedError: a perturbation moves the image off the mirrors.
         """
         instrument, names = self.instrument, list(self.instrument.cameras)
-        placed, to_stop, points, guess = self._from_the_image(states)
+        placed = instrument.assembly.place(states) if placed is None else placed
+        to_stop, points, guess = self._from_the_image(states, placed)
         to_object = assemble(instrument.assembly, [f"{n}/image_to_object" for n in names], states, placed=placed)
         start = [np.repeat(a, len(states), axis=0) for a in self._aimed]
         sight = chief_directions(self.backend, to_stop, to_object, points, guess, ACROSS, (start[0], start[1]))
         return sight.reshape(len(names), len(states), LINE_POINTS, 3)
 
-    def truth(self, states: Sequence[State]) -> Truth:
+    def truth(self, states: Sequence[State], placed: PlacedBodies | None = None) -> Truth:
         """What states do to all cameras.
+
+        Args:
+            states: S states.
+            placed: their bodies, when already placed.
 
         Raises:
             AimError, BeamMissedError: as `trace`.
         """
-        sight = self.nominal if not states else np.concatenate([self.nominal, self.trace(states)], axis=1)
+        sight = self.nominal if not states else np.concatenate([self.nominal, self.trace(states, placed)], axis=1)
         return truth_of_sight(self.instrument, sight, self._axes)
 
     @cached_property
@@ -144,21 +153,22 @@ class LineSight:
     @cached_property
     def _aimed(self) -> tuple[np.ndarray, np.ndarray]:
         """Parameters and Jacobian of the unperturbed instrument's chief rays, from which all others are aimed."""
-        _, to_stop, points, guess = self._from_the_image([{}])
+        to_stop, points, guess = self._from_the_image([{}], self.instrument.assembly.place())
         return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
 
     @cached_property
     def _axes(self) -> dict[str, np.ndarray]:
         return {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
 
-    def _from_the_image(self, states: Sequence[State]) -> tuple[PlacedBodies, SystemBatch, np.ndarray, np.ndarray]:
-        """Bodies, systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), directions from them (B, 1, 3)."""
+    def _from_the_image(
+        self, states: Sequence[State], placed: PlacedBodies
+    ) -> tuple[SystemBatch, np.ndarray, np.ndarray]:
+        """Systems to the stops, points of the line CCDs (B, LINE_POINTS, 3), directions from them (B, 1, 3)."""
         instrument, names = self.instrument, list(self.instrument.cameras)
-        placed = instrument.assembly.place(states)
         to_stop = assemble(instrument.assembly, [f"{n}/image_to_stop" for n in names], states, placed=placed)
         points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
         guess = np.concatenate([instrument.toward_optics(placed, name) for name in names])[:, None]
-        return placed, to_stop, points, guess
+        return to_stop, points, guess
 
 
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
