@@ -14,7 +14,7 @@ of the image that it is held against.
 The next order counts where a spot is narrow or faint, since learning leaves noise that is as fine as the spot is:
 
 - **Curvature.** The noise's own slopes stand in the normal matrix I as if they were the spot's, with N = sum of
-  w cov(n', n'), and the residuals take them off again: the fit has the curvature I - N, and answers by I / (I - N) more.
+  w cov(n', n'), and the residuals take them off again: the fit has the curvature I - N, and answers by I / (I - N).
 - **Lean.** The noise of the shape is least half way between pixels, and pattern of the pixels is in both images: the
   fit is drawn there, by (I - N)^-1 sum of w (cov(n', m) - cov(n', n)). The place is not moved by it; the covariance of
   the shift gets the square of it.

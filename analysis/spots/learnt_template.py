@@ -1,8 +1,9 @@
 """The calibrated shape of a spot learnt from frames of the spot itself, where its optics are not modelled.
 
 The mean image without its level is low-passed where it holds more noise than light: a radial Wiener filter of its own
-power spectrum, real and even, so that it moves nothing. Beyond the image the shape is zero. What is left of the noise
-stands in the covariance of a shift: the image that the shape is from is fitted with it as one of two that differ.
+power spectrum, real and even, so that it moves nothing. Noise is what is new in every frame and the pattern of the
+pixels, which has all frequencies as well. Beyond the image the shape is zero. What is left of the noise stands in the
+covariance of a shift by `learnt_noise`.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
         noise: of the detector.
 
     Raises:
-        SpotError: there is no spot.
+        SpotError: there is no spot, or one so narrow that pixels do not sample it.
     """
     image = spot_image.filled(screened.mean, screened.good)
     frames = max(int(np.median(screened.counts)), 1)
@@ -133,6 +134,9 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplat
     if not np.all(screened.good):
         light, fills = _completed(light, screened.good, variance)
     passed = _passed(light, variance)
+    # holes that are not filled to the last leave noise of all frequencies, which no light is
+    if np.all(screened.good) and (passed[light.shape[0] // 2, 0] > 0.0 or passed[0, light.shape[1] // 2] > 0.0):
+        raise SpotError({0: "too narrow: a light with detail finer than two pixels has no shape between pixels"})
     light = _filtered(light, passed)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)

@@ -56,12 +56,12 @@ def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
 
     Against along leaves terms of third order only, 1e-2 of the change by a tenth of the noise.
     """
-    place = FIRST + (4.3, -3.6)
+    place = FIRST + np.array([4.3, -3.6])
     good = [np.ones(SHAPE, bool), np.ones(SHAPE, bool)]
     if case == "core":
         good[1] = ~core(place, 3.0)
     if case == "holes":
-        good[0] = ~core(FIRST + (1.0, -2.0), 1.5)
+        good[0] = ~core(FIRST + np.array([1.0, -2.0]), 1.5)
         good[0][:, 39] = False
     rng = np.random.default_rng(3)
     sigma = np.sqrt(NOISE.temporal_variance_dn2(spot(FIRST), FRAMES))
@@ -104,8 +104,8 @@ def test_pattern_of_the_pixels_is_no_light_when_a_shape_is_learnt():
 
 
 def test_noise_of_a_series_is_that_of_its_shifts():
-    """Of three images against the same one before, of which two show the spot at one place: the covariance of each shift
-    is its own, and in the difference of those two the image before cancels, and the pattern with it.
+    """Of three images against the same one before, of which two show the spot at one place: the covariance of each
+    shift is its own, and in the difference of those two the image before cancels, and the pattern with it.
     """
     rng = np.random.default_rng(6)
 
@@ -138,7 +138,7 @@ def test_a_part_of_the_detector_has_the_noise_of_all_of_it():
     """The image after is a window of the detector: places in it count from its corner, noise is the same."""
     before = screened(spot(FIRST))
     learnt = learn_template(before, NOISE)
-    first, place = fitted(before, learnt), FIRST + (1.4, 2.3)
+    first, place = fitted(before, learnt), FIRST + np.array([1.4, 2.3])
     mean = spot(place)
     whole = learnt_shift(learnt, first, fitted(screened(mean), learnt), NOISE, SHAPE)
     part = np.s_[3:60, 5:61]
@@ -150,12 +150,25 @@ def test_a_part_of_the_detector_has_the_noise_of_all_of_it():
     np.testing.assert_allclose(found.lean / whole.lean, 57 * 56 / 64**2, rtol=0.1)
 
 
+@pytest.mark.parametrize(("width", "narrow"), [(0.6, True), (0.75, True), (1.2, False)])
+def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
+    """What is finer than two pixels folds into other frequencies, and no interpolation can bring it back."""
+    rng = np.random.default_rng(9)
+    mean = spot(FIRST, width=width)
+    mean = mean + np.sqrt(NOISE.temporal_variance_dn2(mean, FRAMES)) * rng.standard_normal(SHAPE)
+    if not narrow:
+        assert learn_template(screened(mean), NOISE).light > 0.0
+        return
+    with pytest.raises(SpotError, match="too narrow"):
+        learn_template(screened(mean), NOISE)
+
+
 def test_a_shape_that_is_mostly_noise_is_refused():
     """Its covariance ends where the noise's own slopes are most of what the fit seems to know."""
     before = screened(spot(FIRST))
     learnt = learn_template(before, NOISE)
     first, second = fitted(before, learnt), fitted(screened(spot(FIRST + 1.3)), learnt)
-    # of a hundredth of a frame: noise ten times a frame's, in the shape only
+    # as if the frames before had hundreds of times the noise, in the shape only
     with pytest.raises(SpotError, match="mostly noise"):
         learnt_shift(learnt, replace(first, counts=np.full(SHAPE, 1e-5)), second, NOISE, SHAPE)
     assert isinstance(learnt.shape, SpotTemplate)

@@ -40,10 +40,8 @@ def bench(experiment):
     return one_shape(calibration.template, 0, calibration.template.shape), pair.detector, calibration.noise
 
 
-def squares(bench, kinds, seeds, centroid="ml", learnt=False, refused=False):
-    """Chi-square of every corrected shift against the truth (two coordinates), and the findings of each set; without
-    the sets that are refused, if some may be.
-    """
+def squares(bench, kinds, seeds, centroid="ml", learnt=False):
+    """Chi-square of every corrected shift against the truth (two coordinates), and the findings of each set."""
     template, detector, noise = bench
     out, told = [], []
     with one_blas_thread():
@@ -52,11 +50,8 @@ def squares(bench, kinds, seeds, centroid="ml", learnt=False, refused=False):
             analysis = AnalysisSpec(centroid=centroid)
             shape = None if learnt else template
             work = measurement(drawn, template, noise, "vibration" in kinds, shape, analysis=analysis)
-            if refused and (work.search() or work.measure()):
-                continue
-            if not refused:
-                assert work.search() == []
-                assert work.measure() == []
+            assert work.search() == []
+            assert work.measure() == []
             first, second = work.positions
             error = (second.position - first.position)[0] - drawn.shift
             out.append(float(error @ np.linalg.solve(work.shift_covariance(1)[0], error)))
@@ -187,8 +182,8 @@ def test_a_learnt_shape_is_that_of_the_spot_alone(bench, kind):
 
 @pytest.mark.parametrize(("kind", "sets"), [("saturation", 12), ("reflection", 4), ("vibration", 3)])
 def test_what_the_frames_before_hold_stands_in_the_sigma_of_a_learnt_shape(bench, kind, sets):
-    """Where the middle of a brighter spot is left out the noise of the shape counts for more than that of the image that
-    it is from; a reflection or a smear of the frames before goes with the shape, and is missing in those after.
+    """Where the middle of a brighter spot is left out the noise of the shape counts for more than that of the image
+    that it is from; a reflection or a smear of the frames before goes with the shape, and is missing in those after.
     """
     found, told = squares(bench, (kind,), range(40, 40 + sets), learnt=True)
     assert found.sum() < chi2.isf(1e-4, 2 * sets)
@@ -252,12 +247,16 @@ def test_corrected_estimates_hold_their_sigmas(bench, kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["clean", *(kind for kind in KINDS if kind != "movement"), "all"])
 def test_a_learnt_shape_holds_its_sigmas(bench, kind):
-    """200 sets of each kind again, with the shape learnt from the frames before. Of all together a set may be refused,
-    and the warning of the core stands for what is left.
+    """200 sets of each kind again, with the shape learnt from the frames before. Of all together one in ten may have
+    the warning that the spot after is another one, which says that sigma does not hold.
     """
     kinds = {"clean": (), "all": STANDING}.get(kind, (kind,))
-    found, told = squares(bench, kinds, range(SETS), learnt=True, refused=kind in ("saturation", "all"))
-    assert len(found) >= 0.98 * SETS
+    found, told = squares(bench, kinds, range(SETS), learnt=True)
+    if kind == "all":
+        found = found[[all(spot.fits for spot in spots) for spots in told]]
+        assert len(found) >= 0.9 * SETS
+    else:
+        assert all(spot.fits for spots in told for spot in spots)
     low, high = (chi2.isf(p, 2 * len(found)) for p in (1.0 - FALSE_ALARM / 2.0, FALSE_ALARM / 2.0))
     assert low < found.sum() < high
     assert found.max() < chi2.isf(FALSE_ALARM / SETS, 2)

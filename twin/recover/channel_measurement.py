@@ -36,6 +36,7 @@ _REMEDIES = (
     ("saturated", "frames with less light or a shorter exposure"),
     ("no spot", "frames that hold the channel's spot: the right file, with the light on"),
     ("range of the template", "a spot nearer to where the calibrated one stands"),
+    ("too narrow", "an instrument's model for the shape, `template: twin`, or a spot of 3 pixels at half of its peak"),
     ("mostly noise", "more frames of the state before, or frames with more light"),
     ("missing", "frames with less light, or with fewer bad pixels at the spot"),
 )
