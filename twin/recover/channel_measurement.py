@@ -275,7 +275,21 @@ class ChannelMeasurement:
         """
         if self._shifts:
             return self._shifts[number - 1].covariance[None]
-        return difference_covariance(self.positions[0], self.positions[number], self.channel.noise)
+        spread = difference_covariance(self.positions[0], self.positions[number], self.channel.noise)
+        return spread + self._doubt(number)
+
+    def _doubt(self, number: int) -> np.ndarray:
+        """(2, 2) px^2, what a reflection of the frames before may do to a centroid that knows no shape: it is in the
+        image before, and is put into that after with the accuracy of the learnt shape only. So far as the shift is not
+        that of the shape itself it is doubted.
+        """
+        first, second = self._examined[0], self._examined[number]
+        if not self._learnt or first is None or second is None or not np.any(second.fit.others[:, 2] < 0.0):
+            return np.zeros((2, 2))
+        own = (self.positions[number].position - self.positions[0].position)[0]
+        by_shape = (second.fit.positions.position - first.fit.positions.position)[0]
+        moved = np.subtract(self.channel.states[number].offset, self.channel.before.offset)
+        return np.outer(own - by_shape - moved, own - by_shape - moved)
 
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
         """Of the spot before and after, for the covariance of a series of shifts.
@@ -286,7 +300,9 @@ class ChannelMeasurement:
         if self._shifts:
             return self._shifts[number - 1].parts
         noise = self.channel.noise
-        return noise_parts(self.positions[0], noise), noise_parts(self.positions[number], noise)
+        after = noise_parts(self.positions[number], noise)
+        after = replace(after, temporal=after.temporal + self._doubt(number))
+        return noise_parts(self.positions[0], noise), after
 
     def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)
