@@ -1,14 +1,16 @@
 """The calibrated shape of a spot learnt from frames of the spot itself, where its optics are not modelled.
 
 The mean image without its level is low-passed where it holds more noise than light: a radial Wiener filter of its own
-power spectrum, real and even, so that it moves nothing. Beyond the image the shape is zero. What is left of the noise
-stands in the covariance of a shift: the image that the shape is from is fitted with it as one of two that differ.
+power spectrum, real and even, so that it moves nothing. Noise is what is new in every frame and the pattern of the
+pixels, which has all frequencies as well. Beyond the image the shape is zero. What is left of the noise stands in the
+covariance of a shift by `learnt_noise`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = ["MARGIN_PX", "learn_template", "without_slopes"]
+__all__ = ["MARGIN_PX", "LearntTemplate", "learn_template", "without_slopes"]
 
 Array = NDArray[np.float64]
 MARGIN_PX = 40
@@ -63,7 +65,55 @@ def _edge(shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return out
 
 
-def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
+@dataclass(frozen=True, eq=False)
+class LearntTemplate:
+    """A shape, and what every pixel of the image that it is from has to do with it.
+
+    Attributes:
+        shape: of the spot.
+        light: DN, what the samples that the shape is made of sum to.
+        passed: (H, W) share of each frequency that is kept, in the order of the discrete Fourier transform.
+        good: (H, W) pixels that were used.
+        fills: (n, H, W) frequencies by which the others were filled, step by step.
+    """
+
+    shape: SpotTemplate
+    light: float
+    passed: Array
+    good: NDArray[np.bool_]
+    fills: tuple[NDArray[np.bool_], ...]
+
+    def impulse(self, pixel: tuple[int, int]) -> Array:
+        """(H, W) what 1 DN in a pixel of the image adds to what is learnt, holes and edges aside.
+
+        Args:
+            pixel: row and column.
+        """
+        image = np.zeros(self.good.shape)
+        image[pixel] = 1.0
+        return _filtered(image, self.passed)
+
+    def returned(self, maps: Array) -> Array:
+        """What pixels of the image do to numbers that the shape's samples make: the transpose of learning, (n, H, W).
+
+        Args:
+            maps: (n, M, N) derivatives of the numbers by the samples, which sum to `light`.
+        """
+        inner = maps[:, MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX] * _taper(self.good.shape)
+        out = _filtered(inner, self.passed)
+        if np.all(self.good):
+            return out
+        known = np.where(self.good, out, 0.0)
+        hole = out - known
+        for passed in reversed(self.fills):
+            for _ in range(_FILLS):
+                hole = _filtered(hole, passed)
+                known += np.where(self.good, hole, 0.0)
+                hole = np.where(self.good, 0.0, hole)
+        return known
+
+
+def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> LearntTemplate:
     """The shape of the spot in one state's frames.
 
     Args:
@@ -71,26 +121,32 @@ def learn_template(screened: ScreenedFrames, noise: NoiseModel) -> SpotTemplate:
         noise: of the detector.
 
     Raises:
-        SpotError: there is no spot.
+        SpotError: there is no spot, or one so narrow that pixels do not sample it.
     """
     image = spot_image.filled(screened.mean, screened.good)
     frames = max(int(np.median(screened.counts)), 1)
     _, _, background, peak, _ = spot_image.coarse(image[None], frames, noise)
     edge = _edge(image.shape)
     level = float(np.median(image[edge & screened.good])) if np.any(edge & screened.good) else float(background[0])
-    variance = noise.temporal_variance_dn2(image, 1) / screened.counts
+    variance = noise.temporal_variance_dn2(image, 1) / screened.counts + noise.fixed_variance_dn2(image)
     light = image - level
+    fills: tuple[NDArray[np.bool_], ...] = ()
     if not np.all(screened.good):
-        light = _completed(light, screened.good, variance)
-    light = _without_noise(light, variance)
+        light, fills = _completed(light, screened.good, variance)
+    passed = _passed(light, variance)
+    # holes that are not filled to the last leave noise of all frequencies, which no light is
+    if np.all(screened.good) and (passed[light.shape[0] // 2, 0] > 0.0 or passed[0, light.shape[1] // 2] > 0.0):
+        raise SpotError({0: "too narrow: a light with detail finer than two pixels has no shape between pixels"})
+    light = _filtered(light, passed)
     wide = np.pad(light * _taper(light.shape), MARGIN_PX)
     core = np.where(wide > _CORE * wide.max(), wide, 0.0)
-    if not core.sum() > 0.0:
-        raise SpotError({0: "no spot: no light is left to learn its shape from"})
+    if not (core.sum() > 0.0 and wide.sum() > 0.0):
+        raise SpotError({0: "no spot: too little light is left to learn its shape from"})
     row = float(core.sum(axis=1) @ np.arange(wide.shape[0]) / core.sum())
     column = float(core.sum(axis=0) @ np.arange(wide.shape[1]) / core.sum())
     share = math.sqrt(float(np.median(noise.temporal_variance_dn2(image, 1) / screened.counts))) / float(peak[0])
-    return SpotTemplate.from_image(wide, row, column, light.shape, tolerance=min(0.1 * share, 1e-3))
+    shape = SpotTemplate.from_image(wide, row, column, light.shape, tolerance=min(0.1 * share, 1e-3))
+    return LearntTemplate(shape, float(wide.sum()), passed, screened.good, fills)
 
 
 def _taper(shape: tuple[int, ...]) -> Array:
@@ -102,11 +158,17 @@ def _taper(shape: tuple[int, ...]) -> Array:
     return np.outer(*parts)
 
 
-def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> Array:
+def _filtered(image: Array, passed: NDArray[Any]) -> Array:
+    """Images (..., H, W) in the share of each frequency that is passed."""
+    return np.asarray(np.real(np.fft.ifft2(np.fft.fft2(image) * passed)))
+
+
+def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> tuple[Array, tuple[NDArray[np.bool_], ...]]:
     """The image with its holes filled by what the light in the other pixels says, which optics let through up to a
     frequency only: the hole takes the value of the low-passed image again and again (Papoulis, IEEE Trans. Circuits
-    Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)).
+    Syst. 22, 735 (1975); Gerchberg, Opt. Acta 21, 709 (1974)). With the frequencies of each look.
     """
+    fills = []
     frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
     ring = np.rint(frequency * min(light.shape)).astype(np.intp)
     for _ in range(_LOOKS):
@@ -117,14 +179,14 @@ def _completed(light: Array, good: NDArray[np.bool_], variance: Array) -> Array:
         dark = np.flatnonzero(middle < 2.0 * noise)
         passed = ring < (int(dark[0]) if dark.size else middle.size)
         for _ in range(_FILLS):
-            light = np.where(good, light, np.real(np.fft.ifft2(np.where(passed, np.fft.fft2(light), 0.0))))
-    return light
+            light = np.where(good, light, _filtered(light, passed))
+        fills.append(passed)
+    return light, tuple(fills)
 
 
-def _without_noise(light: Array, variance: Array) -> Array:
-    """The image in the frequencies in which it stands above its noise."""
-    transform = np.fft.fft2(light)
-    power = np.abs(transform) ** 2
+def _passed(light: Array, variance: Array) -> Array:
+    """(H, W) share of each frequency that is kept: those in which the image stands above its noise."""
+    power = np.abs(np.fft.fft2(light)) ** 2
     floor = float(variance.sum())
     frequency = np.hypot(np.fft.fftfreq(light.shape[0])[:, None], np.fft.fftfreq(light.shape[1])[None, :])
     ring = np.rint(frequency * min(light.shape)).astype(np.intp)
@@ -134,4 +196,4 @@ def _without_noise(light: Array, variance: Array) -> Array:
     last = int(noisy[0]) if noisy.size else mean.size
     gain = np.clip(1.0 - floor / np.maximum(mean, 1e-300), 0.0, 1.0)
     gain[last:] = 0.0
-    return np.real(np.fft.ifft2(transform * gain[ring]))
+    return np.asarray(gain[ring])

@@ -49,11 +49,14 @@ class FitTerms:
         background: 0 for an even background, 1 with slopes, 2 with curvature.
         others: (row, column) where further spots are looked for, px.
         smear: whether the shape is convolved with a normal distribution.
+        learnt: whether the shape was learnt from frames of the spot, and may have been smeared more itself: a smear
+            that is negative makes the shape sharper. Else the shape is the sharpest, and what is negative is noise.
     """
 
     background: int = 0
     others: tuple[tuple[float, float], ...] = ()
     smear: bool = False
+    learnt: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,6 +212,8 @@ def _fit(
     theta = _start(mean, counts, good, noise, model) if near is None else model.begun(near)
     spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
     flat, use, many = mean.ravel(), good.ravel(), counts.ravel()
+    if near is not None and terms.learnt:
+        theta = model.signed(theta, flat, use, len(near.others))
     for _ in range(_MOST_STEPS):
         design, level = model.design(theta)
         weight = use / _variance(level, many, noise)
@@ -332,6 +337,17 @@ class _Model:
             theta[self._smear :] = near.smear[0, 0], near.smear[0, 1], near.smear[1, 1]
         return theta
 
+    def signed(self, theta: Array, flat: Array, use: Mask, known: int) -> Array:
+        """With the light of other spots after the first ``known`` as it is in the image, where it may be missing."""
+        for light in range(self._others + 3 * known + 2, self._smear, 3):
+            theta[light] = 0.0
+            design, level = self.design(theta)
+            shape = design[light] * use
+            theta[light] = shape @ (flat - level) / max(float(shape @ shape), 1e-300)
+            if theta[light] == 0.0:
+                theta[light] = 0.01 * theta[2]
+        return theta
+
     def moved(self, theta: Array, step: Array) -> Array:
         """The next parameters: no place by more than a pixel, and the spot's flux stays positive."""
         length = max(float(np.abs(step[self._places]).max()), 1e-300)
@@ -365,8 +381,10 @@ class _Model:
         )
 
     def _spread(self, theta: Array) -> Array:
-        """Positive part of the smear, (2, 2) px^2."""
+        """Smear that the shape is convolved with, (2, 2) px^2: the positive part, unless the shape may be sharper."""
         rows, across, columns = theta[self._smear :]
+        if self.terms.learnt:
+            return np.array([[rows, across], [across, columns]])
         value, vector = np.linalg.eigh(np.array([[rows, across], [across, columns]]))
         return np.asarray((vector * np.maximum(value, 0.0)) @ vector.T)
 

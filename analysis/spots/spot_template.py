@@ -15,6 +15,7 @@ Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,6 +30,8 @@ __all__ = ["SmearedShape", "SpotTemplate", "TemplateRangeError"]
 Array = NDArray[np.float64]
 _DEGREE = 5
 _TAPS = _DEGREE + 1
+SHARPEST = 4.0
+"""Most by which a frequency is raised where a shape is made sharper."""
 
 
 class TemplateRangeError(ValueError):
@@ -332,11 +335,15 @@ class SmearedShape:
         """Spline coefficients (M, N) of the smeared shape, for `evaluate`.
 
         Args:
-            covariance: (2, 2) px^2 of the normal distribution, (row, column); positive semi-definite.
+            covariance: (2, 2) px^2 of the normal distribution, (row, column). Where it is negative the shape is made
+                sharper, by less than `SHARPEST` at any frequency.
         """
+        return np.asarray(fft.irfft2(self._spectrum * self._kernel(covariance), self._template.grid))
+
+    def _kernel(self, covariance: Array) -> Array:
         (a, b), (_, c) = covariance
         power = a * self._rows**2 + 2.0 * b * self._rows * self._columns + c * self._columns**2
-        return np.asarray(fft.irfft2(self._spectrum * np.exp(-0.5 * power), self._template.grid))
+        return np.asarray(np.exp(np.minimum(-0.5 * power, math.log(SHARPEST))))
 
     def evaluate(self, coefficients: Array, row: float, column: float) -> Array:
         """The smeared shape at one place, (6, H, W): value, derivatives by row and by column (1/px), by row twice, by
@@ -358,6 +365,27 @@ class SmearedShape:
         for k, (i, j) in enumerate(((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))):
             np.matmul(lines[i], by_column[j].T, out=out[k])
         return out
+
+    def returned(self, maps: Array, row: float, column: float, covariance: Array) -> Array:
+        """What samples of the shape's image do to numbers that its pixels make at one place: the transpose of smearing,
+        interpolating and evaluating, (n, M, N), the samples being those that the template was made of.
+
+        Args:
+            maps: (n, H, W) derivatives of the numbers by the pixels.
+            row: of the centre, detector pixels.
+            column: likewise.
+            covariance: as of `smeared`.
+        """
+        centre, (height, width) = self._template.centre[self._which[0]], self._template.shape
+        by_row, rows = self._splines(centre[0], row, height)
+        by_column, columns = self._splines(centre[1], column, width)
+        out = np.zeros((len(maps), *self._template.grid))
+        out[:, rows, columns] = by_row[0].T @ maps @ by_column[0]
+        if np.any(covariance):
+            # the kernel is even, and so its own transpose
+            out = fft.irfft2(fft.rfft2(out) * self._kernel(covariance), self._template.grid)
+        along = [ndimage.spline_filter1d(np.eye(size), _DEGREE, mode="mirror", axis=0) for size in out.shape[1:]]
+        return np.asarray(along[0].T @ out @ along[1])
 
     def _splines(self, centre: float, place: float, pixels: int) -> tuple[Array, slice]:
         """Weights of the samples in every pixel, and of their first and second derivatives by the place, (3, pixels,

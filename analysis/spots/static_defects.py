@@ -103,6 +103,7 @@ def examine(
     own: bool = False,
     searched: bool = True,
     first: tuple[int, int] = (0, 0),
+    learnt: bool = False,
 ) -> Examined:
     """Find what is in an image beside the spot.
 
@@ -114,6 +115,8 @@ def examine(
         own: whether the shape was learnt from this very image, so that residuals of it say nothing.
         searched: whether anything is looked for; else what is known already is left out and fitted.
         first: row and column of the detector at which the image begins; findings tell places on the detector.
+        learnt: whether the shape was learnt from frames of this spot in another state: it may have been smeared more
+            there, and have held a reflection, which then is missing here.
 
     Raises:
         SpotError: no spot, or it cannot be measured.
@@ -122,7 +125,7 @@ def examine(
     rough = _rough(mean, screened, noise) if searched else np.zeros_like(screened.good)
     good = screened.good & ~rough
     smeared = (vibration or bool(np.any(screened.jitter))) and not own
-    terms = FitTerms()
+    terms = FitTerms(learnt=learnt)
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     dirty = not screened.clean
@@ -341,7 +344,7 @@ def _others(
     edges = np.zeros_like(good)
     terms, fit = _kept(screened, good, noise, template, terms, fit)
     while len(terms.others) < MOST_OTHERS:
-        place = _second_light(screened.mean, fit, good & ~edges, template)
+        place = _second_light(screened.mean, fit, good & ~edges, template, terms.learnt)
         if place is None:
             break
         if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
@@ -357,7 +360,7 @@ def _others(
         row, column, share = tried.others[-1]
         away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
         gain = fit.explains(screened.mean) - tried.explains(screened.mean)
-        if share <= 0.0 or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
+        if (share <= 0.0 and not terms.learnt) or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
         fit = tried
@@ -373,7 +376,8 @@ def _kept(
     fit: ScreenedFit,
 ) -> tuple[FitTerms, ScreenedFit]:
     """Without further spots that are no longer needed."""
-    bright = fit.others[:, 2] > _LEAST_SHARE * fit.others_sigma[:, 2]
+    share = np.abs(fit.others[:, 2]) if terms.learnt else fit.others[:, 2]
+    bright = share > _LEAST_SHARE * fit.others_sigma[:, 2]
     if np.all(bright):
         return terms, fit
     terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in fit.others[bright]))
@@ -381,8 +385,10 @@ def _kept(
     return terms, _fitted(screened, good, noise, template, terms, fit)
 
 
-def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate) -> tuple[float, float] | None:
-    """Where the residuals look most like another spot; None where they do not."""
+def _second_light(
+    mean: Array, fit: ScreenedFit, good: Mask, template: SpotTemplate, missing: bool
+) -> tuple[float, float] | None:
+    """Where the residuals look most like another spot, or like one that is missing; None where they do not."""
     height, width = mean.shape
     middle = (height // 2, width // 2)
     stamp = template.evaluate(float(middle[0]), float(middle[1]))[0][0]
@@ -395,7 +401,7 @@ def _second_light(mean: Array, fit: ScreenedFit, good: Mask, template: SpotTempl
     score = np.where(power > 0.3 * np.median(power), amplitude / np.sqrt(power), 0.0)
     row, column = np.indices(mean.shape)
     away = np.hypot(row - fit.positions.row[0], column - fit.positions.column[0])
-    score = np.where(good & (away > NEAREST_PX), score, 0.0)
+    score = np.where(good & (away > NEAREST_PX), np.abs(score) if missing else score, 0.0)
     limit = float(norm.isf(FALSE_ALARM / mean.size))
     for _ in range(5):
         top = np.unravel_index(int(np.argmax(score)), score.shape)
@@ -432,11 +438,19 @@ def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> l
         out.append(Finding("uneven background", f"its {what} are fitted, {rise:.2g} DN between the corners"))
     for (row, column, share), (_, _, sigma) in zip(fit.others, fit.others_sigma, strict=True):
         place = f"at row {row + first[0]:.1f}, column {column + first[1]:.1f}"
-        light = f"{100.0 * share:.2g} ± {100.0 * sigma:.1g} % of the light"
-        out.append(Finding("second light", f"{place} with {light}; it is fitted"))
+        light = f"{100.0 * abs(share):.2g} ± {100.0 * sigma:.1g} % of the light"
+        what = "; it is fitted" if share > 0.0 else " is in the frames before and not here; it is fitted"
+        out.append(Finding("second light", f"{place} with {light}{what}"))
     if np.any(edges):
         out.append(Finding("second light", "near the edge of the frames; what surrounds it is left out"))
     if fit.terms.smear:
-        rows, columns = (math.sqrt(max(fit.smear[k, k], 0.0)) for k in (0, 1))
-        out.append(Finding("smear", f"{rows:.2f} px in row and {columns:.2f} px in column, rms, is fitted"))
+        kept = not fit.terms.learnt
+        rows, columns = (max(moment, 0.0) if kept else moment for moment in np.diagonal(fit.smear))
+        text = f"{_rms(rows)} px in row and {_rms(columns)} px in column, rms, is fitted"
+        out.append(Finding("smear", text if kept else f"{text}, against that before"))
     return out
+
+
+def _rms(moment: float) -> str:
+    """Of a smear by its second moment, px^2; one that is less than another by so much has a minus."""
+    return f"{math.copysign(math.sqrt(abs(moment)), moment):.2f}"

@@ -112,6 +112,23 @@ def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
     assert np.all(last["smoothed"].sigma[0] <= last["filtered"].sigma[0] * (1.0 + 1e-9))
 
 
+def test_a_learnt_shape_does_for_a_series_as_well(course, backend):
+    """With the model for what moves and the shape from the frames before: shifts of the same frames agree to what one
+    shape's noise is, each sigma is that of two images, and filter and smoother know what the times share.
+    """
+    found = course.measured(backend, course.text() + "template: measured\n", "learnt.yaml")
+    for k, reading in enumerate(found.readings):
+        own, modelled = reading.recovery.shift_covariance[0], course.series.shift_covariance[k]
+        sigma = np.sqrt(np.diag(modelled))
+        np.testing.assert_array_less(np.abs(reading.recovery.shift[0] - course.series.shift[k]), 0.5 * sigma)
+        np.testing.assert_allclose(np.sqrt(np.diag(own)), sigma, rtol=0.1)
+    learnt, whole = found.smoothed.changes.parameters, course.series.smoothed.changes.parameters
+    for name, every in whole.items():
+        for estimator in ("filtered", "smoothed"):
+            np.testing.assert_allclose(learnt[name][estimator].sigma, every[estimator].sigma, rtol=0.1)
+    assert found.smoothed.consistency.agrees
+
+
 def test_the_report_shows_the_series(course, backend):
     found = course.measured(backend, course.text())
     section = next(one for one in recover_report(found).sections if one.title == "Series")

@@ -10,12 +10,13 @@ from analysis.monitor.calibration import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import mean_frames
 from analysis.spots.frame_screening import Finding, FramesError, ScreenedFrames, screen_frames
-from analysis.spots.learnt_template import learn_template, without_slopes
+from analysis.spots.learnt_noise import FittedSpot, LearntShift, learnt_shift
+from analysis.spots.learnt_template import LearntTemplate, learn_template, without_slopes
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.repaired_image import repaired_centroid
 from analysis.spots.screened_fit import one_shape
-from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
 from scenes.specs.measured.monitor_frames import MeasurementSpec
@@ -35,6 +36,8 @@ _REMEDIES = (
     ("saturated", "frames with less light or a shorter exposure"),
     ("no spot", "frames that hold the channel's spot: the right file, with the light on"),
     ("range of the template", "a spot nearer to where the calibrated one stands"),
+    ("too narrow", "an instrument's model for the shape, `template: twin`, or a spot of 3 pixels at half of its peak"),
+    ("mostly noise", "more frames of the state before, or frames with more light"),
     ("missing", "frames with less light, or with fewer bad pixels at the spot"),
 )
 
@@ -114,6 +117,9 @@ class ChannelMeasurement:
         self._screened: list[ScreenedFrames] = []
         self._examined: list[Examined | None] = []
         self._costs: dict[int, float] = {}
+        self._learnt_from: LearntTemplate | None = None
+        self._fitted: list[FittedSpot] = []
+        self._shifts: list[LearntShift] = []
         self._templates: dict[tuple[int, int], SpotTemplate] = {}
         self.positions: list[SpotPositions] = []
 
@@ -148,7 +154,8 @@ class ChannelMeasurement:
                 screened = self._screen(state)
                 burnt = "; ".join(found.text for found in screened.findings if found.kind == "saturation")
                 if self.shape is None:
-                    screened, self.shape = self._learn(screened)
+                    screened, self._learnt_from = self._learn(screened)
+                    self.shape = self._learnt_from.shape
                 self._screened.append(screened)
                 self._examined.append(self._examine(number, state))
             except FramesError as error:
@@ -192,7 +199,7 @@ class ChannelMeasurement:
         good = screened.good & ~part.bad
         return replace(screened, mean=part.corrected(screened.mean), good=good, findings=(*screened.findings, *told))
 
-    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, SpotTemplate]:
+    def _learn(self, screened: ScreenedFrames) -> tuple[ScreenedFrames, LearntTemplate]:
         """The shape of the spot before, without the pixels that no shape could have."""
         if self._searches:
             lone = lone_pixels(screened, self.channel.noise)
@@ -208,8 +215,9 @@ class ChannelMeasurement:
         fitted = test.vibration == "fitted"
         if not self._searches and not fitted and np.all(screened.good):
             return None
-        own = self._learnt and number == 0
-        return examine(screened, self.channel.noise, self._template(state), fitted, own, self._searches, state.offset)
+        own, learnt = self._learnt and number == 0, self._learnt and number > 0
+        template, searched = self._template(state), self._searches
+        return examine(screened, self.channel.noise, template, fitted, own, searched, state.offset, learnt)
 
     def measure(self) -> list[Issue]:
         """Measure the spot in every state; what is refused."""
@@ -221,6 +229,10 @@ class ChannelMeasurement:
         for number, state in enumerate(self.channel.states):
             try:
                 self.positions.append(self._position(number, state, state.of_ccd(static)))
+                if self._learnt_from is not None and number and self._fitted:
+                    first, second = self._fitted[0], self._fitted[-1]
+                    noise, ccd = self.channel.noise, self.channel.ccd
+                    self._shifts.append(learnt_shift(self._learnt_from, first, second, noise, ccd))
             except SpotError as error:
                 issues.append(self._lost(state, error))
         return issues
@@ -242,7 +254,55 @@ class ChannelMeasurement:
             positions, self._costs[number] = examined.fit.positions, examined.fit.cost
             if self._test.analysis.centroid != "ml":
                 positions, self._costs[number] = self._repaired(examined, state)
+        if self._learnt and self._test.analysis.centroid == "ml":
+            self._fitted.append(self._as_fitted(positions, number, state))
         return self._on_ccd(positions, state)
+
+    def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> FittedSpot:
+        """What the noise of a learnt shape rests on."""
+        examined, screened = self._examined[number], self._screened[number]
+        counts, jitter = screened.counts, screened.jitter / float(np.median(screened.counts))
+        others, smear = np.zeros((0, 3)), np.zeros((2, 2))
+        if examined is not None and not examined.clean:
+            others, smear = examined.fit.others, examined.fit.smear
+        return FittedSpot(positions, counts, jitter, others, smear, state.offset)
+
+    def shift_covariance(self, number: int) -> np.ndarray:
+        """(1, 2, 2) px^2 of after - before, by noise.
+
+        Args:
+            number: of the state after, from 1 on.
+        """
+        if self._shifts:
+            return self._shifts[number - 1].covariance[None]
+        spread = difference_covariance(self.positions[0], self.positions[number], self.channel.noise)
+        return spread + self._doubt(number)
+
+    def _doubt(self, number: int) -> np.ndarray:
+        """(2, 2) px^2, what a reflection of the frames before may do to a centroid that knows no shape: it is in the
+        image before, and is put into that after with the accuracy of the learnt shape only. So far as the shift is not
+        that of the shape itself it is doubted.
+        """
+        first, second = self._examined[0], self._examined[number]
+        if not self._learnt or first is None or second is None or not np.any(second.fit.others[:, 2] < 0.0):
+            return np.zeros((2, 2))
+        own = (self.positions[number].position - self.positions[0].position)[0]
+        by_shape = (second.fit.positions.position - first.fit.positions.position)[0]
+        moved = np.subtract(self.channel.states[number].offset, self.channel.before.offset)
+        return np.outer(own - by_shape - moved, own - by_shape - moved)
+
+    def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
+        """Of the spot before and after, for the covariance of a series of shifts.
+
+        Args:
+            number: of the state after, from 1 on.
+        """
+        if self._shifts:
+            return self._shifts[number - 1].parts
+        noise = self.channel.noise
+        after = noise_parts(self.positions[number], noise)
+        after = replace(after, temporal=after.temporal + self._doubt(number))
+        return noise_parts(self.positions[0], noise), after
 
     def _as_ever(self, screened: ScreenedFrames, state: StateFrames) -> SpotPositions:
         return self._centroid(screened.mean[None], screened.frames, self.channel.noise, state)

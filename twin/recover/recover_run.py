@@ -16,7 +16,7 @@ from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.recovery import Recovery, recover, recovery_of
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
-from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
+from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
 from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
 from scenes.models.camera_sharpness import blur_warnings
@@ -250,10 +250,11 @@ def _corrected(
     out: list[Recovery] = []
     for k in range(1, len(found[0].positions)):
         second = _joined([one.positions[k] for one in found])
-        spread = [difference_covariance(one.positions[0], one.positions[k], one.channel.noise) for one in found]
+        spread = [one.shift_covariance(k) for one in found]
         out.append(recovery_of(first, second, np.concatenate(spread), calibration, bench.disturbances))
         if smoother is not None:
-            smoother.take(out[-1].shift, _parts(found, 0), _parts(found, k))
+            before, after = zip(*(one.noise_parts(k) for one in found), strict=True)
+            smoother.take(out[-1].shift, _together(before), _together(after))
     return out, None if smoother is None else smoother.smoothed()
 
 
@@ -266,9 +267,8 @@ def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
     return CourseSmoother(bench.disturbances, bench.cameras, ground, times)
 
 
-def _parts(found: Sequence[ChannelMeasurement], state: int) -> NoiseParts:
-    """Noise of the spots in one state, each by its own CCD's."""
-    each = [noise_parts(one.positions[state], one.channel.noise) for one in found]
+def _together(each: Sequence[NoiseParts]) -> NoiseParts:
+    """Noise of spots that are each on a CCD of its own."""
     return NoiseParts(np.concatenate([one.temporal for one in each]), np.concatenate([one.pattern for one in each]))
 
 

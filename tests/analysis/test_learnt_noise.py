@@ -1,0 +1,174 @@
+"""A shift by a shape that was learnt from the image before: what noise does to it, image by image and in a series."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.spots.frame_screening import ScreenedFrames
+from analysis.spots.learnt_noise import FittedSpot, learnt_shift
+from analysis.spots.learnt_template import learn_template
+from analysis.spots.noise import NoiseModel
+from analysis.spots.screened_fit import FitTerms, fit_screened
+from analysis.spots.spot_positions import SeriesNoise, SpotError
+from analysis.spots.spot_template import SpotTemplate
+
+NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
+SHAPE = (64, 64)
+FRAMES = 9
+FIRST = np.array([30.7, 32.2])
+
+
+def spot(place, peak=9000.0, width=2.6):
+    """A spot of normal distribution, a little longer in rows, on the detector's dark level; DN."""
+    row, column = (np.arange(n) for n in SHAPE)
+    along = np.exp(-0.5 * ((row - place[0]) / (1.2 * width)) ** 2)
+    return NOISE.dark_level_dn + peak * np.outer(along, np.exp(-0.5 * ((column - place[1]) / width) ** 2))
+
+
+def screened(mean, good=None, frames=FRAMES):
+    used = np.ones(SHAPE, bool) if good is None else good
+    return ScreenedFrames(mean, np.full(SHAPE, float(frames)), used, frames, frames, np.zeros((2, 2)), ())
+
+
+def fitted(frames, learnt, offset=(0, 0)):
+    """The shape held against an image, and what the noise of its shift rests on."""
+    own = replace(learnt.shape, shape=frames.mean.shape)
+    fit = fit_screened(frames.mean, frames.counts, frames.good, NOISE, own, FitTerms(learnt=True))
+    return FittedSpot(fit.positions, frames.counts, np.zeros((2, 2)), fit.others, fit.smear, offset)
+
+
+def shift(before, after):
+    """(2,) px, the shape learnt anew."""
+    learnt = learn_template(before, NOISE)
+    return (fitted(after, learnt).positions.position - fitted(before, learnt).positions.position)[0]
+
+
+def core(place, radius):
+    row, column = np.indices(SHAPE)
+    return np.hypot(row - place[0], column - place[1]) < radius
+
+
+@pytest.mark.parametrize("case", ["alike", "core", "holes"])
+def test_influence_of_the_image_before_is_the_derivative_of_the_shift(case):
+    """Whole chains, learning included, with the image before changed by a little noise along and against, of the
+    frequencies that learning passes and of all others.
+
+    Against along leaves terms of third order only, 1e-2 of the change by a tenth of the noise.
+    """
+    place = FIRST + np.array([4.3, -3.6])
+    good = [np.ones(SHAPE, bool), np.ones(SHAPE, bool)]
+    if case == "core":
+        good[1] = ~core(place, 3.0)
+    if case == "holes":
+        good[0] = ~core(FIRST + np.array([1.0, -2.0]), 1.5)
+        good[0][:, 39] = False
+    rng = np.random.default_rng(3)
+    sigma = np.sqrt(NOISE.temporal_variance_dn2(spot(FIRST), FRAMES))
+    # noise in the image, for the frequencies that are passed to end where they do in life
+    base = spot(FIRST) + sigma * rng.standard_normal(SHAPE)
+    after = screened(spot(place, 14000.0 if case == "core" else 9000.0), good[1])
+    learnt = learn_template(screened(base, good[0]), NOISE)
+    first, second = (fitted(one, learnt) for one in (screened(base, good[0]), after))
+    found = learnt_shift(learnt, first, second, NOISE, SHAPE)
+    maps = found.parts[1].pattern[0, :, 2 * base.size : 3 * base.size].reshape(2, *SHAPE)
+    maps = maps / np.sqrt(first.temporal(NOISE))
+    expected, seen = [], []
+    for _ in range(12):
+        change = 0.1 * sigma * rng.standard_normal(SHAPE)
+        ends = [shift(screened(base + way * change, good[0]), after) for way in (1.0, -1.0)]
+        seen.append(0.5 * (ends[0] - ends[1]))
+        expected.append(-(maps * change).sum(axis=(1, 2)))
+    spread = np.std(expected, axis=0)
+    assert np.all(spread > 0.0)
+    left = np.sqrt(np.mean(np.square((np.array(seen) - expected) / spread), axis=0))
+    # where holes are filled the start of the filling is not followed
+    assert np.all(left < (0.1 if case == "holes" else 0.05)), left
+
+
+def test_pattern_of_the_pixels_is_no_light_when_a_shape_is_learnt():
+    """Where response differs from pixel to pixel by 1 % a shape with its noise of all frequencies drew the fit half way
+    between pixels, by half a sigma at a quarter of a pixel; with the frequencies of light alone it does not.
+    """
+    rough = replace(NOISE, prnu=0.01)
+    rng = np.random.default_rng(5)
+    error, sigma = [], []
+    for _ in range(12):
+        pattern = np.sqrt(rough.fixed_variance_dn2(spot(FIRST)))
+        before = screened(spot(FIRST) + pattern * rng.standard_normal(SHAPE))
+        learnt = learn_template(before, rough)
+        ends = [fitted(screened(spot(FIRST + by)), learnt).positions for by in (0.0, 0.25)]
+        error.append((ends[1].position - ends[0].position)[0] - 0.25)
+        sigma.append(np.sqrt(np.trace(ends[1].covariance[0]) / 2.0))
+    assert np.sqrt(np.mean(np.square(error))) < 0.1 * np.mean(sigma)
+
+
+def test_noise_of_a_series_is_that_of_its_shifts():
+    """Of three images against the same one before, of which two show the spot at one place: the covariance of each
+    shift is its own, and in the difference of those two the image before cancels, and the pattern with it.
+    """
+    rng = np.random.default_rng(6)
+
+    def noisy(place):
+        mean = spot(place)
+        return screened(mean + np.sqrt(NOISE.temporal_variance_dn2(mean, FRAMES)) * rng.standard_normal(SHAPE))
+
+    before = noisy(FIRST)
+    learnt = learn_template(before, NOISE)
+    first = fitted(before, learnt)
+    after = [fitted(noisy(FIRST + by), learnt) for by in ((0.0, 0.0), (5.3, 1.2), (5.3, 1.2))]
+    found = [learnt_shift(learnt, first, one, NOISE, SHAPE) for one in after]
+    series = SeriesNoise(found[0].parts[0], reach=3)
+    for one in found:
+        series.add(one.parts[1])
+    whole = series.covariance(np.arange(3)).reshape(3, 2, 3, 2)
+    for k, one in enumerate(found):
+        np.testing.assert_allclose(whole[k, :, k], one.covariance, rtol=1e-5, atol=1e-6 * one.covariance.max())
+        assert np.linalg.eigvalsh(one.covariance).min() > 0.0
+    difference = whole[1, :, 1] + whole[2, :, 2] - whole[1, :, 2] - whole[2, :, 1]
+    own = after[1].positions.temporal_covariance[0] + after[2].positions.temporal_covariance[0]
+    # places and light of both differ by their noise, 1e-3 px of 3 and 1e-3 of the light
+    np.testing.assert_allclose(difference, own, rtol=2e-2, atol=2e-2 * own.max())
+    # what is left of a spot that has not moved is the noise of two images
+    still = first.positions.temporal_covariance[0] + after[0].positions.temporal_covariance[0]
+    np.testing.assert_allclose(found[0].covariance, still, rtol=2e-2, atol=2e-2 * still.max())
+
+
+def test_a_part_of_the_detector_has_the_noise_of_all_of_it():
+    """The image after is a window of the detector: places in it count from its corner, noise is the same."""
+    before = screened(spot(FIRST))
+    learnt = learn_template(before, NOISE)
+    first, place = fitted(before, learnt), FIRST + np.array([1.4, 2.3])
+    mean = spot(place)
+    whole = learnt_shift(learnt, first, fitted(screened(mean), learnt), NOISE, SHAPE)
+    part = np.s_[3:60, 5:61]
+    cut = ScreenedFrames(mean[part], np.full((57, 56), 9.0), np.ones((57, 56), bool), 9, 9, np.zeros((2, 2)), ())
+    found = learnt_shift(learnt, first, fitted(cut, learnt, (3, 5)), NOISE, SHAPE)
+    # pixels of the dark edge say a little of level
+    np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-2, atol=1e-2 * whole.covariance.max())
+    # the dark pixels draw as well, of which a fifth is not in the window
+    np.testing.assert_allclose(found.lean / whole.lean, 57 * 56 / 64**2, rtol=0.1)
+
+
+@pytest.mark.parametrize(("width", "narrow"), [(0.6, True), (0.75, True), (1.2, False)])
+def test_a_spot_that_pixels_do_not_sample_is_refused(width, narrow):
+    """What is finer than two pixels folds into other frequencies, and no interpolation can bring it back."""
+    rng = np.random.default_rng(9)
+    mean = spot(FIRST, width=width)
+    mean = mean + np.sqrt(NOISE.temporal_variance_dn2(mean, FRAMES)) * rng.standard_normal(SHAPE)
+    if not narrow:
+        assert learn_template(screened(mean), NOISE).light > 0.0
+        return
+    with pytest.raises(SpotError, match="too narrow"):
+        learn_template(screened(mean), NOISE)
+
+
+def test_a_shape_that_is_mostly_noise_is_refused():
+    """Its covariance ends where the noise's own slopes are most of what the fit seems to know."""
+    before = screened(spot(FIRST))
+    learnt = learn_template(before, NOISE)
+    first, second = fitted(before, learnt), fitted(screened(spot(FIRST + 1.3)), learnt)
+    # as if the frames before had hundreds of times the noise, in the shape only
+    with pytest.raises(SpotError, match="mostly noise"):
+        learnt_shift(learnt, replace(first, counts=np.full(SHAPE, 1e-5)), second, NOISE, SHAPE)
+    assert isinstance(learnt.shape, SpotTemplate)
