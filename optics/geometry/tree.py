@@ -190,12 +190,12 @@ class RigidTree:
         rotation[:], translation[:] = nominal
         scale = np.ones((count, len(index)), dtype)
         passed_on = np.ones((count, len(index)), dtype)
-        for i, body in enumerate(self.bodies):
+        for body in self.bodies:
             if body.parent in moved:
                 moved.add(body.path)  # it is carried along
-            elif body.path not in moved:
-                continue
-            motion, offset, growth, stretch = _local_motion(body, states, step, dtype)
+        carried = [body for body in self.bodies if body.path in moved]
+        for body, *local in zip(carried, *_local_motions(carried, states, step, dtype), strict=True):
+            i, (motion, offset, growth, stretch) = index[body.path], local
             position = body.pose.translation
             if body.parent:
                 p = index[body.parent]
@@ -259,36 +259,35 @@ COMPLEX_STEP = 1e-40
 """Imaginary step of the complex-step derivative; products of two steps vanish in float64, so it is exact."""
 
 
-def _local_motion(
-    body: Body, states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
+def _local_motions(
+    bodies: Sequence[Body], states: Sequence[State], step: Sequence[tuple[str, str, int]] | None, dtype: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (S,3,3), translation (S,3) in the body's frame, growth (S,) and stretch (S,) of one body's motion."""
-    count = len(states)
-    rotate = np.zeros((count, 3), dtype)
-    shift = np.zeros((count, 3), dtype)
-    growth = np.ones(count, dtype)
-    stretch = np.ones(count, dtype)
-    pivot = np.zeros((count, 3))
-    for s, state in enumerate(states):
-        motion = state.get(body.path)
-        if motion is not None:
-            rotate[s], shift[s], growth[s] = motion.rotate, motion.shift, 1.0 + motion.scale
-            stretch[s] = 1.0 + motion.stretch
-            if motion.pivot not in body.pivots:
-                raise KeyError(f"{body.path}: pivot {motion.pivot!r}")
-            pivot[s] = body.pivots[motion.pivot]
-        if step is not None and step[s][0] == body.path:
-            kind, axis = step[s][1], step[s][2]
-            if kind == "rotate":
-                rotate[s, axis] += 1j * COMPLEX_STEP
-            elif kind == "shift":
-                shift[s, axis] += 1j * COMPLEX_STEP
-            elif kind == "scale":
-                growth[s] += 1j * COMPLEX_STEP
-            elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
-                raise ValueError(f"unknown kind of motion {kind!r}")
+    """Rotation (B, S, 3, 3), translation (B, S, 3) in each body's frame, growth and stretch (B, S) of their motions."""
+    size = len(bodies), len(states)
+    rotate, shift = np.zeros((*size, 3), dtype), np.zeros((*size, 3), dtype)
+    growth, stretch = np.ones(size, dtype), np.ones(size, dtype)
+    pivot = np.zeros((*size, 3))
+    for b, body in enumerate(bodies):
+        for s, state in enumerate(states):
+            motion = state.get(body.path)
+            if motion is not None:
+                rotate[b, s], shift[b, s], growth[b, s] = motion.rotate, motion.shift, 1.0 + motion.scale
+                stretch[b, s] = 1.0 + motion.stretch
+                if motion.pivot not in body.pivots:
+                    raise KeyError(f"{body.path}: pivot {motion.pivot!r}")
+                pivot[b, s] = body.pivots[motion.pivot]
+            if step is not None and step[s][0] == body.path:
+                kind, axis = step[s][1], step[s][2]
+                if kind == "rotate":
+                    rotate[b, s, axis] += 1j * COMPLEX_STEP
+                elif kind == "shift":
+                    shift[b, s, axis] += 1j * COMPLEX_STEP
+                elif kind == "scale":
+                    growth[b, s] += 1j * COMPLEX_STEP
+                elif kind != FIGURE:  # a figure changes the surface, not the pose: see ``optics.raytrace.system``
+                    raise ValueError(f"unknown kind of motion {kind!r}")
     turned = rotation_matrix(rotate)
-    offset = pivot + shift - (growth * stretch)[:, None] * np.einsum("sij,sj->si", turned, pivot)
+    offset = pivot + shift - (growth * stretch)[..., None] * np.einsum("bsij,bsj->bsi", turned, pivot)
     return turned, offset, growth, stretch
 
 
