@@ -196,10 +196,11 @@ class MonitorPath:
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
         q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, CLOSE_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
-        traced = trace(self.backend, back, make_rays(self.backend, *fan.at(q)))
+        uploaded = back.upload(self.backend)
+        traced = trace(self.backend, uploaded, make_rays(self.backend, *fan.at(q)))
         pitch = self.pitch * back.size[:, None]
         place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / pitch
-        return CoarseTrace(fan, outgoing, back, turn, place.reshape(len(self.channels), count, 2))
+        return CoarseTrace(fan, outgoing, back, uploaded, turn, place.reshape(len(self.channels), count, 2))
 
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
@@ -216,15 +217,14 @@ class MonitorPath:
         start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
         q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
         launch = known.fan.at(q)
-        uploaded = known.back.upload(self.backend)
         face = len(known.outgoing.structure) - 1
-        traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
+        traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
         goal = self.targets(len(states))
         if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
             # a change that is not smooth enough for its few terms
             q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
             launch = known.fan.at(q)
-            traced = trace(self.backend, uploaded, make_rays(self.backend, *launch), keep=(face,))
+            traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
         position, direction, length, valid = traced.numpy()
         rays = CcdRays(position / known.back.size[:, None, None], direction, length, valid, known.back.size)
         for i, channel in enumerate(self.channels):
@@ -422,7 +422,7 @@ class MonitorPath:
         out = np.empty((len(states), channels, *(n + 2 * margin for n in self.shape)))
         for number in np.unique(chosen):
             own = np.flatnonzero(chosen == number)
-            path, known = self.classes[number], coarse.take(own)
+            path, known = self.classes[number], coarse.take(own, self.backend)
             field = path.field_of(path.rays([states[s] for s in own.tolist()], known))
             photons = response.apply(image(field, x, y, single))
             photons = photons.reshape(channels, len(own), *photons.shape[1:])

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optics.numerics.backend import Backend
 from optics.raytrace.aim import RayFan
-from optics.raytrace.system import SystemBatch
+from optics.raytrace.system import SystemBatch, UploadedSystems
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class CoarseTrace:
     Attributes:
         fan: of the rays from the pinholes.
         outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
+        uploaded: the latter where they are traced.
         turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
         place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
     """
@@ -41,15 +43,19 @@ class CoarseTrace:
     fan: RayFan
     outgoing: SystemBatch
     back: SystemBatch
+    uploaded: UploadedSystems
     turn: np.ndarray
     place: np.ndarray
 
-    def take(self, states: np.ndarray) -> CoarseTrace:
+    def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
         """The states of the given indices."""
         channels, count = self.place.shape[:2]
+        if np.array_equal(states, np.arange(count)):
+            return self
         own = (np.arange(channels)[:, None] * count + states).ravel()
         fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
-        return CoarseTrace(fan, self.outgoing.take(own), self.back.take(own), self.turn[:, own], self.place[:, states])
+        outgoing, back = self.outgoing.take(own), self.back.take(own)
+        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.turn[:, own], self.place[:, states])
 
 
 @dataclass(frozen=True, eq=False)
