@@ -41,12 +41,12 @@ def test_one_run_is_what_the_command_gives(study, backend, monkeypatch) -> None:
     The command sums the images of its one state in double precision, a study those of its many in single precision;
     here both do the latter.
     """
-    real = MonitorPath.expected_photons
+    real = MonitorPath.photons_of
 
-    def photons(path, states, margin=0, chunk=32, single=True):
-        return real(path, states, margin, chunk, single or states != [{}])
+    def photons(path, state, placed=None, single=False):
+        return real(path, state, placed, True)
 
-    monkeypatch.setattr(MonitorPath, "expected_photons", photons)
+    monkeypatch.setattr(MonitorPath, "photons_of", photons)
     first = study.plan.run(0)
     (outcome,) = study.setup.job.evaluate(study.setup.tree, [first], backend)
     resolved = read_job(study.setup.tree)
