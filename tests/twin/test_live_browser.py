@@ -261,7 +261,7 @@ def test_views_of_the_spots(page):
     page.page.select_option("#show", "before")
     before = canvas(page, "forward/left")
     page.page.select_option("#show", "difference")
-    assert "after − before" in page.page.text_content("#spots-caption")
+    assert "After − before" in page.page.text_content("#spots-caption")
     assert not np.array_equal(before, whole)
     page.page.uncheck("#noise")
     page.still()
@@ -346,6 +346,7 @@ def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
     with running(str(tmp_path / "run"), "--port", "0") as command:
         page = Page(browser, command.address)
         page.ready()
+        assert page.page.inner_text("#opened") == "run"
         told = page.page.evaluate("liveTwin.last.readings")
         file = json.loads((tmp_path / "run" / "recovered.json").read_text())
         assert told == {key: file[key] for key in told}
@@ -357,7 +358,8 @@ def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
         for column in plan.columns:
             row = page.page.locator("#factors .knob", has_text=column.name).locator("input[type=number]").first
             assert float(row.input_value()) == pytest.approx(float(column.values[1234]))
-        assert "run 1234 of the study study_aperture" in page.page.get_attribute("#name", "title")
+        assert page.page.inner_text("#opened") == "study, run 1234"
+        assert "run 1234 of the study study_aperture" in page.page.get_attribute("#opened", "title")
         assert page.wrong == []
         page.close()
     with running("scenes/examples/study_aperture.yaml", "--port", "0") as command:

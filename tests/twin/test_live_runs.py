@@ -112,7 +112,7 @@ def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkey
         source = read_source(str(name))
         assert source.resolved == resolve(folder / "config.yaml")
         assert source.notes == ()
-        assert source.about == "run: a job of the monitor"
+        assert (source.name, source.about) == ("run", "run: a job of the monitor")
     bench = bench_of(source, pair)
     assert (bench.at_rest.frames, bench.at_rest.seed, bench.at_rest.time) == (3, 11, None)
     shown, after = bench.state(bench.at_rest)

@@ -56,6 +56,7 @@ class Answers:
             bench.warm(advance)
             greeting = {
                 **bench.greeting(),
+                "opened": self.source.name,
                 "about": " ".join((f"{self.source.about}.", *(f"{note}." for note in self.source.notes))),
                 "factors": [
                     {**knob.plain(), "now": factors.get(knob.name, knob.value)} for knob in self.source.factors

@@ -43,6 +43,7 @@ class Source:
 
     Attributes:
         resolved: the job.
+        name: of the file or run folder, with the number of a study's run; empty for an instrument of the library.
         about: what it is, in a few words.
         notes: in what the page differs from what was opened, sentences.
         study: whose base, or run, it is; None for others.
@@ -52,6 +53,7 @@ class Source:
     """
 
     resolved: ResolvedJob
+    name: str = ""
     about: str = ""
     notes: tuple[str, ...] = ()
     study: StudySetup | None = None
@@ -95,13 +97,13 @@ def read_source(what: str, run: int | None = None) -> Source:
     """
     if what in library_names(INSTRUMENTS):
         _no_runs(what, run)
-        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))), what)
+        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))), about=what)
     path = Path(what)
-    if path.is_dir():
-        return _of_folder(path, run)
     if path.name == CONFIG and read_manifest(path.parent) is not None:
-        return _of_folder(path.parent, run)
-    return _for_a_page(_of_file(path, run))
+        path = path.parent
+    source = _of_folder(path, run) if path.is_dir() else _of_file(path, run)
+    name = path.resolve().name if run is None else f"{path.resolve().name}, run {run}"
+    return _for_a_page(replace(source, name=name))
 
 
 def _of_folder(folder: Path, run: int | None) -> Source:
@@ -114,7 +116,7 @@ def _of_folder(folder: Path, run: int | None) -> Source:
     listed = None if manifest is None else manifest.sha256.get(CONFIG)
     if listed is not None and listed != hashlib.sha256(config.read_bytes()).hexdigest():
         notes.append(f"{config} was changed after the run: the page shows what it says now, and not what the run did")
-    return _for_a_page(replace(source, about=f"{folder.name}: {source.about}", notes=tuple(notes)))
+    return replace(source, about=f"{folder.name}: {source.about}", notes=tuple(notes))
 
 
 def _no_config(folder: Path, manifest: Manifest | None) -> Issue:
@@ -144,17 +146,17 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
         return _of_study(file, run)
     _no_runs(str(file), run)
     if name == "job":
-        return Source(resolve(file), "a job of the monitor")
+        return Source(resolve(file), about="a job of the monitor")
     if name == "measurement":
         return _of_measurement(file)
     if name == "orbit_monitor":
         return _of_orbit(file)
     if name == "instrument":
         path = str(file.resolve())
-        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))), file.stem)
+        return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))), about=file.stem)
     if manifest is not None and manifest.program != "twin.render":
         raise InputError(_nothing_to_show(file, _run_of(kind, manifest), file.parent, data))
-    return Source(read_for(PROGRAM, file, resolve), "a job of the monitor")
+    return Source(read_for(PROGRAM, file, resolve), about="a job of the monitor")
 
 
 def _no_runs(what: str, run: int | None) -> None:
@@ -205,14 +207,14 @@ def _of_measurement(file: Path) -> Source:
         "frames were measured; the page renders those of the instrument as designed, and the knobs are a guess of what "
         "moved"
     )
-    return Source(model, "a measurement", (note,))
+    return Source(model, about="a measurement", notes=(note,))
 
 
 def _of_orbit(file: Path) -> Source:
     """A monitored orbit as a course, its motions in steps among it."""
     setup = resolve_monitor(file)
     note = "changes are told against the instrument as designed, and not against the reference time of the orbit's test"
-    return Source(_with_motions(setup), "a monitored orbit", (note,))
+    return Source(_with_motions(setup), about="a monitored orbit", notes=(note,))
 
 
 def _with_motions(setup: MonitorSetup) -> ResolvedJob:
@@ -248,7 +250,7 @@ def _of_study(file: Path, run: int | None) -> Source:
     factors, name = factor_knobs(setup), setup.study.name
     if run is None:
         resolved: ResolvedJob = validate(ResolvedJob, YamlFile("", setup.tree, {}))
-        return Source(resolved, f"the base of the study {name}", (), setup, factors)
+        return Source(resolved, about=f"the base of the study {name}", study=setup, factors=factors)
     plan = Plan.of(setup)
     if not 0 <= run < plan.runs:
         text = "the study has no such run"
@@ -262,9 +264,8 @@ def _of_study(file: Path, run: int | None) -> Source:
         resolved = resolved.with_render(resolved.frames, one.seed)
     factors = tuple(factor.beginning(scalars[factor.name]) for factor in factors)
     values = ", ".join(f"{key} {value}" for key, value in scalars.items())
-    return Source(
-        resolved, f"run {run} of the study {name}: {values}", (), setup, factors, scalars, one.seed is not None
-    )
+    about, own_noise = f"run {run} of the study {name}: {values}", one.seed is not None
+    return Source(resolved, about=about, study=setup, factors=factors, scalars=scalars, own_noise=own_noise)
 
 
 def _for_a_page(source: Source) -> Source:

@@ -199,8 +199,9 @@ class Live {
     this.wait = 500;
     this.waiting.clear();
     byId('name').textContent = hello.instrument;
-    byId('name').title = hello.about;
-    document.title = `${hello.instrument} · live twin`;
+    byId('opened').textContent = hello.opened;
+    byId('opened').title = hello.about;
+    document.title = `${hello.opened || hello.instrument} · live twin`;
     if (first) {
       byId('frames').value = Math.min(64, hello.frames);
       byId('seed').value = hello.seed;

@@ -60,8 +60,8 @@ export class Spots {
       }
       this.put(figure, enlarged);
     });
-    byId('spots-caption').textContent = `${byId('noise').checked ? 'The first frame' : 'The expected image'} of each CCD; `
-      + (second ? `${this.blind ? 'after − your guess' : 'after − before'}, red is more light. ` : '')
+    byId('spots-caption').textContent = `${byId('noise').checked ? 'The first frame' : 'The expected image'} of each CCD. `
+      + (second ? `${this.blind ? 'After − your guess' : 'After − before'}, red is more light. ` : '')
       + `Crosses: ${this.blind && this.told.guess ? 'hidden (orange) and your guess (blue)' : 'before (blue) and after (orange)'}`
       + (enlarged ? `; ellipses: 1 σ of the centroid, ×${Number(enlarged.toPrecision(2)).toLocaleString('en')}.` : '.');
   }
