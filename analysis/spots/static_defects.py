@@ -318,18 +318,22 @@ def _uneven(
             continue
         wider = replace(terms, background=order)
         tried = _fitted(screened, good, noise, template, wider, fit)
-        if fit.explains(screened.mean) - tried.explains(screened.mean) <= chi2.isf(FALSE_ALARM, more):
+        gain = (fit.explains(screened.mean) - tried.explains(screened.mean)) / _spread(terms)
+        if gain <= chi2.isf(FALSE_ALARM, more):
             # a bend without a slope is tried as well
             if order == 1:
                 continue
             break
-        if (
-            order == 1
-            or terms.background == 1
-            or fit.explains(screened.mean) - tried.explains(screened.mean) > chi2.isf(FALSE_ALARM, 5)
-        ):
+        if order == 1 or terms.background == 1 or gain > chi2.isf(FALSE_ALARM, 5):
             terms, fit = wider, tried
     return terms, fit
+
+
+def _spread(terms: FitTerms) -> float:
+    """Variance of what a smooth term explains, over that by the noise of the image: a shape that was learnt has the
+    noise of an image of its own.
+    """
+    return 2.0 if terms.learnt else 1.0
 
 
 def _others(
@@ -359,7 +363,7 @@ def _others(
             break
         row, column, share = tried.others[-1]
         away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
-        gain = fit.explains(screened.mean) - tried.explains(screened.mean)
+        gain = (fit.explains(screened.mean) - tried.explains(screened.mean)) / _spread(terms)
         if (share <= 0.0 and not terms.learnt) or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))

@@ -249,6 +249,9 @@ def test_corrected_estimates_hold_their_sigmas(bench, kind):
 def test_a_learnt_shape_holds_its_sigmas(bench, kind):
     """200 sets of each kind again, with the shape learnt from the frames before. Of all together one in ten may have
     the warning that the spot after is another one, which says that sigma does not hold.
+
+    Noise of the shape is taken for that of an image alike where dirt is looked for, which it is on the average: some
+    three in 200 clean sets are corrected for nothing, at no cost beyond sigma; by chance not more than ten are.
     """
     kinds = {"clean": (), "all": STANDING}.get(kind, (kind,))
     found, told = squares(bench, kinds, range(SETS), learnt=True)
@@ -261,7 +264,7 @@ def test_a_learnt_shape_holds_its_sigmas(bench, kind):
     assert low < found.sum() < high
     assert found.max() < chi2.isf(FALSE_ALARM / SETS, 2)
     if kind in ("clean", "other light"):
-        assert all(spot.clean for spots in told for spot in spots)
+        assert sum(not all(spot.clean for spot in spots) for spots in told) <= 10
 
 
 @pytest.mark.slow
