@@ -142,8 +142,24 @@ class LineSight:
         Raises:
             AimError, BeamMissedError: as `trace`.
         """
-        sight = self.nominal if not states else np.concatenate([self.nominal, self.trace(states, placed)], axis=1)
-        return truth_of_sight(self.instrument, sight, self._axes)
+        return self.told_by(self.trace(states, placed) if states else self.nominal[:, :0])
+
+    def told_by(self, sight: np.ndarray) -> Truth:
+        """What directions of sight (cameras, S, LINE_POINTS, 3) say of S states."""
+        sight = np.concatenate([self.nominal, sight], axis=1)
+        cameras: dict[str, LineChange] = {}
+        principal: dict[str, float] = {}
+        for i, name in enumerate(self.instrument.cameras):
+            change = line_change(sight[i], line_points(self.instrument, name), self._axes[name])
+            cameras[name] = change
+            principal[name] = change.nominal_distance
+        lines = sight[:, :, LINE_POINTS // 2]
+        if len(lines) == 2:
+            sine = np.linalg.norm(np.cross(lines[0], lines[1]), axis=-1)
+            angle = np.arctan2(sine, np.sum(lines[0] * lines[1], axis=-1))
+        else:
+            angle = np.full(sight.shape[1], np.nan)
+        return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0], lines)
 
     @cached_property
     def nominal(self) -> np.ndarray:
@@ -174,27 +190,6 @@ class LineSight:
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:
     """`LineSight.truth`, for one call."""
     return LineSight(instrument, backend).truth(states)
-
-
-def truth_of_sight(instrument: Instrument, sight: np.ndarray, axes: Mapping[str, np.ndarray] | None = None) -> Truth:
-    """What directions of sight (cameras, 1 + S, LINE_POINTS, 3) say of S states; entry 0 is the nominal one.
-
-    ``axes``: ``instrument.camera_axes`` of every camera, where they are known already.
-    """
-    names = list(instrument.cameras)
-    cameras: dict[str, LineChange] = {}
-    principal: dict[str, float] = {}
-    for i, name in enumerate(names):
-        own = instrument.camera_axes(name) if axes is None else axes[name]
-        change = line_change(sight[i], line_points(instrument, name), own)
-        cameras[name] = change
-        principal[name] = change.nominal_distance
-    lines = sight[:, :, LINE_POINTS // 2]
-    if len(names) == 2:
-        angle = np.arctan2(np.linalg.norm(np.cross(lines[0], lines[1]), axis=-1), np.sum(lines[0] * lines[1], axis=-1))
-    else:
-        angle = np.full(sight.shape[1], np.nan)
-    return Truth(cameras, principal, float(angle[0]), angle[1:] - angle[0], lines)
 
 
 DIFFERENCE = 1e-6

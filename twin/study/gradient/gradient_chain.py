@@ -19,15 +19,15 @@ from optics.geometry.tree import COMPLEX_STEP, FIGURE, Motion, State
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.derivatives import jvp
+from optics.raytrace.line_of_sight import aim_chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from scenes.models.instrument_model import Instrument
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_derivative import hit_slopes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
-from twin.monitor.truth import LINE_POINTS, line_in_world, truth_of_sight
+from twin.monitor.truth import ACROSS, LINE_POINTS, line_in_world
 from twin.study.runs.render_base import monitor_results
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
@@ -101,23 +101,19 @@ class Chain:
         return np.swapaxes(self.experiment.sight.trace(states), 0, 1)
 
     @cached_property
-    def nominal(self) -> tuple[np.ndarray, np.ndarray]:
-        """Spots and directions of the unperturbed instrument, (1, ...)."""
-        return self.spots([{}]), self.sight([{}])
-
-    @cached_property
-    def _axes(self) -> dict[str, np.ndarray]:
-        return {name: self.experiment.instrument.camera_axes(name) for name in self.experiment.instrument.cameras}
+    def nominal(self) -> np.ndarray:
+        """Spots of the unperturbed instrument, (1, C, 2)."""
+        return self.spots([{}])
 
     def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
         """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3)."""
-        start, end = self.nominal[0], spots[None]
+        start, end = self.nominal, spots[None]
         cameras = self.experiment.cameras
         joint = np.zeros((1, 2 * end.shape[1], 2 * end.shape[1]))
         found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
         recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)
-        truth = truth_of_sight(self.experiment.instrument, np.stack([self.nominal[1][0], sight], axis=1), self._axes)
+        truth = self.experiment.sight.told_by(sight[:, None])
         exposures = self.resolved.frames, self.resolved.job.render.seed
         return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)
 
@@ -174,9 +170,8 @@ def sight_gradient(
     stop = assemble(assembly, [f"{name}/image_to_stop" for name in names], [about], placed=placed)
     points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
     guess = np.concatenate([instrument.toward_optics(placed, name) for name in names])[:, None]
-    start = np.broadcast_to(guess, points.shape)
-    fan = RayFan(points, start, transverse_axes(start, np.broadcast_to([0.0, 1.0, 0.0], start.shape)))
-    position, direction = fan.at(aim(backend, stop, fan, np.zeros(2))[0])
+    fan, q, _ = aim_chief_rays(backend, stop, points, guess, ACROSS)
+    position, direction = fan.at(q)
     axes, slope = hit_slopes(backend, stop, position, direction)
 
     moved = np.concatenate([line_in_world(instrument, name, stepped).imag for name in names]) / COMPLEX_STEP

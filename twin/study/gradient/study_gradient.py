@@ -411,8 +411,8 @@ class _Traced:
         """Fill in what AD finds; the steps of the differences by these factors."""
         self.advance(AD_PART, 0, 1)
         motions = list(dict.fromkeys(motion for slopes in table.slopes.values() for motion in slopes))
-        spots: np.ndarray = np.zeros((*chain.nominal[0].shape[1:], 0))
-        sight: np.ndarray = np.zeros((*chain.nominal[1].shape[1:], 0))
+        spots: np.ndarray = np.zeros((*chain.nominal.shape[1:], 0))
+        sight: np.ndarray = np.zeros((*chain.experiment.sight.nominal[:, 0].shape, 0))
         if motions:
             experiment = chain.experiment
             spots = spot_gradient(experiment.path.coarse, motions, about)
