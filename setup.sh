@@ -8,9 +8,11 @@ usage() {
 Usage: bash setup.sh [--test | --live] [--help]
 
 Makes a virtual environment in .venv, installs the space camera twin and what it needs into it, and checks that it works.
+What is installed is pinned with checksums in docs/supply/lock; docs/installed.md says more.
 
-  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against), what builds the
-           documentation (Sphinx), what writes Parquet and what --live installs
+  --test   also install what the tests need (pytest, ruff, mypy, the programs the twin is checked against, ray-optics among
+           them in a folder of its own, .venv/peers), what builds the documentation (Sphinx), what writes Parquet and what
+           --live installs
   --live   also install what serves the live twin, python -m twin.live
   --help   this text
 
@@ -20,11 +22,12 @@ The variable PYTHON names the interpreter to use, for instance PYTHON=python3.13
 TEXT
 }
 
-extras=""
+all="install runtime live test peers"
+layers="install runtime"
 for argument in "$@"; do
     case "$argument" in
-        --live) extras="[live]" ;;
-        --test) extras="[test,oracles,docs,live,parquet]" ;;
+        --live) [ "$layers" = "$all" ] || layers="install runtime live" ;;
+        --test) layers="$all" ;;
         -h | --help) usage; exit 0 ;;
         *) echo "setup.sh: unknown option $argument" >&2; usage >&2; exit 2 ;;
     esac
@@ -77,17 +80,39 @@ if [ ! -e .venv ]; then
     "$python" -m venv .venv
 fi
 
-# What is installed is decided by pyproject.toml, the Python version and where this folder is; when none has changed, nothing is
-# installed again. An installation for the tests serves everything else as well.
+# What is installed is decided by the lock files, pyproject.toml, the Python version and where this folder is; when none has
+# changed, nothing is installed again. An installation for the tests serves everything else as well.
 stamp=".venv/installed"
-state="$({ cat pyproject.toml; .venv/bin/python -VV; pwd; } | sha256sum | cut -d' ' -f1)"
-if grep -qsxF -e "$state$extras" -e "$state[test,oracles,docs,live,parquet]" "$stamp"; then
+lock="docs/supply/lock"
+state="$({ cat pyproject.toml "$lock"/*.txt; .venv/bin/python -VV; pwd; } | sha256sum | cut -d' ' -f1)"
+if grep -qsxF -e "$state $layers" -e "$state $all" "$stamp"; then
     say "everything is installed already"
 else
     say "installing (some minutes on a slow line)"
     rm -f "$stamp"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -e ".$extras" || fail "pip could not install the packages"
-    echo "$state$extras" >"$stamp"
+    # Only files whose checksum the lock has, and no package that would run a program of its own to be built: what a lock
+    # file does not name is not installed, whoever asks for it. What is there already is not fetched again.
+    locked() {
+        .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes --only-binary :all: "$@" \
+            || fail "pip could not install the packages of $lock; run this again to go on. (If it speaks of hashes: the package
+       index sent another file than the one that was locked. Do not install that file; see docs/installed.md)"
+    }
+    # pip first and alone: it should not replace itself while it installs others
+    locked -r "$lock/install.txt"
+    files=()
+    for layer in $layers; do
+        case "$layer" in install | peers) ;; *) files+=(-r "$lock/$layer.txt") ;; esac
+    done
+    locked "${files[@]}"
+    if [ "$layers" = "$all" ]; then
+        # ray-optics would bring Qt; the tests find it where they look for it, and nothing else does
+        rm -rf .venv/peers
+        locked --target .venv/peers -r "$lock/peers.txt"
+    fi
+    # The project itself, by the setuptools that is there now, which warns of names that folders and packages share.
+    PYTHONWARNINGS=ignore .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e . \
+        || fail "pip could not install the project itself"
+    echo "$state $layers" >"$stamp"
 fi
 
 say "checking"

@@ -387,6 +387,7 @@ NOT_RUN = {
     "python -m twin.validate --out": "the full run makes docs/validation; .ci/run has the fast one",
     "python -m twin.validate --seed": "the same",
     "bash setup.sh": "installs; .ci/run begins with it",
+    "python -m docs.supply": "needs the package index; tests/test_supply.py holds what can be held without",
     "dask ": "needs machines and certificates of the user's",
     "export ": "is for such a cluster",
     "python -m NAME": "stands for all of them",

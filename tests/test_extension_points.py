@@ -841,10 +841,10 @@ def study_folder(place: Path, kind: str, runs: int = 12) -> tuple[Plan, Path]:
     setup = resolve_study(path)
     plan = Plan.of(setup)
     values = np.stack([np.linspace(0.0, 1.0, runs), np.linspace(0.0, 1.0, runs)], axis=-1)
-    result = BlockResult(values, np.full(values.shape, 0.1), ("",) * runs, 1.0)
+    result = BlockResult(values, *(np.full(values.shape, s) for s in (0.1, 0.01)), ("",) * runs, 1.0, ("",) * runs)
     with StudyFolder(place / "run", setup) as folder:
         numbers = write_data(plan, result, 1.0, runs, folder)
-        write_report(numbers.data, plan, folder.path, numbers.files)
+        write_report(numbers.data, plan, folder, numbers.files)
         write_manifest(
             folder, "twin.study", 0.0, 1.0, backend="llvm", seed=1, runs=runs, failed=0, workers=1, warnings=[]
         )

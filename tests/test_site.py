@@ -20,6 +20,7 @@ from docs.site.file_pages import READ_BY, file_pages
 from docs.site.link_check import faults
 from docs.site.markdown import slug
 from docs.site.node_pages import ACTIONS, node_table
+from docs.site.policy import with_policy
 from docs.site.run_files import FILES, described, known
 from docs.site.run_files import commands as golden_commands
 from docs.site.run_pages import run_pages
@@ -30,6 +31,7 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
 from tests.golden.golden import golden_file
 from tests.golden.jobs import ALL
+from twin.run.page_policy import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -338,3 +340,19 @@ def test_the_site_is_built_without_a_warning_and_without_a_broken_link(tmp_path:
     assert (tmp_path / "site/searchindex.js").exists()
     # in place of a former site
     assert "Every quantity" in (tmp_path / "site/reference/files/index.html").read_text("utf-8")
+
+
+# --- what its pages may do --------------------------------------------------------------------------------
+def test_a_page_of_the_site_may_do_what_it_is_made_of():
+    head = '<head><meta charset="utf-8"><style>p {}</style></head>'
+    text = f'<html>{head}<body><script>a()</script><script src="x.js"></script>'
+    page = with_policy(text)
+    content = re.search(r'charset="utf-8"><meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
+    assert content is not None  # before all that it is for
+    rules = {rule.split()[0]: rule.split()[1:] for rule in content[1].split(";")}
+    assert rules["default-src"] == ["'none'"]
+    assert rules["script-src"] == ["'self'", "file:", checksum("a()")]
+    assert rules["style-src-elem"] == ["'self'", "file:", checksum("p {}")]
+    assert not re.search(r"https?:|\*|unsafe-eval", content[1])
+    with pytest.raises(ValueError, match="onclick"):
+        with_policy("<head></head><p onclick='x()'>")

@@ -1,8 +1,8 @@
 """Is this machine ready? `python -m twin.doctor [--quick] [--json]`.
 
-Reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU and the versions of the dependencies, and runs a small float64 kernel
-and a small render in child processes, so that an unsuitable LLVM, which aborts the process that uses it, cannot take
-the doctor with it. Exit code 0 if the twin can run, 1 if not.
+Reports Python, cores, LLVM, Dr.Jit, Mitsuba, GPU, the versions of the dependencies and whether all packages are those
+of the lock files, and runs a small float64 kernel and a small render in child processes, so that an unsuitable LLVM,
+which aborts the process that uses it, cannot take the doctor with it. Exit code 0 if the twin can run, 1 if not.
 """
 
 if __name__ == "__main__":
@@ -14,7 +14,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import re
 import signal
 import subprocess
 import sys
@@ -24,6 +23,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -106,7 +106,7 @@ def examine(quick: bool = False) -> list[Check]:
         )
     if not quick:
         checks.append(_gpu())
-    return [*checks, *_pins()]
+    return [*checks, *_pins(), *_lock()]
 
 
 def _python() -> Check:
@@ -174,23 +174,22 @@ def _gpu_name() -> str:
 
 
 def pinned() -> dict[str, str]:
-    """Name -> version of every dependency that pyproject.toml pins and that this platform uses.
+    """Name -> version of every dependency that pyproject.toml pins and that this Python and platform use.
 
     Read from the installed distribution, or from pyproject.toml when the twin runs from a folder without being
     installed.
     """
     try:
-        requirements = [line for line in importlib.metadata.requires(DISTRIBUTION) or [] if "extra ==" not in line]
+        lines = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:
         project = Path(__file__).resolve().parent.parent / "pyproject.toml"
-        requirements = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"] if project.exists() else []
+        lines = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"] if project.exists() else []
     pins = {}
-    for line in requirements:
-        match = re.match(r"([A-Za-z0-9._-]+)\s*==\s*([^\s;]+)", line)
-        # The only platform marker in use is LLVM's.
-        elsewhere = "platform_machine" in line and not (sys.platform == "linux" and platform.machine() == "x86_64")
-        if match and not elsewhere:
-            pins[match[1]] = match[2]
+    for requirement in map(Requirement, lines):
+        pin = next(iter(requirement.specifier), None)
+        here = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if here and pin is not None and pin.operator == "==":
+            pins[requirement.name] = pin.version
     return pins
 
 
@@ -207,6 +206,31 @@ def _pins() -> list[Check]:
         else:
             checks.append(Check(name, "ok", found))
     return checks
+
+
+def _lock() -> list[Check]:
+    """Whether all that is installed, also by what the dependencies need, is what setup.sh installs; nothing where there
+    are no lock files, as beside an installed wheel.
+    """
+    from twin.run.lock_file import FOLDER, LockError, differences
+
+    if not FOLDER.is_dir():
+        return []
+    try:
+        found = differences(DISTRIBUTION)
+    except (LockError, OSError) as error:
+        return [Check("lock", "failed", f"cannot be read: {error}")]
+    parts = [f"{found.equal} packages as in docs/supply/lock"]
+    if found.other:
+        parts.append(f"other than locked: {'; '.join(found.other)}")
+    if found.missing:
+        parts.append(f"not installed: {', '.join(found.missing)}")
+    if found.other or found.missing:
+        parts.append("to have them as locked, delete .venv/installed and run bash setup.sh")
+    if found.unknown:
+        parts.append(f"not in the lock: {', '.join(found.unknown)}")
+    status: Status = "failed" if found.missing else "note" if found.other else "ok"
+    return [Check("lock", status, "; ".join(parts))]
 
 
 def _show(checks: list[Check], good: bool, console: Console) -> None:

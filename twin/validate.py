@@ -27,14 +27,15 @@ from twin.run.cli import (
     Heartbeat,
     InputErrorText,
     check_backend,
-    exit_on_terminate,
     explained,
     print_verdict,
     print_whole,
     result_table,
     time_text,
 )
+from twin.run.ending_signals import exit_on_terminate
 from twin.run.run_folder import RunFolder
+from twin.run.versions import program_digest
 from twin.validation.checks.check import (
     CONFIRMED,
     CONSISTENT,
@@ -74,7 +75,7 @@ def main(
     fast: Annotated[
         bool,
         typer.Option(
-            "--fast", help="Fewer trials, larger sigmas, the same verdicts: minutes, not the best part of an hour."
+            "--fast", help="Fewer trials, larger sigmas, the same verdicts: a few minutes in place of thirteen."
         ),
     ] = False,
     list_checks: Annotated[
@@ -113,6 +114,9 @@ def main(
     - **not checkable**: the text does not print what a comparison needs.
 
     - **failed**: the check could not be computed; this says nothing about the paper.
+
+    A row is two-sided, or it is of a claim of **at most** or **at least** and agrees however far below or above it
+    lies: the column *sides*.
 
     The run folder gets validation.json, a self-contained validation.html, a summary in summary/, and figures and
     tables in artefacts/.
@@ -175,6 +179,7 @@ def _run(
         _TimeLeft(),
     )
     tracer = load_backend(backend)
+    program_digest()  # of the files that compute, which may be others when the checks end
     with Progress(*columns, console=errors, disable=not errors.is_terminal, transient=True) as bar:
         total = rough_seconds(selections, fast)
         task = bar.add_task("start", total=total)
@@ -223,6 +228,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
                 "also": list(check.also),
                 "printed": check.printed,
                 "unit": check.unit,
+                "comparison": check.comparison,
                 "tolerance": check.tolerance,
                 "because": check.reason,
                 "tells": check.separation,
@@ -254,18 +260,19 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
 
 def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
-    from twin.validation.validation_report import claim_text, measured_text, sigma_text, verdict
+    from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
     table = result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)
+    table.add_column("sides", no_wrap=True)
     table.add_column("measured", justify="right", no_wrap=True)
     table.add_column("sigma", justify="right", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     for r in validation.results:
         unit = "" if r.unit == "1" else r.unit
-        cells = (r.id, claim_text(r), measured_text(r), sigma_text(r), unit)
+        cells = (r.id, claim_text(r), comparison_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Terminal()
     print_verdict(console, verdict(validation))

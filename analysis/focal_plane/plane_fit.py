@@ -21,6 +21,8 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from analysis.measurement_error import MeasurementError, UndeterminedError
+
 __all__ = ["RigidMotion"]
 
 Array = NDArray[np.float64]
@@ -85,7 +87,7 @@ _NAMES = ("piston", "slope_x", "slope_y")
 _LEAST_SPREAD = 1e-6
 
 
-class ObservabilityError(ValueError):
+class ObservabilityError(MeasurementError, ValueError):
     """The places measured cannot tell one of the rotations."""
 
 
@@ -275,7 +277,7 @@ def line_level(along: ArrayLike, across: ArrayLike, sigma: ArrayLike) -> LineLev
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(np.isfinite(spread)) and np.all(spread > 0)):
         raise ValueError("line level: positions must be finite and sigmas finite and positive")
     if np.ptp(y) <= 1e-12 * np.max(np.abs(y)):
-        raise ValueError("line level: all points are at one place along the line; measure near both of its ends")
+        raise UndeterminedError("line level: all points are at one place along the line; measure near both of its ends")
     weight = spread**-2
     arm = y - np.sum(weight * y) / np.sum(weight)
     moment = float(np.sum(weight * arm**2))

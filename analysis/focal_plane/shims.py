@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from analysis.focal_plane.plane_fit import RigidMotion
+from analysis.measurement_error import MeasurementError
 
 __all__ = ["Mount", "ShimError", "ShimPlan", "shim_plan"]
 
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 _LEAST_SPREAD = 1e-3
 
 
-class ShimError(ValueError):
+class ShimError(MeasurementError, ValueError):
     """The motion cannot be made with this mount and these shims.
 
     holes: indices of the holes at fault, empty when it is the mount as a whole. The message counts them from 1.

@@ -33,6 +33,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = ["LEAST_POINTS", "WIDEST_FRACTION", "Lobe", "main_peak"]
 
 Array = NDArray[np.float64]
@@ -218,7 +220,7 @@ _REMEDY = {
 }
 
 
-class FocusError(ValueError):
+class FocusError(MeasurementError, ValueError):
     """No vertex can be given.
 
     faults: index of the curve, an empty tuple for a single one -> reason: "peak below", "peak above", "few points",

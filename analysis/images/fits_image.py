@@ -10,6 +10,7 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from numpy.typing import NDArray
 
 from analysis.images.image_header import ImageError, ImageHeader, different_pages, full_scale, no_such_page
 
-__all__ = ["MAGIC", "fits_header", "fits_planes"]
+__all__ = ["MAGIC", "fits_header", "fits_planes", "fits_time"]
 
 MAGIC = b"SIMPLE  ="
 _SCIENCE = "SCI"
+_MJD_ZERO = datetime(1858, 11, 17, tzinfo=UTC)
 _NOT_IMAGES = {"ERR", "DQ", "VAR", "MASK", "WHT", "UNCERT", "BPM", "QUALITY"}
 """Names of extensions that go with an image."""
 
@@ -33,9 +35,10 @@ def _opened(path: Path) -> Iterator[Any]:
     from astropy.io import fits
 
     # without a memory map: astropy maps no scaled integers, and sections read what they need anyway
-    with warnings.catch_warnings(record=True) as told:
+    # opened here, since astropy leaves a file open that it cannot read
+    with path.open("rb") as file, warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        with fits.open(path, mode="readonly", memmap=False, lazy_load_hdus=False) as units:
+        with fits.open(file, mode="readonly", memmap=False, lazy_load_hdus=False) as units:
             cut = next((str(w.message) for w in told if "truncated" in str(w.message)), "")
             if cut:
                 raise ImageError(f"{path} cannot be read as an image: it is cut off ({cut})")
@@ -101,6 +104,27 @@ def fits_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
         dtype = _physical(unit)
         size = math.prod((rows, columns)) * max(dtype.itemsize, 2)
         return ImageHeader("FITS", tuple(numbers), rows, columns, 1, size, full_scale(dtype))
+
+
+def fits_time(path: Path) -> datetime | None:
+    """When the first image was recorded, by DATE-BEG, DATE-OBS (with TIME-OBS) or MJD-OBS; None where it does not say.
+
+    Args:
+        path: of the file.
+    """
+    with _opened(path) as units:
+        for unit in units:
+            header = unit.header
+            for key in ("DATE-BEG", "DATE-OBS"):
+                text = str(header.get(key, "")).strip()
+                if text and "T" not in text and "TIME-OBS" in header:
+                    text = f"{text}T{str(header['TIME-OBS']).strip()}"
+                if "T" in text:
+                    time = datetime.fromisoformat(text)
+                    return time if time.tzinfo else time.replace(tzinfo=UTC)
+            if "MJD-OBS" in header:
+                return _MJD_ZERO + timedelta(days=float(header["MJD-OBS"]))
+    return None
 
 
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:

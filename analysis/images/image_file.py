@@ -1,5 +1,5 @@
-"""Image files as grey values that are linear in light: TIFF, FITS, PNG and JPEG; regions averaged over pages, or all
-frames as they are.
+"""Image files as grey values that are linear in light: TIFF, FITS, PNG and JPEG; regions of all pages, or
+frames as they are in the file.
 
 The header is read first, so that what would not fit into memory is refused before it is decoded. Of an uncompressed
 TIFF and of a FITS file nothing but what is asked for is read.
@@ -8,7 +8,10 @@ TIFF and of a FITS file nothing but what is asked for is read.
 from __future__ import annotations
 
 import math
+import os
+import re
 import struct
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,11 +32,14 @@ MOST_BYTES = 1 << 29
 """Of one page when it is decoded, and of the frames of one file together."""
 MOST_PIXELS = 4_000_000
 """Of one region: the fits need some 250 bytes for each."""
+MOST_STACKED = 16_000_000
+"""Of one region in all pages together."""
 GAMMAS = ("srgb", "1", "2.2")
 """Examples of the tone curves."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _LARGEST_GAMMA = 5.0
 _GZIP = b"\x1f\x8b"
+_OF_CODEC = re.compile(rb"JPEG|libpng|grfmt_|loadsave")
 _INSIDE = (struct.error, ArithmeticError, AssertionError, AttributeError, LookupError, TypeError)
 """What readers of spoilt files stumble over; the words of these are about their own code."""
 
@@ -81,8 +87,10 @@ class ImageFile:
         try:
             if path.is_dir():
                 raise ImageError(f"{path} is a folder, not an image")
-            if not path.is_file():
+            if not path.exists():
                 raise ImageError(f"there is no image {path}")
+            if not path.is_file():  # it could be endless, or block
+                raise ImageError(f"{path} is a device, a pipe or a socket, not an image")
             header = _header(path, page, choose)
         except ImageError:
             raise
@@ -99,40 +107,34 @@ class ImageFile:
             raise ImageError(f"{path} says that its largest value is black, but real numbers have no largest one")
         return cls(path, replace(header, pages=header.pages[:frames]))
 
-    def read(
-        self, regions: dict[str, Region], gamma: str | None = None, saturation: float | None = None
-    ) -> dict[str, Array]:
-        """Mean grey values over the pages, name -> (H, W), linear in light.
-
-        A pixel that is saturated in one page counts as saturated: its mean is put at that level.
+    def read(self, regions: dict[str, Region], gamma: str | None = None) -> dict[str, Array]:
+        """Grey values of all pages, name -> (P, H, W), linear in light.
 
         Args:
             regions: name -> what to read; names are options of the command, for messages.
             gamma: tone curve of the file, ``srgb`` or the exponent as text; None and "1" for none.
-            saturation: grey value of saturation, linear in light; None for the full scale.
 
         Raises:
             ImageError: a region beyond the image or too large, too large an image, or one that cannot be decoded.
         """
         for name, region in regions.items():
             self._check(name, region)
+            size = len(self.header.pages) * region.height * region.width
+            if size > MOST_STACKED:
+                raise ImageError(
+                    f"{name} has {region.height} x {region.width} pixels in {len(self.header.pages)} pages, more than"
+                    f" {MOST_STACKED} in all do not fit into memory: choose a smaller region, or fewer pages with"
+                    " --frames"
+                )
         whole = self.header.full_scale
         linear = tone_curve(gamma, whole)
-        limit = whole if saturation is None else saturation
-        total = {name: np.zeros((r.height, r.width)) for name, r in regions.items()}
-        largest = {name: np.full((r.height, r.width), -np.inf) for name, r in regions.items()}
-        # sums of huge real numbers may overflow; what is not finite is refused where it is measured
+        shape = len(self.header.pages)
+        out = {name: np.empty((shape, r.height, r.width)) for name, r in regions.items()}
         with np.errstate(over="ignore", invalid="ignore"):
-            for data in self._decoded():
+            for number, data in enumerate(self._decoded()):
                 for name, region in regions.items():
                     stored = np.asarray(data[region.slices], dtype=np.float64)
-                    grey = _luminance(whole - stored if self.header.inverted else stored, linear, whole)
-                    total[name] += grey
-                    np.maximum(largest[name], grey, out=largest[name])
-        out = {}
-        for name, value in total.items():
-            mean = value / len(self.header.pages)
-            out[name] = np.where(largest[name] >= limit, np.maximum(mean, limit), mean)
+                    out[name][number] = _luminance(whole - stored if self.header.inverted else stored, linear, whole)
         return out
 
     def frames(self, region: Region | None = None) -> NDArray[Any]:
@@ -201,8 +203,8 @@ class ImageFile:
         if self.header.kind == "FITS":
             yield from fits_image.fits_planes(self.path, self.header.pages)
             return
-        data = cv2.imread(str(self.path), cv2.IMREAD_UNCHANGED)
-        if data is None:
+        data, told = _imread(self.path)
+        if data is None or told:
             raise ImageError(f"{self.path} cannot be read as an image: it is damaged")
         yield data[..., 2::-1] if data.ndim == 3 else data
 
@@ -214,6 +216,29 @@ class ImageFile:
                 f"{self.path} of {head.rows} x {head.columns} pixels fills {1e-9 * head.page_bytes:.1f} GB when it is"
                 f" decoded, more than {1e-9 * MOST_BYTES:.1f} GB: {remedy}"
             )
+
+
+def _imread(path: Path) -> tuple[NDArray[Any] | None, bool]:
+    """Pixels of a PNG or JPEG, and whether its library found the data corrupt: libjpeg goes on with what it has, and
+    tells nobody but the terminal.
+    """
+    try:
+        terminal = os.dup(2)
+    except OSError:  # closed
+        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED), False
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            data = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+        said.seek(0)
+        lines = said.read().splitlines(keepends=True)
+    told = [line for line in lines if _OF_CODEC.search(line)]
+    if len(told) < len(lines):  # of a thread that has something to say
+        os.write(2, b"".join(line for line in lines if line not in told))
+    return data, any(b"extraneous" not in line for line in told)
 
 
 def _header(path: Path, page: int | None, choose: str) -> ImageHeader:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -26,28 +27,27 @@ def png_header(path: Path) -> ImageHeader:
         ImageError: it is cut off or damaged.
     """
     rows = columns = depth = colour = 0
-    coded, ended = "", False
+    coded, name, damaged = "", b"", f"{path} cannot be read as an image: it is cut off or damaged"
     with path.open("rb") as file:
         file.seek(8)
-        while head := file.read(8):
+        while name != b"IEND" and len(head := file.read(8)) == 8:
             length, name = struct.unpack(">I4s", head)
-            if name == b"IHDR":
-                columns, rows, depth, colour = struct.unpack(">IIBB", file.read(10))
-                length -= 10
-            elif name == b"gAMA":
-                gamma = struct.unpack(">I", file.read(4))[0] * 1e-5
-                length -= 4
+            data, check = file.read(length), file.read(4)
+            # libpng would tell the terminal of it
+            if len(check) < 4 or struct.unpack(">I", check)[0] != zlib.crc32(data, zlib.crc32(name)):
+                raise ImageError(damaged)
+            if name == b"IHDR" and length == 13:
+                columns, rows, depth, colour = struct.unpack(">IIBB", data[:10])
+            elif not rows:  # something stands before it
+                raise ImageError(damaged)
+            elif name == b"gAMA" and length == 4:
+                gamma = struct.unpack(">I", data)[0] * 1e-5
                 if not coded and abs(gamma - 1.0) > 0.01:
                     coded = f"it says gamma {gamma:.4g}"
             elif name in (b"sRGB", b"iCCP"):
                 coded = "it has a colour profile" if name == b"iCCP" else "it says sRGB"
-            elif name == b"IEND":
-                ended = True
-                break
-            # the checksum is four bytes
-            file.seek(length + 4, 1)
-    if not (rows and columns and ended):
-        raise ImageError(f"{path} cannot be read as an image: it is cut off or damaged")
+    if not (rows and columns and name == b"IEND"):
+        raise ImageError(damaged)
     if colour not in _PNG_CHANNELS:
         raise ImageError(f"{path} cannot be read as an image: PNG has no colour type {colour}")
     channels = _PNG_CHANNELS[colour]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +17,14 @@ from numpy.typing import NDArray
 
 from analysis.images.image_header import ImageError, ImageHeader, different_pages, full_scale, no_such_page
 
-__all__ = ["MAGIC", "tiff_header", "tiff_pages"]
+__all__ = ["MAGIC", "tiff_header", "tiff_origin", "tiff_pages"]
 
 # what it logs of a spoilt file would stand beside the sentence in which the file is refused
 tifffile.logger().addHandler(logging.NullHandler())
 
 MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 """First four bytes."""
-_ICC_PROFILE, _ORIENTATION = 34675, 274
+_ICC_PROFILE, _ORIENTATION, _EXIF = 34675, 274, 34665
 _AXES = {"YX": (0, 1, None), "YXS": (0, 1, 2), "SYX": (1, 2, 0)}
 """Where rows, columns and channels stand in a page."""
 _GREY = {"MINISWHITE", "MINISBLACK", "RGB"}
@@ -97,6 +100,25 @@ def tiff_header(path: Path, wanted: int | None, choose: str) -> ImageHeader:
             inverted=photometric == "MINISWHITE",
             turned="" if orientation == 1 else f"orientation {orientation}",
         )
+
+
+def tiff_origin(path: Path) -> tuple[datetime | None, str]:
+    """When the first page was recorded, by Exif's DateTimeOriginal, None where it does not say; and the ``note`` in a
+    description that is JSON, as this program writes it.
+
+    Args:
+        path: of the file.
+    """
+    with tifffile.TiffFile(path) as file:
+        page = _page(file, 0)
+        exif, told = page.tags.valueof(_EXIF) or {}, str(page.description)
+    note = str(json.loads(told).get("note", "")) if told.startswith("{") else ""
+    found = re.fullmatch(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)\0?", str(exif.get("DateTimeOriginal", "")))
+    if found is None:
+        return None, note
+    fraction = re.sub(r"\D", "", str(exif.get("SubsecTimeOriginal", "")))[:6]
+    text = "{}-{}-{}T{}".format(*found.groups()) + (f".{fraction:0<6}" if fraction else "")
+    return datetime.fromisoformat(text).replace(tzinfo=UTC), note
 
 
 def tiff_pages(path: Path, pages: Iterable[int], check: Callable[[], None]) -> Iterator[NDArray[Any]]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.matching.options import checked_places
+from analysis.measurement_error import UndeterminedError
 
 __all__ = ["Consensus", "DisplacementField", "consensus"]
 
@@ -126,7 +127,7 @@ def consensus(
     usable &= True if heights is None else np.isfinite(heights)
     terms = (degree + 1) * (degree + 2) // 2 + (heights is not None)
     if usable.sum() < max(2 * terms, 5):
-        raise ValueError(
+        raise UndeterminedError(
             f"consensus: {int(usable.sum())} usable matches do not carry {terms} terms; need {max(2 * terms, 5)}: "
             "match more points or lower the degree"
         )

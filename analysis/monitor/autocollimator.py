@@ -28,6 +28,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import UndeterminedError
+
 __all__ = [
     "AXES",
     "ReadingMap",
@@ -151,7 +153,7 @@ class ReadingMap:
         design = _monomials((spots - centre) / max(scale, 1e-300), degree)
         solution, _, rank, _ = np.linalg.lstsq(design, known, rcond=None)
         if rank < design.shape[1]:
-            raise ValueError(f"reading map: {len(spots)} spots do not settle a polynomial of degree {degree}")
+            raise UndeterminedError(f"reading map: {len(spots)} spots do not settle a polynomial of degree {degree}")
         rms = float(np.sqrt(np.mean((design @ solution - known) ** 2)))
         return cls(centre, scale, degree, np.asarray(solution, dtype=np.float64), rms)
 

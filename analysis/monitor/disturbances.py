@@ -140,7 +140,18 @@ class Disturbances:
         Args:
             noise: R, (..., D, D) of the shifts, px^2.
         """
-        across = self.parameters @ self.correlation @ self.spots.T
+        return self._best(self.parameters, noise)
+
+    def best_amounts(self, noise: Array) -> Array:
+        """Likewise the motions themselves in standard deviations per pixel, C A' (A C A' + R)^-1, (..., M, D).
+
+        Args:
+            noise: R, (..., D, D) of the shifts, px^2.
+        """
+        return self._best(np.eye(len(self.labels)), noise)
+
+    def _best(self, rows: Array, noise: Array) -> Array:
+        across = rows @ self.correlation @ self.spots.T
         spread = self.spot_covariance + noise
         if np.any(noise):
             return np.asarray(np.swapaxes(np.linalg.solve(spread, across.T), -1, -2))

@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.measurement_error import UndeterminedError
+
 __all__ = ["EARTH_RADIUS_M", "GroundError", "GroundGeometry"]
 
 Array = NDArray[np.float64]
@@ -89,9 +91,9 @@ class GroundGeometry:
     def __post_init__(self) -> None:
         """Check the geometry."""
         if any(abs(math.sin(a)) * (EARTH_RADIUS_M + self.altitude_m) >= EARTH_RADIUS_M for a in self.looks_rad):
-            raise ValueError("ground error: a camera looks past the Earth")
+            raise UndeterminedError("ground error: a camera looks past the Earth")
         if abs(self.looks_rad[0] - self.looks_rad[1]) < 1e-3:
-            raise ValueError("ground error: the cameras look the same way, their rays do not meet in one point")
+            raise UndeterminedError("ground error: the cameras look the same way, their rays do not meet in one point")
 
     @cached_property
     def incidences_rad(self) -> tuple[float, float]:

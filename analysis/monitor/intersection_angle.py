@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.measurement_error import UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC
 
@@ -92,7 +93,9 @@ def exact(
             raise ValueError(f"intersection angle: {name}_look_rad must be within +-pi/2, found {look!r}")
     nominal = abs(forward_look_rad - backward_look_rad)
     if nominal < 1e-3:
-        raise ValueError("intersection angle: the cameras look the same way, their angle has no direction to change in")
+        raise UndeterminedError(
+            "intersection angle: the cameras look the same way, their angle has no direction to change in"
+        )
     rotations = (forward.d_alpha_rad, forward.d_beta_rad, backward.d_alpha_rad, backward.d_beta_rad)
     given = np.stack(np.broadcast_arrays(*(np.asarray(one, np.float64) for one in rotations)))
     # the angle as it is, and with each rotation a step further and back

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError, UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC, UM_PER_M
 
@@ -38,7 +39,7 @@ _NEGLIGIBLE = 1e-5
 _ROUNDING = 1e-6
 
 
-class RankError(ValueError):
+class RankError(MeasurementError, ValueError):
     """The motions cannot be told apart by the spots.
 
     `null_vectors` (K, P): combinations of motions that move no spot.
@@ -108,7 +109,7 @@ def gain(
         # whitening: solve(L, x) has unit covariance
         root = np.linalg.cholesky(np.eye(len(spots)) if noiseless else spread)
     except np.linalg.LinAlgError as error:
-        raise ValueError("model fit: covariance of the shifts is not positive definite") from error
+        raise UndeterminedError("model fit: covariance of the shifts is not positive definite") from error
     white = np.linalg.solve(root, np.broadcast_to(spots, (*root.shape[:-2], *spots.shape)))
     # pinv by QR-like SVD of the column-scaled matrix: units of motion differ by many orders of magnitude
     length = np.linalg.norm(white, axis=-2, keepdims=True)
@@ -201,7 +202,7 @@ def observability(
     try:
         root = np.linalg.cholesky(np.asarray(covariance, dtype=np.float64))
     except np.linalg.LinAlgError as error:
-        raise ValueError("observability: covariance of the shifts is not positive definite") from error
+        raise UndeterminedError("observability: covariance of the shifts is not positive definite") from error
     spots, parameters = spots * size, parameters * size
     own = [names[k] for k in chosen]
     _check_rank(spots[:, chosen], own, rank_tolerance)

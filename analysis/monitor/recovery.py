@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor import intersection_angle
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.curvature import Curvature, MotionModel, read_again
 from analysis.monitor.disturbances import Consistency, Disturbances, consistency
 from analysis.monitor.estimators import PARAMETERS_EACH, Shifts, applicable
 from analysis.monitor.ground_error import GroundError, GroundGeometry
 from analysis.monitor.intersection_angle import IntersectionAngleChange
+from analysis.monitor.limits import quantities
 from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
+from analysis.spots.fit_state import FitStates, fit_states, require_rest, widened
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
 
@@ -26,6 +30,7 @@ __all__ = [
     "estimates",
     "estimates_of",
     "joint",
+    "judged_spots",
     "measure_spots",
     "recover",
     "recovery_of",
@@ -42,11 +47,13 @@ class Estimates:
     parameters: camera -> estimator -> changes with arrays of shape (S,).
     angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
     ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
+    curvature: estimator -> whether its motions are small enough to be linear; of those that were traced again.
     """
 
     parameters: Mapping[str, Mapping[str, CameraParameters]]
     angle: Mapping[str, IntersectionAngleChange]
     ground: Mapping[str, GroundError]
+    curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +66,8 @@ class Recovery:
     angle: estimator -> change of the intersection angle, arrays (S,); empty unless there are two cameras.
     ground: estimator -> errors on the ground, arrays (S,); empty unless the altitude of a pair is known.
     parts: noise of the positions before (C spots) and after (S C), for series of measurements; None unless kept.
+    evidence: what the fits of the spots say of their sigmas; None where nobody judged them.
+    curvature: estimator -> whether its motions are small enough to be linear; of those that were traced again.
     """
 
     before: Array
@@ -70,6 +79,8 @@ class Recovery:
     angle: Mapping[str, IntersectionAngleChange]
     ground: Mapping[str, GroundError] = field(default_factory=dict)
     parts: tuple[NoiseParts, NoiseParts] | None = None
+    evidence: SpotEvidence | None = None
+    curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
     def at(self, states: slice) -> Recovery:
         """Those of some states, without ``parts``.
@@ -86,6 +97,8 @@ class Recovery:
             {name: {e: p.at(states) for e, p in every.items()} for name, every in self.parameters.items()},
             {e: a.at(states) for e, a in self.angle.items()},
             {e: g.at(states) for e, g in self.ground.items()},
+            evidence=None if self.evidence is None else self.evidence.at(states),
+            curvature={e: c.at(states) for e, c in self.curvature.items()},
         )
 
     @property
@@ -111,7 +124,7 @@ def measure_spots(
 ) -> SpotPositions:
     """Centre of every spot of mean frames (B, H, W), B a multiple of the number of spots, in the calibration's order.
 
-    Raises SpotError for spots that cannot be measured.
+    Raises SpotError for spots that cannot be measured, and for those whose fit does not come to rest.
 
     Args:
         mean: mean frames, (B, H, W), grey values.
@@ -121,12 +134,30 @@ def measure_spots(
         threads: for the fits; results do not depend on it.
     """
     if centroid == "ml":
-        return maximum_likelihood_fit(mean, frames, calibration.noise, calibration.template, threads=threads)
+        found = maximum_likelihood_fit(mean, frames, calibration.noise, calibration.template, threads=threads)
+        return require_rest(found)
     if centroid == "gaussian":
-        return gaussian_fit(mean, frames, calibration.noise)
+        return require_rest(gaussian_fit(mean, frames, calibration.noise))
     if centroid == "energy":
-        return energy_centroid(mean, frames, calibration.noise)
+        return require_rest(energy_centroid(mean, frames, calibration.noise))
     raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
+
+
+def judged_spots(
+    mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
+) -> tuple[SpotPositions, FitStates]:
+    """The same with the sigmas that their fits leave them, and how good these are, (B / C, C).
+
+    Args:
+        mean: as of `measure_spots`, as all others.
+        frames: of each mean.
+        calibration: of the nominal instrument.
+        centroid: `ml`, `gaussian` or `energy`.
+        threads: for the fits.
+    """
+    found = measure_spots(mean, frames, calibration, centroid, threads)
+    states = fit_states(found)
+    return widened(found, states.widening), states.reshaped(calibration.template.count)
 
 
 def recover(
@@ -137,6 +168,7 @@ def recover(
     threads: int = 1,
     disturbances: Disturbances | None = None,
     keep_parts: bool = False,
+    motions: Mapping[str, MotionModel] | None = None,
 ) -> Recovery:
     """Recover all parameters.
 
@@ -149,14 +181,17 @@ def recover(
         disturbances: what is stated to move; without it there is no `posterior`, and all sigmas are those of the noise
             alone.
         keep_parts: of the noise, which are large.
+        motions: estimator -> the motions by which it reads, traced again to see whether they are linear; None to take
+            them so.
     """
     spots, frames = after.shape[1], after.shape[2]
     if spots != calibration.spots or before.shape[-4] != spots:
         raise ValueError(f"recovery: the calibration has {calibration.spots} spots, the images {spots}")
-    first = measure_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
-    second = measure_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
+    first, fits = judged_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
+    second, more = judged_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
     spread = difference_covariance(first, second, calibration.noise)
-    return recovery_of(first, second, spread, calibration, disturbances, keep_parts)
+    evidence = SpotEvidence(fits, more)
+    return recovery_of(first, second, spread, calibration, disturbances, keep_parts, evidence, motions)
 
 
 def recovery_of(
@@ -166,6 +201,8 @@ def recovery_of(
     calibration: MonitorCalibration,
     disturbances: Disturbances | None = None,
     keep_parts: bool = False,
+    evidence: SpotEvidence | None = None,
+    motions: Mapping[str, MotionModel] | None = None,
 ) -> Recovery:
     """What spots say that have been measured already.
 
@@ -176,13 +213,15 @@ def recovery_of(
         calibration: of the nominal instrument; C must be its number of spots.
         disturbances: as of `recover`.
         keep_parts: of the noise, which are large.
+        evidence: what the fits say; the positions are those of `judged_spots`.
+        motions: as of `recover`.
     """
     spots = calibration.spots
     states = second.row.size // spots
     spread = joint(covariance.reshape(states, spots, 2, 2))
     start = np.broadcast_to(first.position.reshape(-1, spots, 2), (states, spots, 2))
     end = second.position.reshape(states, spots, 2)
-    found = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground)
+    found = estimates(start, end, spread, calibration.cameras, disturbances, calibration.ground, motions)
     return Recovery(
         before=start,
         after=end,
@@ -193,6 +232,8 @@ def recovery_of(
         angle=found.angle,
         ground=found.ground,
         parts=(noise_parts(first, calibration.noise), noise_parts(second, calibration.noise)) if keep_parts else None,
+        evidence=evidence,
+        curvature=found.curvature,
     )
 
 
@@ -203,6 +244,7 @@ def estimates(
     cameras: Mapping[str, CameraCalibration],
     disturbances: Disturbances | None = None,
     ground: GroundGeometry | None = None,
+    motions: Mapping[str, MotionModel] | None = None,
 ) -> Estimates:
     """All estimators on spot positions.
 
@@ -213,14 +255,22 @@ def estimates(
         cameras: what is calibrated of each.
         disturbances: what is stated to move, None for nothing.
         ground: of a pair whose altitude is known.
+        motions: as of `recover`.
     """
     shifts = Shifts(start, end, covariance, cameras, disturbances)
     found: dict[str, tuple[Array, Array, Array | None]] = {}
+    curvature: dict[str, Curvature] = {}
+    rows = np.stack([quantity.row for quantity in quantities(cameras, ground)]) if motions else np.empty((0, 0))
     for title, estimator in applicable(cameras, disturbances).items():
         gain, values = estimator.gain(shifts), estimator.read(shifts)
         noise = gain @ shifts.covariance @ np.swapaxes(gain, -1, -2)
-        found[title] = values, noise, None if disturbances is None else noise + disturbances.misfit(gain)
-    return estimates_of(found, cameras, ground)
+        total = None if disturbances is None else noise + disturbances.misfit(gain)
+        if motions is not None and title in motions:
+            whole = noise if total is None else total
+            again = read_again(values, shifts.vector, shifts.covariance, whole, rows, motions[title])
+            values, curvature[title] = again
+        found[title] = values, noise, total
+    return replace(estimates_of(found, cameras, ground), curvature=curvature)
 
 
 def estimates_of(

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from analysis.chi_square import limit_of
+from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
 
 __all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
@@ -213,7 +214,7 @@ class _Factor:
         try:
             self.root = np.linalg.cholesky(process.shifts(when) + noise)
         except np.linalg.LinAlgError as error:
-            raise ValueError("smoother: shifts that say the same twice need noise") from error
+            raise UndeterminedError("smoother: shifts that say the same twice need noise") from error
         self.white = solve_triangular(self.root, shifts.ravel(), lower=True)
         left = solve_triangular(self.root, noise, lower=True)
         self.noise = solve_triangular(self.root, left.T, lower=True)

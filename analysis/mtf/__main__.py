@@ -33,9 +33,11 @@ from rich.console import Console
 from rich.table import Table
 
 from analysis.images.image_file import ImageError, ImageFile, Region, tone_curve
-from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
+from analysis.mtf.bar_contrast import BarError, BarMtf
+from analysis.mtf.bar_pages import measure_bar_pages, page_warnings
 from analysis.mtf.edge_mtf import EdgeMtf
-from analysis.mtf.slanted_edge import EdgeError, measure_edge
+from analysis.mtf.edge_pages import grey_step, measure_pages
+from analysis.mtf.slanted_edge import EdgeError
 
 Array = NDArray[np.float64]
 BAD_INPUT, NOT_PRINTED = 2, 1
@@ -114,8 +116,11 @@ def main(
     too high, by about a per cent with patches 10 pixels from everything else, F/9 and 7 um.
 
     Grey values must be linear in light: raw frames. Of a picture with a tone curve state --gamma; a JPEG without it is
-    taken as it is, with a warning. Colour becomes the luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B). Pages
-    of a TIFF and planes of a FITS cube are averaged. --saturation and --offset are grey values linear in light.
+    taken as it is, with a warning. Colour becomes the luminance of linear RGB (0.2126 R + 0.7152 G + 0.0722 B).
+
+    **Pages** of a TIFF and planes of a FITS cube are averaged. If an edge stands elsewhere or turns from page to page
+    (by chance once in 10 000 images), the pages are laid over each other first, with a warning; bars that move are
+    refused. --saturation and --offset are grey values linear in light.
 
     Example, with images of `python -m twin.render scenes/examples/targets.yaml --out runs/targets`:
     `python -m analysis.mtf runs/targets/images/forward_centre_knife_edge_along_before.tiff --roi 24,24,64,64
@@ -145,26 +150,31 @@ def main(
                     raise _Wrong(f"{option} {text} and {image} have different numbers of rows or columns")
             elif text is not None:
                 regions[option] = _region(text, option)
-        read = source.read(regions, gamma, saturation)
+        read = source.read(regions, gamma)
         for option, other in fields.items():
-            read[option] = other.read({"--roi": regions["--roi"]}, gamma, saturation)["--roi"]
+            read[option] = other.read({"--roi": regions["--roi"]}, gamma)["--roi"]
         warnings = _warnings([source, *fields.values()], gamma)
         region = read["--roi"]
         if saturation is None and np.any(region >= source.header.full_scale):
             saturation = source.header.full_scale
         found: BarMtf | EdgeMtf
+        step = _step(source, region, gamma)
         if frequency is not None:
-            found = measure_bars(
-                region, read["--dark"], read["--bright"], frequency, saturation=saturation, offset=offset
+            found = measure_bar_pages(
+                region, read["--dark"], read["--bright"], frequency, saturation=saturation, offset=offset, step=step
             )
         else:
-            found = measure_edge(region, saturation=saturation)
+            found = measure_pages(region, saturation=saturation, step=step)
+        warnings += page_warnings(found, step)
         if isinstance(found, EdgeMtf):
             edge = found
             _write(plot, lambda path: _draw(edge, pitch, path))
             _write(csv_file, lambda path: _write_csv(edge, pitch, path))
     except (EdgeError, BarError, ImageError, _Wrong) as error:
-        errors.print(f"error: {error}", style="bold red", markup=False, highlight=False, soft_wrap=True)
+        # what is wrong with an image says which: there may be many in a script
+        named = isinstance(error, _Wrong) or str(image) in str(error)
+        text = str(error) if named else f"{image}: {error}"
+        errors.print(f"error: {text}", style="bold red", markup=False, highlight=False, soft_wrap=True)
         raise typer.Exit(BAD_INPUT) from None
     except OSError as error:
         # names that the system does not take, such as too long ones
@@ -217,6 +227,15 @@ def _warnings(images: list[ImageFile], gamma: str | None) -> list[str]:
         for image in images
         if image.header.coded
     ]
+
+
+def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
+    """Between the grey values of a page, linear in light; of a tone curve the largest."""
+    if gamma in (None, "1"):
+        return grey_step(region)
+    whole = source.header.full_scale
+    ends = tone_curve(gamma, whole)(np.array([0.0, 1.0, whole - 1.0, whole]))
+    return float(max(ends[1] - ends[0], ends[3] - ends[2]))
 
 
 def _pixel_size(text: str) -> float:
@@ -348,6 +367,7 @@ def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
         "bright_dn": edge.bright - offset,
         "noise_dark_dn": edge.noise_dark,
         "noise_bright_dn": edge.noise_bright,
+        "pages": _pages_json(edge),
         "mtf_nyquist": nyquist,
         "mtf_nyquist_sigma": nyquist_sigma,
         "mtf_nyquist_noise_bias": float(np.interp(0.5, edge.frequency, edge.noise_bias)),
@@ -358,6 +378,22 @@ def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
         "mtf": edge.mtf.tolist(),
         "sigma": edge.sigma.tolist(),
         "noise_bias": edge.noise_bias.tolist(),
+    }
+
+
+def _pages_json(edge: EdgeMtf) -> dict[str, Any]:
+    pages = edge.pages
+    assert pages is not None
+    return {
+        "position_px": pages.position.tolist(),
+        "position_sigma_px": pages.position_sigma.tolist(),
+        "angle_deg": np.degrees(pages.angle).tolist(),
+        "angle_sigma_deg": np.degrees(pages.angle_sigma).tolist(),
+        "drift_px_rms": pages.drift,
+        "chi_square": pages.chi_square,
+        "degrees_of_freedom": pages.degrees_of_freedom,
+        "aligned": pages.aligned,
+        "repeated": pages.same,
     }
 
 
@@ -391,10 +427,21 @@ def _print_edge(edge: EdgeMtf, pitch: float, offset: float, written: list[Path])
         f"edge: {math.degrees(edge.angle):+.3f} ± {math.degrees(edge.angle_sigma):.3f} deg, {kind}",
         f"levels: {edge.dark - offset:.1f} and {edge.bright - offset:.1f}, noise {edge.noise_dark:.2f} and "
         f"{edge.noise_bright:.2f} per pixel",
+        *([_pages_text(edge)] if edge.pages is not None and len(edge.pages.position) > 1 else []),
         *(f"written: {path}" for path in written),
     ]
     for text in lines:
         console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def _pages_text(edge: EdgeMtf) -> str:
+    pages = edge.pages
+    assert pages is not None
+    sigma = float(np.sqrt(np.mean(pages.position_sigma**2)))
+    each = ", ".join(f"{place:+.3f}" for place in pages.position[:9] - edge.position)
+    more = f", ... ({len(pages.position)} pages)" if len(pages.position) > 9 else ""
+    how = "laid over each other" if pages.aligned else "averaged"
+    return f"edge in the pages, against {edge.position:.3f} px: {each}{more}, each ± {sigma:.3f} px; {how}"
 
 
 def _print_bars(bars: BarMtf, pitch: float, offset: float, as_json: bool) -> None:

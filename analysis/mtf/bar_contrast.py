@@ -29,6 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
 from analysis.mtf.edge_location import LARGEST_GREY, grey_fault
 from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
@@ -48,7 +49,7 @@ _UNEVEN = 0.15
 _STEPS = 8
 
 
-class BarError(ValueError):
+class BarError(MeasurementError, ValueError):
     """A region that does not show measurable bars; the message says what is wrong and what to change."""
 
 
@@ -64,6 +65,8 @@ class BarMtf:
     dark, dark_sigma, bright, bright_sigma: grey values of the reference patches, offset included.
     contrast: (max - min) / (max + min) of the region, offset taken off. Noise raises it.
     contrast_transfer: contrast over that of the patches. coltman: pi / 4 of it.
+    page_noise: of one pixel in one page of the region and of the two patches, rms, where pages were measured.
+    same: pages of the region that another one repeats to the bit.
     """
 
     frequency: Array
@@ -81,6 +84,8 @@ class BarMtf:
     contrast: float
     contrast_transfer: float
     coltman: float
+    page_noise: tuple[float, float, float] | None = None
+    same: int = 0
 
     @property
     def cycles_per_pixel(self) -> float:
@@ -98,8 +103,11 @@ def measure_bars(
     frames: int = 1,
     saturation: float | None = None,
     offset: float = 0.0,
+    rounding: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> BarMtf:
     """MTF from the bars that fill a region.
+
+    Of several frames of them see `bar_pages.measure_bar_pages`.
 
     Args:
         region: (H, W) grey values, linear in light, inside the group.
@@ -112,6 +120,8 @@ def measure_bars(
         frames: number of averaged frames.
         saturation: as in `slanted_edge.measure_edge`.
         offset: grey value without light, for the contrast only.
+        rounding: rms of what rounding leaves in a pixel of the region and in the two levels, grey values
+            (`edge_pages.left_over`).
 
     Raises:
         BarError: no bars, saturated, too small, not filled, at Nyquist without tilt, or patches without contrast.
@@ -120,7 +130,9 @@ def measure_bars(
         saturation = noise.saturation_dn
     grey = _checked(region, saturation)
     levels = [_level(name, patch, noise, frames, saturation) for name, patch in (("dark", dark), ("bright", bright))]
-    (low, low_sigma), (high, high_sigma) = levels
+    (low, low_sigma), (high, high_sigma) = (
+        (level, math.hypot(sigma, least)) for (level, sigma), least in zip(levels, rounding[1:], strict=True)
+    )
     step, step_sigma = high - low, math.hypot(low_sigma, high_sigma)
     if step <= 5.0 * step_sigma or step <= 0:
         raise BarError(
@@ -141,7 +153,8 @@ def measure_bars(
     model = parameters @ design[:-2]
     inverse = np.linalg.inv(_gram(design * weight, design))
     if noise is None:
-        variance = np.full(value.size, float(np.sum((value - model) ** 2)) / (value.size - design.shape[0]))
+        scatter = float(np.sum((value - model) ** 2)) / (value.size - design.shape[0])
+        variance = np.full(value.size, max(scatter, rounding[0] ** 2))
     else:
         variance = noise.temporal_variance_dn2(model, frames) + noise.fixed_variance_dn2(model)
     covariance = inverse @ _gram(design * (weight**2 * variance), design) @ inverse

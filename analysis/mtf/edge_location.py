@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = ["LARGEST_GREY", "EdgeError", "EdgeLine", "checked_region", "grey_fault", "locate_edge", "pixel_noise"]
 
 Array = NDArray[np.float64]
@@ -39,7 +41,7 @@ _NOT_FOLLOWED = (
 )
 
 
-class EdgeError(ValueError):
+class EdgeError(MeasurementError, ValueError):
     """A region that does not show one measurable edge; the message says what is wrong and what to change."""
 
 

@@ -11,9 +11,39 @@ from scipy.interpolate import CubicSpline
 
 from analysis.mtf.edge_location import Axis
 
-__all__ = ["EdgeMtf"]
+__all__ = ["EdgeMtf", "PagePlaces"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PagePlaces:
+    """Where the edge stands in each of P pages, frames of one image.
+
+    position, position_sigma: (P,) in the region's middle, px, as `EdgeMtf.position`; sigma by what is new in each page.
+    angle, angle_sigma: (P,) rad, as `EdgeMtf.angle`; all the same where pages do not turn.
+    chi_square, degrees_of_freedom: of places and angles of all pages being the same.
+    aligned: they are not, so that the pages were laid over each other before they were measured together.
+    same: pages that another one repeats to the bit and that do not count.
+    noise: (2,) of one pixel in one page on the dark and on the bright side, rms, grey values.
+    rounded: (2,) rms of what rounding leaves in these levels, however many pixels and pages there are, grey values.
+    """
+
+    position: Array
+    position_sigma: Array
+    angle: Array
+    angle_sigma: Array
+    chi_square: float
+    degrees_of_freedom: int
+    aligned: bool
+    same: int
+    noise: tuple[float, float]
+    rounded: tuple[float, float]
+
+    @property
+    def drift(self) -> float:
+        """Rms of the positions about their mean, px."""
+        return float(np.std(self.position))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +69,7 @@ class EdgeMtf:
     dark, bright: grey values far from the edge, tails accounted for.
     noise_dark, noise_bright: rms noise of one pixel there.
     core: half width of the spline, px; beyond it the edge-spread function is level + tail / x.
+    pages: of what was measured from several frames by `edge_pages.measure_pages`.
     """
 
     axis: Axis
@@ -65,6 +96,7 @@ class EdgeMtf:
     noise_dark: float
     noise_bright: float
     core: float
+    pages: PagePlaces | None = None
 
     @property
     def frequency_along_axis(self) -> Array:

@@ -30,11 +30,21 @@ from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.rice import measured_bias, rice_sigma, signal_modulus
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["EdgeError", "EdgeMtf", "measure_edge"]
+__all__ = [
+    "EdgeError",
+    "EdgeMtf",
+    "FittedEdge",
+    "checked_frequency",
+    "edge_result",
+    "fit_edge",
+    "measure_edge",
+    "rising",
+    "rising_line",
+]
 
 Array = NDArray[np.float64]
 # Half width of the spline: so many 10-90% widths of the edge, at least so many px, at most this part of the plateau.
-_CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
+CORE_WIDTHS, _LEAST_CORE, _LARGEST_CORE_SHARE = 4.0, 6.0, 0.7
 # Widest hole between neighbouring sampling phases, px.
 _LARGEST_GAP = 0.3
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
@@ -52,8 +62,11 @@ def measure_edge(
     saturation: float | None = None,
     oversampling: int = 4,
     frequency: ArrayLike | None = None,
+    rounding: tuple[float, float] = (0.0, 0.0),
 ) -> EdgeMtf:
     """MTF of the one edge in a region.
+
+    Of several frames of it see `edge_pages.measure_pages`.
 
     Args:
         region: (H, W) grey values, linear in light.
@@ -63,41 +76,71 @@ def measure_edge(
         saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
         oversampling: knots of the edge-spread function per pixel.
         frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
+        rounding: rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
 
     Raises:
         EdgeError: the region does not show one measurable edge.
         ValueError: oversampling or frequency make no sense.
     """
+    wanted = checked_frequency(frequency, oversampling)
+    if saturation is None and noise is not None:
+        saturation = noise.saturation_dn
+    grey = checked_region(region, saturation)
+    line = locate_edge(grey)
+    up = rising(grey, line)
+    fitted = fit_edge(up, *rising_line(line, up.shape[1]), oversampling)
+    return edge_result(up[None], line, fitted, noise, frames, wanted, rounding)
+
+
+def checked_frequency(frequency: ArrayLike | None, oversampling: int) -> Array:
+    """Frequencies (F,) of `measure_edge`. ValueError if they or the oversampling make no sense."""
     wanted = np.linspace(0.0, 1.0, 65) if frequency is None else np.array(frequency, dtype=np.float64)
     if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0) or wanted[0] < 0:
         raise ValueError("frequency must be at least two increasing values >= 0, in cycles/pixel")
     if not (isinstance(oversampling, int) and 2 <= oversampling <= 16) or wanted[-1] > oversampling / 2:
         raise ValueError(f"oversampling must be an integer of 2 to 16 and at least twice {wanted[-1]:g} cycles/pixel")
-    if saturation is None and noise is not None:
-        saturation = noise.saturation_dn
-    grey = checked_region(region, saturation)
-    line = locate_edge(grey)
-    # from here on the edge is near-vertical and rises to the right
-    rising = grey if line.axis == "x" else grey.T
-    rising = rising if line.sign > 0 else rising[:, ::-1]
-    columns = rising.shape[1]
-    start = line.position if line.sign > 0 else columns - 1 - line.position
-    fitted = _fit_line_and_spread(rising, start, math.tan(line.sign * line.angle), oversampling)
-    return _result(rising, line, fitted, noise, frames, wanted)
+    return wanted
+
+
+def rising(grey: Array, line: EdgeLine) -> Array:
+    """Regions (..., H, W) turned so that the edge is near-vertical and rises to the right."""
+    upright = grey if line.axis == "x" else np.swapaxes(grey, -1, -2)
+    return upright if line.sign > 0 else upright[..., ::-1]
+
+
+def rising_line(line: EdgeLine, columns: int) -> tuple[float, float]:
+    """Column in the middle row and slope of the line in a region so turned."""
+    return line.position if line.sign > 0 else columns - 1 - line.position, math.tan(line.sign * line.angle)
 
 
 @dataclass(frozen=True, eq=False)
-class _Fitted:
-    """Line column = offset + slope * v with v from the middle row (rows,); all pixels by their distance from it."""
+class FittedEdge:
+    """Line column = offset + slope * v with v from the middle row (rows,); all pixels by their distance from it.
+
+    Of P pages with lines of their own these are the means, rows those of all pages, one after the other; jitter is the
+    mean variance of what noise does to a page's line, (P,), px^2.
+    """
 
     offset: float
     slope: float
     along: Array
     design: EdgeDesign
     spread: EdgeSpread
+    jitter: float = 0.0
 
 
-def _fit_line_and_spread(rising: Array, offset: float, slope: float, oversampling: int) -> _Fitted:
+def fit_edge(rising: Array, offset: float, slope: float, oversampling: int) -> FittedEdge:
+    """Line and edge-spread function of a region (H, W) from `rising`.
+
+    Args:
+        rising: grey values.
+        offset: column of the line in the middle row, about.
+        slope: of the line, about.
+        oversampling: knots per pixel.
+
+    Raises:
+        EdgeError: too few sampling phases, or no sharp edge.
+    """
     rows, columns = rising.shape
     along = np.arange(rows) - (rows - 1) / 2.0
     column = np.arange(columns)
@@ -106,8 +149,8 @@ def _fit_line_and_spread(rising: Array, offset: float, slope: float, oversamplin
     for step in range(_LINE_STEPS + 1):
         distance = ((column - offset - slope * along[:, None]) * math.cos(math.atan(slope))).ravel()
         if step == 0:
-            _check_phases(distance, rows, slope)
-            core = _core(distance, grey, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
+            check_phases(distance, rows, slope)
+            core = core_width(distance, grey, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
         last = step == _LINE_STEPS
         # few knots for the line: its slope must not follow the noise
         design = EdgeDesign.of(distance, core, oversampling if last else 2)
@@ -116,7 +159,7 @@ def _fit_line_and_spread(rising: Array, offset: float, slope: float, oversamplin
             parts, normal, near = _line_parts(design, spread, along, columns)
             change = normal @ (parts @ (grey - spread.value(design))[near])
             offset, slope = offset + float(change[0]), slope + float(change[1])
-    return _Fitted(offset, slope, along, design, spread)
+    return FittedEdge(offset, slope, along, design, spread)
 
 
 def _line_parts(
@@ -126,7 +169,7 @@ def _line_parts(
 
     Only pixels in the inner quarter of the core: farther out the fitted slope is mostly noise and would pull the line.
     """
-    close = np.abs(design.x[design.inside]) <= spread.core / _CORE_WIDTHS
+    close = np.abs(design.x[design.inside]) <= spread.core / CORE_WIDTHS
     near = design.inside[close]
     v = along[near // columns]
     fall = -spread.core_slope(design)[close]
@@ -134,7 +177,14 @@ def _line_parts(
     return parts, np.asarray(np.linalg.inv(parts @ parts.T)), near
 
 
-def _check_phases(distance: Array, rows: int, slope: float) -> None:
+def check_phases(distance: Array, rows: int, slope: float) -> None:
+    """EdgeError where the sampling phases leave a wide gap.
+
+    Args:
+        distance: of pixels from the edge, (N,), px.
+        rows: lines that they lie in, for the message.
+        slope: of the edge, likewise.
+    """
     near = np.sort(distance[np.abs(distance) <= 1.5])
     gap = float(np.diff(near).max()) if near.size > 1 else math.inf
     if gap > _LARGEST_GAP:
@@ -146,8 +196,17 @@ def _check_phases(distance: Array, rows: int, slope: float) -> None:
         )
 
 
-def _core(distance: Array, grey: Array, plateau: float) -> float:
-    """Half width of the spline, from the 10-90% width of the edge, px."""
+def core_width(distance: Array, grey: Array, plateau: float) -> float:
+    """Half width of the spline, from the 10-90% width of the edge, px.
+
+    Args:
+        distance: of pixels from the edge, (N,), px.
+        grey: their values, (N,).
+        plateau: that lies beside the edge on both sides, px.
+
+    Raises:
+        EdgeError: the edge is too wide for it.
+    """
     cell = np.round(2.0 * distance).astype(np.intp)
     low = int(cell.min())
     count = np.bincount(cell - low)
@@ -165,17 +224,38 @@ def _core(distance: Array, grey: Array, plateau: float) -> float:
             f"no sharp edge in the region: grey values rise from 10% to 90% over {width:.0f} px, and only "
             f"{plateau:.0f} px lie beside the edge; take a wider region, or one with a single edge between even areas"
         )
-    return min(max(_CORE_WIDTHS * width, _LEAST_CORE), largest)
+    return min(max(CORE_WIDTHS * width, _LEAST_CORE), largest)
 
 
-def _result(
-    rising: Array, line: EdgeLine, fitted: _Fitted, noise: NoiseModel | None, frames: int, frequency: Array
+def edge_result(
+    pages: Array,
+    line: EdgeLine,
+    fitted: FittedEdge,
+    noise: NoiseModel | None,
+    frames: int,
+    frequency: Array,
+    rounding: tuple[float, float],
 ) -> EdgeMtf:
+    """What a fit says, with its sigmas.
+
+    Args:
+        pages: from `rising`, with equal levels, (P, H, W); P is 1 but for pages that are aligned.
+        line: as located; its axis and sign count.
+        fitted: line and edge-spread function of all pages together.
+        noise: as in `measure_edge`.
+        frames: each page is the mean of.
+        frequency: (F,) cycles/pixel.
+        rounding: as in `measure_edge`.
+
+    Raises:
+        EdgeError: there is more than one straight edge.
+    """
     spread, design = fitted.spread, fitted.design
-    grey, columns = rising.ravel(), rising.shape[1]
+    grey, columns = pages.ravel(), pages.shape[2]
     model = spread.value(design)
-    _check_one_edge(rising, model.reshape(rising.shape), spread.contrast, line)
-    variance, dark_variance, bright_variance = _variances(grey, model, design, spread, noise, frames)
+    _check_one_edge((pages - model.reshape(pages.shape)).mean(axis=0), spread.contrast, line)
+    levels = _Levels(pages.shape, grey, model, design, spread)
+    variance, dark_variance, bright_variance = levels.variances(noise, frames, rounding)
     covariance = spread.covariance(design, variance)
     transfer, gradient = spread.transform(frequency)
     modulus = np.abs(transfer)
@@ -193,6 +273,10 @@ def _result(
     cosine = math.cos(math.atan(fitted.slope))
     # A turned line blurs: 1 - mean cos(2 pi f v dslope cosine) = k chi^2 of one degree of freedom, mean square 3 k^2.
     blur = 0.5 * (2.0 * np.pi * frequency * cosine * slope_sigma) ** 2 * float(np.mean(fitted.along**2))
+    # pages that are laid over each other by their noise: an error of one sign, as much up as down by its size
+    jitter = 0.5 * (2.0 * np.pi * frequency) ** 2 * fitted.jitter
+    # one error of the contrast, which the value 1 at frequency 0 does not have
+    level = np.where(frequency > 0.0, math.hypot(*rounding) / spread.contrast, 0.0)
     centre = spread.design(np.zeros(1))
     steep = float(spread.slope(centre)[0])
     shift = (spread.dark + 0.5 * spread.contrast - float(spread.value(centre)[0])) / steep
@@ -212,7 +296,11 @@ def _result(
         transfer=transfer * np.exp(2j * np.pi * frequency * shift),
         sigma_along=along,
         sigma_across=across,
-        sigma=np.sqrt(rice_sigma(signal, along, across) ** 2 + 3.0 * (blur * modulus) ** 2),
+        sigma=np.sqrt(
+            rice_sigma(signal, along, across) ** 2
+            + 3.0 * (blur * modulus) ** 2
+            + (np.hypot(jitter, level) * modulus) ** 2
+        ),
         noise_bias=measured_bias(modulus, across),
         angle=line.sign * math.atan(fitted.slope),
         angle_sigma=slope_sigma * cosine**2,
@@ -233,8 +321,7 @@ def _result(
     )
 
 
-def _check_one_edge(rising: Array, model: Array, contrast: float, line: EdgeLine) -> None:
-    residual = rising - model
+def _check_one_edge(residual: Array, contrast: float, line: EdgeLine) -> None:
     rows, columns = residual.shape[0] // 4, residual.shape[1] // 4
     blocks = np.abs(residual[: 4 * rows, : 4 * columns].reshape(rows, 4, columns, 4).mean(axis=(1, 3)))
     # six sigma: by chance once in 1e6 regions of 64 x 64 px
@@ -251,23 +338,43 @@ def _check_one_edge(rising: Array, model: Array, contrast: float, line: EdgeLine
         )
 
 
-def _variances(
-    grey: Array, model: Array, design: EdgeDesign, spread: EdgeSpread, noise: NoiseModel | None, frames: int
-) -> tuple[Array, float, float]:
-    """Variance of every pixel (N,), and of a dark and a bright one."""
-    levels = np.array([spread.dark, spread.dark + spread.contrast])
-    if noise is not None:
-        dark, bright = noise.temporal_variance_dn2(levels, frames) + noise.fixed_variance_dn2(levels)
-        variance = noise.temporal_variance_dn2(model, frames) + noise.fixed_variance_dn2(model)
+@dataclass(frozen=True, eq=False)
+class _Levels:
+    """Grey values (N,) of pages of this shape and their model, for the noise on both sides of the edge."""
+
+    shape: tuple[int, ...]
+    grey: Array
+    model: Array
+    design: EdgeDesign
+    spread: EdgeSpread
+
+    def variances(
+        self, noise: NoiseModel | None, frames: int, rounding: tuple[float, float]
+    ) -> tuple[Array, float, float]:
+        """Variance of every pixel (N,), and of a dark and a bright one.
+
+        What a pixel has in all pages alike does not average down. A pixel of P pages therefore counts with P times the
+        variance of its mean, as if it had fallen on the same place of the edge in all of them, which it does where
+        pages hardly move; where they do, sigma is rather too large.
+        """
+        count, spread = self.shape[0], self.spread
+        ends = np.array([spread.dark, spread.dark + spread.contrast])
+        if noise is not None:
+            dark, bright = (noise.temporal_variance_dn2(ends, frames * count) + noise.fixed_variance_dn2(ends)) * count
+            variance = noise.temporal_variance_dn2(self.model, frames * count) + noise.fixed_variance_dn2(self.model)
+            return variance * count, float(dark), float(bright)
+        # two levels and a tail are fitted outside of the core: each side gives one degree of freedom and a half away
+        square = np.mean((self.grey - self.model).reshape(count, -1), axis=0) ** 2
+        x, levels = self.design.x.reshape(count, -1), self.model.reshape(count, -1)
+        sides = np.all(x < -spread.core, axis=0), np.all(x > spread.core, axis=0)
+        dark, bright = (
+            max(float(square[side].sum()) / max(np.count_nonzero(side) - 1.5, 1.0), least**2) * count
+            for side, least in zip(sides, rounding, strict=True)
+        )
+        # the tails of diffraction lie between the levels
+        low, high = (float(levels[:, side].mean()) for side in sides)
+        slope = (bright - dark) / (high - low)
+        floor = 0.1 * min(dark, bright)
+        variance = np.maximum(dark + slope * (self.model - low), floor)
+        dark, bright = (max(dark + slope * (level - low), floor) for level in ends)
         return variance, float(dark), float(bright)
-    # two levels and a tail are fitted outside of the core: each side gives one degree of freedom and a half away
-    square = (grey - model) ** 2
-    sides = design.x < -spread.core, design.x > spread.core
-    dark, bright = (float(square[side].sum()) / max(np.count_nonzero(side) - 1.5, 1.0) for side in sides)
-    # the tails of diffraction lie between the levels
-    low, high = (float(model[side].mean()) for side in sides)
-    slope = (bright - dark) / (high - low)
-    floor = 0.1 * min(dark, bright)
-    variance = np.maximum(dark + slope * (model - low), floor)
-    ends = [max(dark + slope * (level - low), floor) for level in levels]
-    return variance, float(ends[0]), float(ends[1])

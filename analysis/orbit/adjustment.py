@@ -7,15 +7,15 @@ open are named, and must be closed by a gauge or by priors.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from analysis.orbit.adjustment_result import Adjustment
 from analysis.orbit.calibration_parameters import (
     CalibrationError,
     CalibrationField,
@@ -25,8 +25,19 @@ from analysis.orbit.calibration_parameters import (
     Unknowns,
     index,
 )
+from analysis.orbit.hidden_terms import HiddenTerms, Unseen
 from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.null_space import Combination, Freedom, Gauge, combinations, free_basis, solved, weak_vectors
+from analysis.orbit.null_space import (
+    WORST,
+    Freedom,
+    Gauge,
+    RankError,
+    combinations,
+    free_basis,
+    solved,
+    weak_vectors,
+)
+from analysis.orbit.plausibility import FarPointsError, NoiseError, check_places, single_ray
 from analysis.orbit.residual_weights import (
     HUBER,
     Robust,
@@ -38,7 +49,7 @@ from analysis.orbit.residual_weights import (
 )
 from analysis.orbit.residual_weights import variance_components as components
 from analysis.orbit.shared_noise import SharedNoise
-from analysis.orbit.three_line_model import DRIFT, LineModel
+from analysis.orbit.three_line_model import LineModel
 
 __all__ = ["Adjustment", "Robust", "adjust"]
 
@@ -52,92 +63,6 @@ _FREE_ROUNDS = 12
 _SETTLED = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class Adjustment:
-    """Solution of a calibration.
-
-    Attributes:
-        names: of the unknowns. values: (P,) metres and radians. covariance: (P, P) from the sigmas as given times
-            `factors`, and of what minimum norm leaves at the start values from `Gauge.start`. Held unknowns count as
-            exact: zero rows.
-        gauge: what was fixed. open: combinations that the gauge closed. weak: combinations of low strength that were
-            solved for all the same.
-        follow: (P, H) change of the values with the start values of the H held unknowns.
-        cameras: with the adjusted interior, in the reference state.
-        ground: field -> (m, 3) adjusted points; NaN for those that robust weights gave up. ground_covariance:
-            field -> (m, 3, 3), likewise.
-        residual: field -> line -> (n, 2) standardised residuals of image points. weight: field -> line -> (n,) robust.
-        chi_square, degrees_of_freedom: weighted, points left out do not count.
-        factors: variance group -> estimated factor (1 where not estimated). redundancy: of each group. Noise that image
-            points share is a group of its own.
-        iterations: Gauss-Newton steps in all.
-    """
-
-    names: tuple[str, ...]
-    values: Array
-    covariance: Array
-    gauge: Gauge
-    open: tuple[Combination, ...]
-    weak: tuple[Combination, ...]
-    follow: Array
-    cameras: Mapping[str, LineModel]
-    ground: Mapping[str, Array]
-    ground_covariance: Mapping[str, Array]
-    residual: Mapping[str, Mapping[str, Array]]
-    weight: Mapping[str, Mapping[str, Array]]
-    chi_square: float
-    degrees_of_freedom: int
-    factors: Mapping[str, float]
-    redundancy: Mapping[str, float]
-    iterations: int
-
-    @property
-    def sigma(self) -> dict[str, float]:
-        """Standard deviation of each unknown; 0 where held."""
-        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
-
-    def sigma_with(self, start: Mapping[str, float]) -> dict[str, float]:
-        """Standard deviation of each unknown where held unknowns are not exact: name -> sigma of its start value.
-
-        Raises CalibrationError for a name that is not held.
-        """
-        given = np.zeros(len(self.gauge.held))
-        for name, sigma in start.items():
-            given[index(self.gauge.held, name)] = sigma
-        hidden = np.sum((self.follow * given) ** 2, axis=1)
-        return dict(zip(self.names, np.sqrt(np.diag(self.covariance) + hidden).tolist(), strict=True))
-
-    @property
-    def correlation(self) -> Array:
-        """(P, P); rows of held unknowns are NaN."""
-        sigma = np.sqrt(np.diag(self.covariance))
-        with np.errstate(invalid="ignore"):
-            return np.asarray(self.covariance / sigma / sigma[:, None])
-
-    @property
-    def p_value(self) -> float:
-        """Chance of such a chi-square or a larger one, if the sigmas are right and no robust weights are on."""
-        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
-
-    def value(self, name: str) -> float:
-        """One unknown. Raises CalibrationError when there is none of that name."""
-        return float(self.values[index(self.names, name)])
-
-    def bias(self, field: str) -> Array:
-        """(3,) roll, pitch, yaw of a field, radians; zero where not solved for."""
-        found = [n if n in self.names else f"{field} {n}" for n in ("roll", "pitch", "yaw")]
-        return np.array([self.value(n) if n in self.names else 0.0 for n in found])
-
-    def cameras_of(self, field: str) -> dict[str, LineModel]:
-        """Cameras in their state during one field: adjusted interior and, where solved for, drift."""
-        found = {}
-        for line, camera in self.cameras.items():
-            names = [f"{field} {line} {n}" for n in DRIFT]
-            drift = names[0] in self.names
-            found[line] = camera.drifted([self.value(n) for n in names]) if drift else camera
-        return found
-
-
 def adjust(
     fields: Sequence[CalibrationField],
     cameras: Mapping[str, LineModel],
@@ -148,7 +73,7 @@ def adjust(
     priors: Sequence[Prior] = (),
     gauge: Gauge | None = None,
     robust: Robust | None = None,
-    variance_components: bool = False,
+    variance_components: bool | Collection[str] = False,
     iterations: int = 20,
 ) -> Adjustment:
     """Adjust everything at once.
@@ -166,11 +91,14 @@ def adjust(
         variance_components: estimate a factor on the variances of "image", "control", each group of priors and, where
             image points share them, "attitude", "slow attitude" and "station", within a hundredth and a hundred. With
             robust weights they come from image points within the limit of "igg", all of full weight, which are found
-            with the noise of the image by the median of its residuals; the robust weights then use these factors.
+            with the noise of the image by the median of its residuals; the robust weights then use these factors. Names
+            of groups: of these alone.
         iterations: most Gauss-Newton steps of one round.
 
     Raises:
         RankError: open combinations that nothing closes.
+        NoiseError: a single image point is more uncertain than all that start values leave open.
+        FarPointsError: points that are not what was photographed, or that contradict each other.
         CalibrationError: other input that cannot be used, fewer observations than unknowns, no convergence.
     """
     noise.check()
@@ -180,15 +108,25 @@ def adjust(
     gauge = gauge or Gauge()
     shared = SharedNoise.of(fields, noise)
     none = np.zeros(sum(len(f.ground) for f in fields), bool)
-    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, none)
+    estimated = None if isinstance(variance_components, bool) else frozenset(variance_components)
+    problem = _Problem(fields, cameras, parameters, noise, shared, tuple(priors), gauge, iterations, none, estimated)
     groups = ("image", "control", *shared.groups, *dict.fromkeys(p.group for p in priors))
     count = sum(len(r.point) for f in fields for r in f.rays.values())
     if 2 * count < len(parameters.names) - len(gauge.held) - len(priors):
         raise CalibrationError(
             f"calibration: {count} image points are too few for {len(parameters.names) - len(gauge.held)} unknowns"
         )
+    check_places(fields, cameras, gauge.start if isinstance(gauge.start, Mapping) else None)
     start_state = State(parameters.start, tuple(f.ground for f in fields), np.zeros(shared.size))
     state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
+    try:
+        return _adjusted(problem, state, robust, bool(variance_components))
+    except RankError as error:
+        raise problem.cause(error) from error
+
+
+def _adjusted(problem: _Problem, state: _Iteration, robust: Robust | None, variance_components: bool) -> Adjustment:
+    """With weights that rest."""
     if robust and variance_components:
         found = _settled(problem, state, _SCREENING)
         found = _settled(found.problem, found.state, _ACCEPTED)
@@ -252,7 +190,8 @@ def _settled(problem: _Problem, state: _Iteration, rule: _Rule) -> _Settled:
         if rule.factor == "median":
             factor["image"] = bounded(factor["image"] * median_factor(standard))
         elif rule.factor == "components":
-            factor, _ = components(equations, covariance, cofactors, old, problem.priors)
+            found, _ = components(equations, covariance, cofactors, old, problem.priors)
+            factor |= {g: v for g, v in found.items() if problem.estimated is None or g in problem.estimated}
             factors.append(factor)
         image = old.image
         if rule.image is not None:
@@ -292,6 +231,7 @@ class _Problem:
     gauge: Gauge
     iterations: int
     lost: NDArray[np.bool_]
+    estimated: frozenset[str] | None = None
 
     @cached_property
     def place(self) -> NDArray[np.intp]:
@@ -318,7 +258,7 @@ class _Problem:
         state = replace(at.state, grounds=tuple(grounds))
         return replace(self, fields=fields, lost=every), replace(at, state=state, weights=weights)
 
-    def equations(self, at: _Iteration) -> Equations:
+    def equations(self, at: _Iteration, hidden: HiddenTerms | None = None) -> Equations:
         return assemble(
             self.fields,
             self.cameras,
@@ -328,18 +268,36 @@ class _Problem:
             self.priors,
             at.weights,
             self.shared,
+            hidden,
         )
+
+    @cached_property
+    def ray(self) -> dict[str, float]:
+        """Source of noise -> of a single image point, metres."""
+        return single_ray(self.fields, self.cameras, self.noise)
 
     def solve(self, state: _Iteration) -> tuple[_Iteration, Equations, Array]:
         """Gauss-Newton with the weights of the state: state, equations there and covariance (P, P)."""
-        scale = self.parameters.scale
         equations = self.equations(state)
-        basis = self.freedom(state, equations).basis
+        try:
+            freedom = self.freedom(state, equations)
+        except RankError as error:
+            lost = int(np.sum(state.weights.image <= _SETTLED))
+            if not lost:
+                raise
+            raise FarPointsError(
+                f"calibration: robust weights give up {lost} of {len(state.weights.image)} image points, and what is"
+                " left does not determine the unknowns: points and images contradict each other"
+            ) from error
+        kept, rows = freedom.kept, freedom.rows
+        pull = rows.T @ rows
         last = np.inf
         for _ in range(self.iterations):
-            normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
-            step = scale * (basis @ solved(normal, -basis.T @ (scale * equations.right)))
-            size = float(np.sqrt(max(float(step @ equations.reduced @ step), 0.0)))
+            total = equations.reduced + pull
+            right = equations.right + pull @ (state.state.values - self.parameters.start)
+            step = np.zeros(len(right))
+            step[kept] = solved(total[np.ix_(kept, kept)], -right[kept])
+            size = float(np.sqrt(max(float(step @ total @ step), 0.0)))
             state = _Iteration(state.state.moved(equations, step), state.weights, state.steps + 1)
             equations = self.equations(state)
             if size < _CONVERGED or (size < 1e3 * _CONVERGED and size > 0.5 * last):
@@ -349,8 +307,9 @@ class _Problem:
             raise CalibrationError(
                 f"calibration: no convergence in {self.iterations} steps, the last of {size:.3g} sigmas"
             )
-        normal = basis.T @ (scale[:, None] * equations.reduced * scale) @ basis
-        spread = scale[:, None] * (basis @ solved(normal, np.eye(len(normal))) @ basis.T) * scale
+        total = (equations.reduced + pull)[np.ix_(kept, kept)]
+        spread = np.zeros(pull.shape)
+        spread[np.ix_(kept, kept)] = solved(total, np.eye(len(kept)))
         return state, equations, 0.5 * (spread + spread.T)
 
     def freedom(self, state: _Iteration, equations: Equations) -> Freedom:
@@ -361,24 +320,46 @@ class _Problem:
         if any(v != 1.0 for v in state.weights.factor.values()):
             given = replace(state.weights, factor=dict.fromkeys(state.weights.factor, 1.0))
             equations = self.equations(replace(state, weights=given))
-        return free_basis(equations.reduced, equations.length, self.parameters.scale, self.parameters.names, self.gauge)
+        names, scale = self.parameters.names, self.parameters.scale
+        # start values that are known by name are knowledge of a launch; one number for all only chooses a solution
+        stated = isinstance(self.gauge.start, Mapping)
+        ray = float(np.linalg.norm(list(self.ray.values()))) if stated else np.inf
+        told = {next(iter(p.weights)): p.sigma for p in self.priors if len(p.weights) == 1}
+        return free_basis(equations.reduced, equations.length, scale, names, self.gauge, ray, told)
 
-    def followed(self, equations: Equations, freedom: Freedom, closed: Array) -> Array:
-        """(P, k) change of the values with start values along `closed` (P, k), in units of `scale`."""
-        scale = self.parameters.scale
-        normal = scale[:, None] * equations.reduced * scale
-        inner = freedom.basis.T @ normal
-        return scale[:, None] * (closed - freedom.basis @ solved(inner @ freedom.basis, inner @ closed))
+    def cause(self, error: RankError) -> CalibrationError:
+        """The error of open combinations, or that of the noise where this leaves them open."""
+        ray = float(np.linalg.norm(list(self.ray.values())))
+        if ray < WORST:
+            return error
+        largest = max(self.ray, key=lambda group: self.ray[group])
+        parts = ", ".join(f"{group} {1e6 * v:.3g}" for group, v in self.ray.items() if v)
+        return NoiseError(
+            f"calibration: noise too large: a single image point is uncertain by {1e6 * ray:.3g} um in the image"
+            f" (one sigma; {parts}), more than what is to be found, {1e6 * WORST:g} um",
+            largest,
+        )
+
+    def followed(self, equations: Equations, covariance: Array, held: Array) -> Array:
+        """(P, k) change of the values with start values of held unknowns, `held` (P, k) columns of ones."""
+        return np.asarray(held - covariance @ (equations.reduced @ held))
 
     def result(self, state: _Iteration, equations: Equations, covariance: Array, robust: Robust | None) -> Adjustment:
         names, scale = self.parameters.names, self.parameters.scale
         freedom = self.freedom(state, equations)
-        vectors = weak_vectors(equations.reduced, equations.length, scale, freedom.basis)
+        rows = freedom.rows
+        vectors = weak_vectors(
+            equations.reduced + rows.T @ rows, equations.length, scale, np.eye(len(names))[:, freedom.kept]
+        )
         cofactors = equations.image_cofactors(covariance)
         standard = standardised(equations, cofactors, state.weights)
         _, redundancy = components(equations, covariance, cofactors, state.weights, self.priors)
         held = np.eye(len(names))[:, [index(names, n) for n in self.gauge.held]]
-        closed = self.followed(equations, freedom, freedom.closed)
+        follow = self.followed(equations, covariance, held)
+        pulled = rows @ covariance
+        spread_all = np.diag(covariance).copy()
+        from_start = np.sum(pulled**2, axis=0) / np.where(spread_all > 0, spread_all, 1.0)
+        covariance_of_points = covariance
         if robust == "huber":
             covariance = covariance + covariance @ _scores(equations, standard, state.weights) @ covariance
         for name in self.cameras:
@@ -393,23 +374,29 @@ class _Problem:
         spreads, lost = np.split(spread, cuts), np.split(self.lost, cuts)
         used = int(np.sum(state.weights.image > 0))
         controls = sum(int(np.sum(f.control & np.any(f.covariance, axis=(1, 2)))) for f in self.fields)
-        known = 2 * used + 3 * controls + len(self.priors)
+        known = 2 * used + 3 * controls + len(self.priors) + len(rows)
         r = equations.residuals
         square = float(
             np.sum(state.weights.image * np.sum(r.image**2, axis=1)) / state.weights.factor["image"]
             + np.sum(r.control**2) / state.weights.factor["control"]
             + np.sum(equations.prior_weight * r.prior**2)
             + sum(v / state.weights.factor[g] for g, v in r.shared.items())
+            + np.sum((rows @ (state.state.values - self.parameters.start)) ** 2)
         )
         parts = self.parameters.parts
+
+        def unseen(terms: HiddenTerms) -> Unseen:
+            return Unseen.of(terms, self.equations(state, terms), covariance_of_points)
+
         return Adjustment(
             names=names,
             values=state.state.values,
-            covariance=covariance + self.gauge.start**2 * closed @ closed.T,
+            covariance=covariance,
             gauge=self.gauge,
             open=freedom.opened,
             weak=combinations(names, scale, vectors, equations.reduced, equations.length),
-            follow=self.followed(equations, freedom, held / scale[:, None]),
+            from_start=from_start,
+            follow=follow,
             cameras={
                 k: c.with_interior(parts(state.state.values, f.name, k, c)[0].interior)
                 for f in self.fields
@@ -424,10 +411,12 @@ class _Problem:
             residual=self._by_line(standard),
             weight=self._by_line(state.weights.image),
             chi_square=square,
-            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - freedom.basis.shape[1],
+            degrees_of_freedom=known - 3 * int(equations.movable.sum()) - len(freedom.kept),
             factors=state.weights.factor,
             redundancy=redundancy,
             iterations=state.steps,
+            fields=self.fields,
+            unseen=unseen,
         )
 
     def _by_line(self, rows: Array) -> dict[str, dict[str, Array]]:

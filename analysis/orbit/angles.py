@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
 from analysis.orbit.planes import PlaneFit, Station, Strip
 
 __all__ = [
@@ -50,7 +51,7 @@ Array = NDArray[np.float64]
 _FOLDED = 3.0
 
 
-class AngleError(ValueError):
+class AngleError(MeasurementError, ValueError):
     """Planes or rays have no angle that could be told."""
 
 

@@ -5,7 +5,7 @@ pitch", "Beijing yaw" for each field, or "roll", "pitch", "yaw" where all fields
 "... across", "... down" for a constant error of the orbit during one field, in the field's mean body axes; "Beijing
 forward d_alpha", "... d_beta", "... d_gamma", "... d_f" for the drift of a camera during one field from its reference
 state, which interior orientation and mounting describe; "roll rate", "pitch rate", "yaw rate" for a drift of the bias
-during every field, rad/s, zero at the mean time of the field's rays.
+during every field, or "Beijing roll rate" and so on during each, rad/s, zero at the mean time of the field's rays.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from analysis.measurement_error import MeasurementError
 from analysis.orbit.three_line_model import BIAS, DRIFT, INTERIOR, LineModel, Rays
 
 __all__ = [
@@ -40,7 +41,7 @@ _SHORTEST = 1e-3  # of f: half a line that is taken to be at least that long
 _FARTHEST = 12e3  # metres: no land is higher, and geodetic coordinates or kilometres are far beyond
 
 
-class CalibrationError(ValueError):
+class CalibrationError(MeasurementError, ValueError):
     """Input of a calibration that cannot be used."""
 
 
@@ -53,12 +54,14 @@ class NoiseTerm:
         kind: what it acts on.
         sigma: of a reading, about each body axis in radians or along each axis in metres.
         interval: of the readings, seconds, that a cubic spline joins; None where each exposure has noise of its own.
+        walks: whether the readings are those of a random walk, of which sigma is what it gains in an interval.
     """
 
     group: str
     kind: Literal["attitude", "station"]
     sigma: float
     interval: float | None
+    walks: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,6 +77,9 @@ class Noise:
             them, so that rays with known times share errors. None: each exposure has its own.
         slow_attitude: of slow errors of the attitude, a cubic spline through independent values every `slow_interval`
             seconds, radians.
+        attitude_walk: of what a random walk of the attitude gains in a second, radians. Its level at the middle of a
+            pass is the bias. It needs the times of the rays.
+        walk_interval: between the values of it that are solved for, seconds.
     """
 
     image: float
@@ -83,6 +89,8 @@ class Noise:
     station_interval: float | None = None
     slow_attitude: float = 0.0
     slow_interval: float | None = None
+    attitude_walk: float = 0.0
+    walk_interval: float = 0.25
 
     @property
     def terms(self) -> tuple[NoiseTerm, ...]:
@@ -91,17 +99,21 @@ class Noise:
             NoiseTerm("attitude", "attitude", self.attitude, self.attitude_interval),
             NoiseTerm("slow attitude", "attitude", self.slow_attitude, self.slow_interval),
             NoiseTerm("station", "station", self.station, self.station_interval),
+            NoiseTerm(
+                "attitude walk", "attitude", self.attitude_walk * self.walk_interval**0.5, self.walk_interval, True
+            ),
         )
         return tuple(t for t in every if t.sigma > 0)
 
     def check(self) -> None:
         """Raises CalibrationError for sigmas and intervals that cannot be used."""
-        sigmas = (self.image, self.attitude, self.station, self.slow_attitude)
+        sigmas = (self.image, self.attitude, self.station, self.slow_attitude, self.attitude_walk)
         if not (np.isfinite(sigmas).all() and self.image > 0 and min(sigmas) >= 0):
             raise CalibrationError(
                 f"calibration: sigmas must be finite, that of the image positive and no other negative, found {self}"
             )
-        intervals = [v for v in (self.attitude_interval, self.station_interval, self.slow_interval) if v is not None]
+        given = (self.attitude_interval, self.station_interval, self.slow_interval, self.walk_interval)
+        intervals = [v for v in given if v is not None]
         if not all(np.isfinite(v) and v > 0 for v in intervals):
             raise CalibrationError(f"calibration: intervals must be finite and positive, found {self}")
 
@@ -229,15 +241,15 @@ class Unknowns:
         offset: constant error of the orbit of each field, or none.
         drift: change of every camera during each field against its reference state, or none. It is open against bias
             and interior unless priors, for example of an on-board monitor, tell it.
-        rate: drift of the bias during the fields, the same in all, or none. It is weak against x and y of the outer
-            lines, which see a field before and after the nadir line, unless priors tell it.
+        rate: drift of the bias during the fields, the same in all or one in each, or none. It is weak against x and y
+            of the outer lines, which see a field before and after the nadir line, unless priors tell it.
     """
 
     interior: bool = True
     bias: Literal["field", "common", "none"] = "field"
     offset: Literal["field", "none"] = "none"
     drift: Literal["field", "none"] = "none"
-    rate: Literal["common", "none"] = "none"
+    rate: Literal["common", "field", "none"] = "none"
 
     def __post_init__(self) -> None:
         """Refuse words that mean nothing: they would count as none."""
@@ -252,7 +264,7 @@ _EXTENT = {
     "bias": ("field", "common", "none"),
     "offset": ("field", "none"),
     "drift": ("field", "none"),
-    "rate": ("common", "none"),
+    "rate": ("common", "field", "none"),
 }
 
 
@@ -297,7 +309,8 @@ class Parameters:
     Attributes:
         names: of the unknowns.
         start: (P,) start values, metres and radians.
-        scale: (P,) the change of each that moves the image by about one metre: 1 for the interior, 1/f rad, range/f m.
+        scale: (P,) the change of each that moves the image by about one metre: 1 for principal points, 1/f rad, range/f
+            m; of f the change that moves the ends of the line by one metre.
         columns: (field, line) -> (indices of f, x, y), (of roll, pitch, yaw), (of along, across, down), (of d_alpha,
             d_beta, d_gamma, d_f), (of the rates of roll, pitch, yaw), -1 if fixed.
         middles: field -> mean time of its rays, seconds, where the bias drifts.
@@ -331,7 +344,10 @@ class Parameters:
         entries: dict[str, tuple[float, float]] = {}
         if unknowns.interior:
             for line, camera in cameras.items():
-                entries |= {f"{line} {n}": (float(v), 1.0) for n, v in zip(INTERIOR, camera.interior, strict=True)}
+                # f moves an image by the tangent of its place in the field
+                units = (float(camera.interior[0]) / _edge(fields, line, camera), 1.0, 1.0)
+                start_values = zip(INTERIOR, camera.interior, units, strict=True)
+                entries |= {f"{line} {n}": (float(v), s) for n, v, s in start_values}
         if unknowns.bias == "common":
             entries |= dict.fromkeys(BIAS, (0.0, 1.0 / focal))
         for one in fields:
@@ -354,6 +370,12 @@ class Parameters:
             middles = {one.name: _middle(one) for one in fields}
             spans = [np.ptp(np.concatenate([r.time for r in f.rays.values() if r.time is not None])) for f in fields]
             entries |= dict.fromkeys(RATE, (0.0, 2.0 / (focal * max(float(np.max(spans)), _SHORTEST))))
+        if unknowns.rate == "field":
+            middles = {one.name: _middle(one) for one in fields}
+            for one in fields:
+                span = np.ptp(np.concatenate([r.time for r in one.rays.values() if r.time is not None]))
+                size = 2.0 / (focal * max(float(span), _SHORTEST))
+                entries |= {f"{one.name} {n}": (0.0, size) for n in RATE}
         if not entries:
             raise CalibrationError("calibration: nothing to solve for")
         names = tuple(entries)
@@ -371,7 +393,7 @@ class Parameters:
                     [n if unknowns.bias == "common" else f"{one.name} {n}" for n in BIAS],
                     [f"{one.name} offset {n}" for n in OFFSET],
                     [f"{one.name} {line} {n}" for n in DRIFT],
-                    RATE,
+                    [n if unknowns.rate == "common" else f"{one.name} {n}" for n in RATE],
                 )
                 inner, turn, shift, drift, rate = (np.array([where.get(n, -1) for n in g]) for g in groups)
                 columns[one.name, line] = (inner, turn, shift, drift, rate)
@@ -411,6 +433,12 @@ class Parameters:
         bias, offset = (values[c] if c[0] >= 0 else np.zeros(3) for c in (turn, shift))
         camera = camera.with_interior(values[inner]) if inner[0] >= 0 else camera
         return (camera.drifted(values[drift]) if drift[0] >= 0 else camera), bias, offset
+
+
+def _edge(fields: Sequence[CalibrationField], line: str, camera: LineModel) -> float:
+    """How far the ends of a line, or the outermost of its image points, lie from its middle, metres."""
+    places = [float(np.abs(f.rays[line].image[:, 1]).max(initial=0.0)) for f in fields if line in f.rays]
+    return max(camera.half_length, *places, _SHORTEST * float(camera.interior[0]))
 
 
 def _middle(one: CalibrationField) -> float:

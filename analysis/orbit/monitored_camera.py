@@ -20,6 +20,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = ["CalibratedLine", "IntersectionError", "Sightings", "StereoPoints", "between", "intersect_pair"]
 
 Array = NDArray[np.float64]
@@ -27,7 +29,7 @@ _PARALLEL = 3e-4
 """Radians; two rays at less than one arc minute do not meet."""
 
 
-class IntersectionError(ValueError):
+class IntersectionError(MeasurementError, ValueError):
     """Points cannot be intersected."""
 
 

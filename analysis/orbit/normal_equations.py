@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,9 @@ from scipy.sparse.linalg import splu
 
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters, Prior, index
 from analysis.orbit.shared_noise import SharedNoise, ray_covariance
-from analysis.orbit.three_line_model import LineModel, misclosure, partials
+from analysis.orbit.three_line_model import LineModel, Partials, Rays, misclosure, partials
 
-__all__ = ["Equations", "Residuals", "State", "Weights", "assemble"]
+__all__ = ["Equations", "Hidden", "Residuals", "State", "Weights", "assemble"]
 
 Array = NDArray[np.float64]
 _CHUNK = 512
@@ -189,12 +190,15 @@ def assemble(
     priors: Sequence[Prior],
     weights: Weights,
     shared: SharedNoise,
+    hidden: Hidden | None = None,
 ) -> Equations:
     """Linearise at a state.
 
-    Image rows run by field, line and ray, x before y; points and shared unknowns by field.
+    Image rows run by field, line and ray, x before y; points and shared unknowns by field. `hidden` terms, zero at this
+    state, are unknowns after those of the parameters.
     """
-    count = len(state.values)
+    known = len(state.values)
+    count = known + (0 if hidden is None else hidden.size)
     rows, points, misses, places, shares = [], [], [], [], []
     spans: list[list[tuple[int, int]]] = [[], []]
     first = row = 0
@@ -213,6 +217,8 @@ def assemble(
             for where, part in zip(parameters.columns[one.name, line], parts, strict=True):
                 if where[0] >= 0:
                     block[:, :, where] = part
+            if hidden is not None:
+                block[:, :, known:] = hidden.columns(one, line, rays, by)
             rows.append(sparse.csr_matrix((white @ block).reshape(2 * len(block), count)))
             shares.append(shared.rows(one.name, line, white, by))
             points.append(white @ by.ground)
@@ -230,7 +236,27 @@ def assemble(
         np.concatenate(places),
         (tuple(spans[0]), tuple(spans[1])),
     )
-    return _reduce(fields, state, found, _priors(parameters, state.values, priors, weights), weights, shared)
+    design, residual, weight = _priors(parameters, state.values, priors, weights)
+    design = np.pad(design, ((0, 0), (0, count - known)))
+    return _reduce(fields, state, found, (design, residual, weight), weights, shared)
+
+
+class Hidden(Protocol):
+    """Terms that the model leaves out."""
+
+    @property
+    def size(self) -> int:
+        """How many."""
+
+    def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
+        """(n, 2, size) change of the misclosures with each of them.
+
+        Args:
+            field: the pass.
+            line: of the camera.
+            rays: n image points of it.
+            by: derivatives of their misclosures.
+        """
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,12 +1,13 @@
 """Which combinations of calibration unknowns the points leave open, by name, and the gauge that closes them.
 
-Unknowns are counted in metres of image motion (`scale`), so that a combination of any of them has one natural size.
-The normal matrix N carries the a-priori sigmas of the measurements; in these units the eigenvectors of N are
-combinations that are uncorrelated, each known to 1 / sqrt(eigenvalue) metres. A combination is open when that sigma is
-above `WORST`, more than a calibration starts with: the data say less of it than the start values do. The space of open
-combinations depends on neither units nor order nor on which combinations of the unknowns are chosen as unknowns, and
-all that is square to it is known to `WORST` or better. Misfit does not open anything: estimated variance factors do not
-count here.
+Unknowns are counted in sigmas of their start values: what a launch may change, or `WORST` metres of image motion
+(`scale`; of a principal distance at the ends of the line, where it moves the image most). The normal matrix N carries
+the a-priori sigmas of the measurements; in these units the eigenvectors of N are combinations that are uncorrelated,
+each known to 1 / sqrt(eigenvalue). A combination is open when that is above 1: the data say less of it than the start
+values do. The space of open combinations depends on neither units nor order nor on which combinations of the unknowns
+are chosen as unknowns, and all that is square to it is known better than at the start. Misfit does not open anything:
+estimated variance factors do not count here. Start values with sigmas then are observations of the open combinations,
+and of nothing else; what the points tell is left to the points.
 
 The strength of a combination compares the reduced system with the lengths its columns had before the ground points were
 eliminated: at a strength s it is known 1/s times less well than its unknowns alone. What is solved for with a strength
@@ -24,7 +25,7 @@ below `WEAK` is reported. What opens in a three-line camera:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,11 @@ Array = NDArray[np.float64]
 # Image motion: 15 px of 6.5 um, 32 arcsec, 75 m on the ground, as without any calibration (paper 003: 100 m class). A
 # camera that is mounted askew by one arc minute lets the pitch be seen, but to 400 px with sixty points of 0.3 px.
 WORST = 1e-4
+# Of the noise of a single image point: a combination that may move the image by so much without the points' noticing is
+# none of theirs, whatever start values say of it. Six points over the width of a field leave 500 times or less.
+LOST = 3e3
 WEAK = 3e-2
+_CLOSED = 10.0
 _SHOWN = 1e-2
 _ANGLES = (*BIAS, *DRIFT[:3], "rate")
 
@@ -85,19 +90,36 @@ class Gauge:
 
     Attributes:
         held: unknowns that keep their start values, for example ("nadir x",).
-        minimum_norm: open combinations, and nothing else, keep their start values.
-        start: sigma of the start values along those, metres of image motion.
+        start: sigmas of the start values, which observe open combinations and nothing else: by name, metres or radians,
+            or one for all, metres of image motion. None: nothing closes what the points leave open.
     """
 
     held: tuple[str, ...] = ()
-    minimum_norm: bool = False
-    start: float = WORST
+    start: Mapping[str, float] | float | None = None
 
     def __str__(self) -> str:
         held = f"held at the start values: {', '.join(self.held)}" if self.held else ""
-        norm = f"open combinations keep their start values, to {self.start:g} m of image motion"
-        norm = norm if self.minimum_norm else ""
-        return "; ".join(t for t in (held, norm) if t) or "none"
+        sure = "to what is stated of them"
+        if isinstance(self.start, float):
+            sure = f"to {self.start:g} m of image motion"
+        start = "" if self.start is None else f"open combinations keep their start values, {sure}"
+        return "; ".join(t for t in (held, start) if t) or "none"
+
+    def sigmas(self, names: Sequence[str], scale: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """(P,) sigmas of the start values, SI, `WORST` of image motion where none is stated; (P,) whether it is.
+
+        Raises CalibrationError for one that is not positive.
+        """
+        if self.start is None:
+            return WORST * scale, np.zeros(len(names), bool)
+        if isinstance(self.start, Mapping):
+            given = np.array([self.start.get(n, np.nan) for n in names])
+        else:
+            given = self.start * scale
+        stated = ~np.isnan(given)
+        if not np.all(np.isfinite(given[stated]) & (given[stated] > 0)):
+            raise CalibrationError(f"calibration: sigmas of start values must be positive, found {self.start}")
+        return np.where(stated, given, WORST * scale), stated
 
 
 class RankError(CalibrationError):
@@ -113,30 +135,30 @@ class RankError(CalibrationError):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """What a gauge lets an adjustment solve for, in metres of image motion (units of `scale`).
+    """What a gauge lets an adjustment solve for.
 
     Attributes:
-        basis: (P, R) orthonormal, what may be solved for.
-        closed: (P, k) orthonormal, open combinations that keep their start values.
+        kept: (R,) unknowns that are solved for.
+        rows: (k, P) what the start values observe: rows @ (unknowns - start) is zero to a standard deviation of 1.
         opened: the open combinations before the gauge.
     """
 
-    basis: Array
-    closed: Array
+    kept: NDArray[np.intp]
+    rows: Array
     opened: tuple[Combination, ...]
 
 
-def null_vectors(reduced: Array, scale: Array) -> Array:
-    """(P, k) orthonormal basis of what is open, in units of `scale`.
+def null_vectors(reduced: Array, sigma: Array) -> Array:
+    """(P, k) orthonormal basis of what is open, in units of `sigma`.
 
     Args:
         reduced: (P, P) normal matrix, of the a-priori sigmas.
-        scale: (P,) change of each unknown that moves the image by one metre.
+        sigma: (P,) of the start values.
     """
-    values, vectors = eigh(scale[:, None] * reduced * scale)
+    values, vectors = eigh(sigma[:, None] * reduced * sigma)
     # an eigenvalue below the rounding of the largest one is no information
     rounding = len(values) * np.finfo(np.float64).eps * max(float(values[-1]), 0.0)
-    return np.asarray(vectors[:, values < max(WORST**-2, rounding)])
+    return np.asarray(vectors[:, values < max(1.0, rounding)])
 
 
 def weak_vectors(reduced: Array, length: Array, scale: Array, basis: Array) -> Array:
@@ -176,14 +198,22 @@ def combinations(
             Combination(
                 tuple(names[i] for i in taking.tolist()),
                 1e-3 * change[taking],
-                form / float(np.linalg.norm(change * length)),
+                form / max(float(np.linalg.norm(change * length)), 1e-300),
                 1.0 / max(form, 1e-300),
             )
         )
     return tuple(found)
 
 
-def free_basis(reduced: Array, length: Array, scale: Array, names: Sequence[str], gauge: Gauge | None) -> Freedom:
+def free_basis(
+    reduced: Array,
+    length: Array,
+    scale: Array,
+    names: Sequence[str],
+    gauge: Gauge | None,
+    ray: float = np.inf,
+    told: Mapping[str, float] | None = None,
+) -> Freedom:
     """What may be solved for. `reduced` (P, P) is of the a-priori sigmas.
 
     Args:
@@ -192,29 +222,51 @@ def free_basis(reduced: Array, length: Array, scale: Array, names: Sequence[str]
         scale: units of the unknowns, (P,), SI.
         names: of the P unknowns.
         gauge: what closes open combinations, None for nothing.
+        ray: standard deviation of a single image point, metres, for `LOST`.
+        told: unknowns without a stated start value that have priors of their own, with the sigmas of these.
 
     Raises:
-        RankError: open combinations that the gauge does not close.
-        CalibrationError: a held unknown that does not exist, a gauge whose start sigma is not positive.
+        RankError: open combinations that the gauge does not close, or that may move the image by `LOST` times the noise
+            of a single image point; points that tell nothing at all.
+        CalibrationError: a held unknown that does not exist, a start value whose sigma is not positive.
     """
     gauge = gauge or Gauge()
-    if not (np.isfinite(gauge.start) and gauge.start > 0):
-        raise CalibrationError(f"calibration: sigma of the gauge's start values must be positive, found {gauge.start}")
-    opened = combinations(names, scale, null_vectors(reduced, scale), reduced, length)
-    kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in gauge.held]).tolist()
-    basis = np.eye(len(names))[:, kept]
-    within = reduced[np.ix_(kept, kept)]
-    inside = null_vectors(within, scale[kept])
-    if inside.shape[1] and not gauge.minimum_norm:
-        still = combinations([names[i] for i in kept], scale[kept], inside, within, length[kept])
-        text = "; ".join(str(c) for c in still)
-        raise RankError(
-            f"calibration: the points cannot tell: {text}. Gauge: {gauge}. Hold or weight some of these", still
-        )
+    sigma, stated = gauge.sigmas(names, scale)
+    if np.any(stated):
+        # counted so that their own priors in `reduced` close them
+        own_prior = np.array([_CLOSED * (told or {}).get(n, np.nan) for n in names])
+        sigma = np.where(stated | np.isnan(own_prior), sigma, own_prior)
+    opened = combinations(names, scale, _in_scale(null_vectors(reduced, sigma), sigma, scale), reduced, length)
+    kept = np.setdiff1d(np.arange(len(names)), [index(names, n) for n in gauge.held])
+    within, own = reduced[np.ix_(kept, kept)], sigma[kept]
+    inside = null_vectors(within, own)
+    # a row says nothing of unknowns whose start values nobody knows
+    rows = np.where(stated[kept], inside.T / own, 0.0)
+    # what start values close has an eigenvalue of 1 or more then
+    checks = [(within + rows.T @ rows, np.where(stated[kept], np.sqrt(2.0), 1.0) * own)]
+    if np.any(stated) and np.isfinite(ray):
+        checks.append((within, LOST * ray * scale[kept]))
+    for matrix, units in checks:
+        vectors = null_vectors(matrix, units)
+        if vectors.shape[1]:
+            if matrix is within:
+                vectors, units = inside, own  # all that is open, of which some is lost
+            shown = _in_scale(vectors, units, scale[kept])
+            found = combinations([names[i] for i in kept.tolist()], scale[kept], shown, within, length[kept])
+            text = "; ".join(str(c) for c in found)
+            raise RankError(
+                f"calibration: the points cannot tell: {text}. Gauge: {gauge}. Hold or weight some of these", found
+            )
     if inside.shape[1] == len(kept):
         raise RankError("calibration: the points determine none of the unknowns", opened)
-    full = np.linalg.qr(inside, mode="complete")[0]
-    return Freedom(basis @ full[:, inside.shape[1] :], basis @ inside, opened)
+    padded = np.zeros((len(rows), len(names)))
+    padded[:, kept] = rows
+    return Freedom(kept, padded, opened)
+
+
+def _in_scale(vectors: Array, sigma: Array, scale: Array) -> Array:
+    """(P, k) combinations in units of `sigma` (P,) as vectors in units of `scale` (P,)."""
+    return np.asarray(vectors * (sigma / scale)[:, None])
 
 
 def solved(normal: Array, right: Array) -> Array:

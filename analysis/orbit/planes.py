@@ -28,6 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = ["METHODS", "Method", "NearVerticalWarning", "PlaneError", "PlaneFit", "Station", "Strip", "fit_plane"]
 
 Array = NDArray[np.float64]
@@ -42,7 +44,7 @@ _BIAS, _ATTENUATION = 0.1, 0.01
 _SINGULAR = 1e15
 
 
-class PlaneError(ValueError):
+class PlaneError(MeasurementError, ValueError):
     """The points do not determine the plane, or not in the form that was asked for."""
 
 

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from analysis.measurement_error import MeasurementError
 from analysis.orbit.planes import Station, Strip
 
 __all__ = ["ObservedLine", "Resection", "ResectionError", "resect"]
@@ -43,7 +44,7 @@ _RANK = 1e-9
 _CONVERGED = 1e-6
 
 
-class ResectionError(ValueError):
+class ResectionError(MeasurementError, ValueError):
     """The points do not determine the unknowns. null_vectors: (k, P) combinations that move no image point."""
 
     def __init__(self, message: str, null_vectors: Array | None = None) -> None:

@@ -22,7 +22,7 @@ from scipy import sparse
 from scipy.linalg import toeplitz
 from scipy.spatial.transform import Rotation
 
-from analysis.orbit.calibration_parameters import CalibrationField, Noise, NoiseTerm
+from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, NoiseTerm
 from analysis.orbit.three_line_model import Partials, Rays
 
 __all__ = ["Series", "SharedNoise", "ray_covariance", "reading_variance"]
@@ -55,7 +55,12 @@ def ray_covariance(noise: Noise, rays: Rays, by: Partials, *, shared: bool) -> A
     for term in noise.terms:
         part = {"attitude": by.attitude, "station": by.ground}[term.kind]
         variance = np.full(len(rays.point), term.sigma**2)
-        if term.interval is not None and rays.time is not None:
+        if term.walks:
+            if rays.time is None:
+                raise CalibrationError("calibration: a random walk of the attitude needs the times of all rays")
+            since = np.abs(rays.time - np.mean(rays.time)) if len(rays.time) else rays.time
+            variance = variance * since / (term.interval or 1.0) * shared
+        elif term.interval is not None and rays.time is not None:
             variance = variance * (reading_variance(rays.time, term.interval) if shared else 0.0)
         spread = spread + variance[:, None, None] * (part @ np.swapaxes(part, 1, 2))
     return np.asarray(spread)
@@ -224,6 +229,9 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
         return None
     found = {line: _blend(time, term.interval) for line, time in timed.items()}
     used = np.unique(np.concatenate([first[:, None] + np.arange(_NEEDED) for first, _ in found.values()]))
+    if term.walks:
+        places = {line: np.searchsorted(used, first) for line, (first, _) in found.items()}
+        return Series(term, column, used, _walk_precision(used), places, {k: b for k, (_, b) in found.items()})
     steps = np.diff(used)
     filled = [np.arange(a, a + s) for a, s in zip(used[:-1], np.where(steps < _GAP, steps, 1), strict=True)]
     numbers = np.concatenate([*filled, used[-1:]])
@@ -232,6 +240,17 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
     places = {line: np.searchsorted(numbers, first) for line, (first, _) in found.items()}
     blends = {line: blend for line, (_, blend) in found.items()}
     return Series(term, column, numbers, sparse.csr_matrix(precision), places, blends)
+
+
+def _walk_precision(numbers: NDArray[np.intp]) -> sparse.csr_matrix:
+    """Of a random walk at whole numbers (k,), rising, that gains a variance of 1 from one to the next; the middle one,
+    whose level the bias has, is known to as much.
+    """
+    count = len(numbers)
+    steps = sparse.diags([-1.0, 1.0], [0, 1], shape=(count - 1, count))
+    precision = steps.T @ sparse.diags(1.0 / np.diff(numbers)) @ steps
+    middle = int(np.argmin(np.abs(numbers - np.mean(numbers))))
+    return sparse.csr_matrix(precision + sparse.csr_matrix(([1.0], ([middle], [middle])), shape=(count, count)))
 
 
 def _blend(time: Array, interval: float) -> tuple[NDArray[np.intp], Array]:

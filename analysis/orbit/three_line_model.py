@@ -28,6 +28,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import UndeterminedError
+
 __all__ = [
     "BIAS",
     "DRIFT",
@@ -58,6 +60,8 @@ class LineModel:
         position: (3,) projection centre in the body frame, metres.
         k1, k2: radial distortion, 1/m^2 and 1/m^4.
         drift: (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres) against that state; zero in the reference state.
+        half_length: metres from the middle of the line to its ends, where a change of f moves the image most; 0 where
+            it is not known.
     """
 
     to_body: Array
@@ -66,14 +70,22 @@ class LineModel:
     k1: float = 0.0
     k2: float = 0.0
     drift: Array = field(default_factory=lambda: np.zeros(4))
+    half_length: float = 0.0
 
     @classmethod
     def of(
-        cls, to_body: ArrayLike, interior: ArrayLike, position: ArrayLike = (0, 0, 0), k1: float = 0.0, k2: float = 0.0
+        cls,
+        to_body: ArrayLike,
+        interior: ArrayLike,
+        position: ArrayLike = (0, 0, 0),
+        k1: float = 0.0,
+        k2: float = 0.0,
+        half_length: float = 0.0,
     ) -> LineModel:
         """The model, checked.
 
-        Raises ValueError for shapes, values that are not finite, f <= 0 and a to_body that is no rotation.
+        Raises ValueError for shapes, values that are not finite, f <= 0, a to_body that is no rotation, a length
+        below zero.
 
         Args:
             to_body: rotation from the camera's axes to the body's, (3, 3).
@@ -81,15 +93,21 @@ class LineModel:
             position: projection centre in the body frame, (3,), metres.
             k1: radial distortion, 1/m^2.
             k2: likewise, 1/m^4.
+            half_length: from the middle of the line to its ends, metres; 0 where it is not known.
         """
         turn, inner, place = (np.array(v, np.float64) for v in (to_body, interior, position))
         if turn.shape != (3, 3) or inner.shape != (3,) or place.shape != (3,):
             raise ValueError("line model: to_body must be (3, 3), interior and position (3,)")
-        if not np.all(np.isfinite(np.concatenate([turn.ravel(), inner, place, [k1, k2]]))) or inner[0] <= 0:
+        if (
+            not np.all(np.isfinite(np.concatenate([turn.ravel(), inner, place, [k1, k2, half_length]])))
+            or inner[0] <= 0
+        ):
             raise ValueError("line model: all numbers must be finite and f positive")
+        if half_length < 0:
+            raise ValueError("line model: half the length of a line is not below zero")
         if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-9) and np.linalg.det(turn) > 0):
             raise ValueError("line model: to_body must be a rotation")
-        return cls(turn, inner, place, float(k1), float(k2))
+        return cls(turn, inner, place, float(k1), float(k2), half_length=float(half_length))
 
     def with_interior(self, interior: ArrayLike) -> LineModel:
         """The same camera with another f, x0, y0."""
@@ -255,7 +273,7 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     mounted = (q @ turn - camera.position) @ camera.to_body
     a, b, c = (mounted @ camera._turned()).T
     if np.any(c <= 0):
-        raise ValueError("three-line model: a ground point lies behind a camera")
+        raise UndeterminedError("three-line model: a ground point lies behind a camera")
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
     square = x * x + y * y
     grown = 1.0 + square * (camera.k1 + camera.k2 * square)

@@ -34,6 +34,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.measurement_error import MeasurementError
 from analysis.monitor.model_fit import RankError
 
 __all__ = [
@@ -66,7 +67,7 @@ _WIDEST = np.pi / 4
 _SINGULAR = 1e-9
 
 
-class OrientationError(ValueError):
+class OrientationError(MeasurementError, ValueError):
     """The readings do not determine what is asked for; the message says what to change."""
 
 
@@ -160,7 +161,7 @@ def principal_distance_and_point(position: ArrayLike, angle: ArrayLike) -> tuple
 
 
 def principal_distance(position: ArrayLike, angle: ArrayLike) -> Array:
-    """Principal distance f (...), m, with p = 0: paper 004, eq. (3).
+    """Balanced principal distance f (...), m, which leaves the smallest distortion with p = 0: paper 004, eq. (3).
 
     position, angle: (..., N) m, rad. Raises OrientationError for bad readings, angles that are all zero, and angles
     that count against the positions.

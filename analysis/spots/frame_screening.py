@@ -12,7 +12,7 @@ once in 1 / FALSE_ALARM.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +20,20 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.stats import chi2, norm
 
+from analysis.measurement_error import MeasurementError
+from analysis.spots import rounding
 from analysis.spots.centroid import mean_frames
 from analysis.spots.noise import NoiseModel
 
-__all__ = ["FALSE_ALARM", "Finding", "FramesError", "ScreenedFrames", "screen_frames"]
+__all__ = [
+    "FALSE_ALARM",
+    "Finding",
+    "FramesError",
+    "ScreenedFrames",
+    "noise_ratio",
+    "screen_frames",
+    "shown_noise",
+]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,19 +49,21 @@ _FEWEST_UNLIKE = 40
 _BORDER_PX = 4
 _SATURATION_SIGMAS = 4.0
 _LEAST_SHARE, _UNKNOWN, _LEAST_DRIFT_DN = 1e-3, 1e12, 0.5
+_ROUNDS = 20
+"""In which the cut-off of differences follows the noise that is found."""
 _MOST_MOVES, _SMALL_PX, _LARGEST_PX = 4, 0.1, 5.0
 """A frame that has moved by more than the second is compared with the reference there, so often at most, up to the
 third."""
 _NOISE_OFF, _MOST_SIGMAS = 0.15, 4.0
 """By which the noise of frames may differ from the stated one, as a share of that; and where single differences are cut
-off, for cosmic rays."""
+off, in standard deviations, for cosmic rays."""
 _LIT = 0.02
 """Share of the peak from which a pixel is in the light, where movement and smear look like noise."""
 _MEDIAN = math.pi / 2.0
 """Variance of a median over that of a mean, of many normal numbers."""
 
 
-class FramesError(ValueError):
+class FramesError(MeasurementError, ValueError):
     """Frames that cannot be used.
 
     Attributes:
@@ -90,8 +102,6 @@ class ScreenedFrames:
         recorded: number of frames that there are.
         jitter: (2, 2) px^2, covariance of the spot's place over the frames beyond noise; zeros where none is seen.
         findings: what was found.
-        noise_ratio: noise of the frames beside the spot over what was stated; None where they do not differ by more
-            than matters, or where a single frame says nothing of it.
     """
 
     mean: Array
@@ -101,7 +111,6 @@ class ScreenedFrames:
     recorded: int
     jitter: Array
     findings: tuple[Finding, ...]
-    noise_ratio: float | None = None
 
     @property
     def clean(self) -> bool:
@@ -132,7 +141,6 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
     values = np.where(finite, values, 0.0)
     kept = _lit(values, finite & ~known, findings)
     hits = ~finite
-    ratio = None
     model = np.zeros_like(values)
     jitter = np.zeros((2, 2))
     if len(kept) > 1:
@@ -153,7 +161,6 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
             model[kept] = found.model
             findings += found.findings()
             jitter = found.jitter
-            ratio = found.noise_ratio
     saturated = _saturated(values[kept], noise) & ~known
     if np.any(saturated):
         findings.append(
@@ -171,7 +178,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
         mean = mean_frames(frames)
     else:
         mean = np.where(lost, model[kept], used).mean(axis=0)
-    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings), ratio)
+    return ScreenedFrames(mean, np.maximum(counts, 1.0), good, len(kept), len(values), jitter, tuple(findings))
 
 
 def _numbers(frames: NDArray[np.intp]) -> str:
@@ -217,7 +224,6 @@ class _Compared:
     offset: Array
     spread: Array
     jitter: Array
-    noise_ratio: float | None
 
     def unlike(self) -> Mask:
         """Which frames as a whole."""
@@ -261,7 +267,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     # of a median the same for all frames that have not moved
     still = _basis(reference[0]) if count > 2 else None
     for k, frame in enumerate(values):
-        weight = usable[k] / (excess * noise.temporal_variance_dn2(reference[k], 1))
+        weight = usable[k] / (excess * noise.frame_variance_dn2(reference[k]))
         place = np.zeros(2)
         for _ in range(_MOST_MOVES):
             if np.any(place):
@@ -276,7 +282,7 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
                 break
             place = place + further
         model[k] = np.tensordot(solution, basis, 1)
-        sigma = np.sqrt(excess * noise.temporal_variance_dn2(model[k], 1))
+        sigma = np.sqrt(excess * noise.frame_variance_dn2(model[k]))
         z[k] = np.where(usable[k], (frame - model[k]) / sigma, 0.0)
         light[k], level[k], sigmas[k] = solution[0], solution[-1], math.sqrt(max(float(inverse[-1, -1]), 0.0))
         # a spot that has moved by d is its reference minus d times the slope
@@ -287,29 +293,75 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     for k in range(count):
         hits[k] = _grown(struck[k], np.abs(z[k]) > GROWTH_SIGMAS)
     moved = _jitter(offset, spread, count)
-    ratio = _noise_ratio(z * math.sqrt(excess), usable, model.mean(axis=0))
-    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, moved, ratio)
+    return _Compared(model, hits, light, level, float(sigmas.max()), offset, spread, moved)
 
 
-def _noise_ratio(z: Array, usable: Mask, mean: Array) -> float | None:
-    """Noise of frames beside the spot over the stated one, by the differences of each to the next, of which the
-    reference is no part; None where they agree. Of two frames each is the other's reference, and their residuals differ
-    by twice as much.
+def noise_ratio(
+    frames: NDArray[Any], noise: NoiseModel, usable: Mask | None = None, where: Mask | None = None
+) -> float | None:
+    """Noise of frames that hold the light, beside the spot, over the stated one, by the differences of each to the
+    next; None where they agree, and where frames cannot show it.
+
+    Every pair of frames has a say, and the middle one counts, lest one spoilt frame is taken for noise.
 
     Args:
-        z: (N, H, W) residuals in standard deviations of one frame.
-        usable: (N, H, W) pixels.
-        mean: (H, W) DN, of the models.
+        frames: (N, H, W) grey values of one state.
+        noise: of the detector, as stated.
+        usable: (N, H, W) pixels that are good; None for all.
+        where: (H, W) pixels to look at; None for those beside the spot.
     """
-    difference = np.diff(z, axis=0) / (math.sqrt(2.0) if len(z) > 2 else 2.0 * math.sqrt(2.0))
-    low = float(np.median(mean))
-    chosen = difference[usable[1:] & usable[:-1] & (mean < low + _LIT * (float(mean.max()) - low))]
-    if not chosen.size:
+    values = np.asarray(frames, dtype=np.float64)
+    good = np.ones(values.shape, dtype=bool) if usable is None else usable
+    try:
+        kept = _lit(values, good, [])
+    except FramesError:
         return None
-    ratio = math.sqrt(max(float(np.minimum(chosen**2, _MOST_SIGMAS**2).mean()), 1e-12))
-    # neighbouring differences share a frame: half as much again in the variance
-    sigma = math.sqrt(1.5 / (2.0 * chosen.size))
-    return ratio if max(ratio, 1.0 / ratio) > 1.0 + max(_NOISE_OFF, 6.0 * sigma) else None
+    values, good = values[kept], good[kept]
+    if len(values) < 2:
+        return None
+    middle = np.median(values, axis=0)
+    low = float(np.median(middle))
+    if noise.frame_variance_dn2(low) < rounding.SHOWN**2 + rounding.WHOLE:
+        # frames show what rounding makes of it, more or less, as pixels stand between two steps
+        return None
+    beside = middle < low + _LIT * (float(middle.max()) - low) if where is None else where
+    sigma = np.sqrt(2.0 * noise.frame_variance_dn2(middle))
+    squares, fewest = [], values[0].size
+    for k in range(1, len(values)):
+        chosen = beside & good[k] & good[k - 1]
+        if not np.any(chosen):
+            continue
+        difference = (values[k] - values[k - 1])[chosen]
+        z2 = ((difference - np.median(difference)) / sigma[chosen]) ** 2
+        square = 1.0
+        for _ in range(_ROUNDS):
+            before, square = square, max(float(np.minimum(z2, _MOST_SIGMAS**2 * square).mean()), 1e-12)
+            # noise that is not more than stated is told at once
+            if square < (1.0 + _NOISE_OFF) ** 2 or square < 1.001 * before:
+                break
+        squares.append(square)
+        fewest = min(fewest, z2.size)
+    if not squares:
+        return None
+    ratio = math.sqrt(float(np.median(squares)))
+    spread = math.sqrt(1.5 / (2.0 * fewest))
+    return ratio if max(ratio, 1.0 / ratio) > 1.0 + max(_NOISE_OFF, 6.0 * spread) else None
+
+
+def shown_noise(frames: NDArray[Any], noise: NoiseModel, ratio: float | None) -> NoiseModel:
+    """The detector with the noise that its frames show, where that is more than stated: what is more is taken for read
+    noise.
+
+    Args:
+        frames: (N, H, W) grey values.
+        noise: as stated.
+        ratio: see `noise_ratio`.
+    """
+    if ratio is None or ratio <= 1.0:
+        return noise
+    own = float(noise.frame_variance_dn2(float(np.median(frames))))
+    read = noise.dark_noise_e**2 + (ratio**2 - 1.0) * own / noise.gain_dn_per_e**2
+    return replace(noise, dark_noise_e=math.sqrt(read))
 
 
 def _basis(reference: Array) -> Array:
@@ -360,6 +412,6 @@ def _jitter(offset: Array, spread: Array, count: int) -> Array:
 
 def _saturated(values: Array, noise: NoiseModel) -> Mask:
     """Pixels that are saturated in most frames, and those beside them, whose charge may have run over."""
-    limit = noise.saturation_dn - _SATURATION_SIGMAS * math.sqrt(noise.temporal_variance_dn2(noise.saturation_dn, 1))
+    limit = noise.saturation_dn - _SATURATION_SIGMAS * math.sqrt(noise.frame_variance_dn2(noise.saturation_dn))
     clipped = np.median(values, axis=0) >= limit
     return np.asarray(ndimage.binary_dilation(clipped, np.ones((3, 3)))) if np.any(clipped) else clipped

@@ -1,21 +1,24 @@
 """Maximum-likelihood fit of the calibrated spot shape, and the bound that no unbiased estimator can beat.
 
 Model of a pixel: background + flux * shape(row, column); normal likelihood with the variance temporal / frames + fixed
-pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7). The two functions are
-public through `centroid`. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+pattern at the model's grey value. Fisher scoring (Kay, Estimation Theory, 1993, sec. 7.7), from two starts. The
+functions are public through `centroid`. Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import fft, ndimage
 
 from analysis.spots import spot_image
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate, TemplateRangeError
 
-__all__ = ["cramer_rao_bound", "image_bound", "maximum_likelihood_fit"]
+__all__ = ["CORE_SHARE", "cramer_rao_bound", "image_bound", "maximum_likelihood_fit"]
 
 Array = NDArray[np.float64]
 _REST_PX = 1e-6
@@ -23,9 +26,26 @@ _FLUX_SIGMAS = 5.0
 # Side of the part of the image that the start is sought in, and the number of steps there; they cost a ninth each.
 _NEAR_PX = 32
 _NEAR_STEPS = 2
+_MOST_STEPS = 30
+# A second start is needed where the image is as like the shape farther than this from where the first fit ended ...
+_SAME_PX = 2
+# ... by this share of its likeness in the best place ...
+_LIKE = 0.95
+# ... and has the same end if that is not farther than this.
+_AGREE_PX = 1e-3
+# Difference of minus twice the logarithms of two likelihoods by which one place is told from the other: a ratio of 2e4.
+_DECISIVE = 20.0
+_MOST_DAMPED = 100
+# Median of the square of a standard normal number.
+_MEDIAN_SQUARE = 0.4549364231195724
+# Of so many pixels one is in that median, which then scatters by 5 %.
+_EVERY = 4
+_HALVINGS = 6
 
 EDGE_PX = 10.0
 """Least distance of a spot's centre from the outermost pixel centres."""
+CORE_SHARE = 0.02
+"""Of a spot's peak, above which a pixel belongs to its core."""
 
 
 def maximum_likelihood_fit(
@@ -38,7 +58,7 @@ def maximum_likelihood_fit(
     weights: str = "total",
     keep_maps: bool = True,
     threads: int = 1,
-    max_iterations: int = 30,
+    max_iterations: int = _MOST_STEPS,
 ) -> SpotPositions:
     """Fit row, column, flux and background of the calibrated shape by Fisher scoring.
 
@@ -102,27 +122,25 @@ def _score(
     theta = np.stack([row, column, flux, background], axis=1)
     spot_image.check_edge(theta[:, :2], height, width, edge_px)
     theta = _start(image, theta, which, template, noise, frames)
-    flat = image.reshape(count, -1)
-    steps = np.full(count, max_iterations + 1)
-    before = np.full(count, _REST_PX)
-    design, weighted = np.empty((2, count, 4, height * width))
-    for iteration in range(1, max_iterations + 1):
-        _, level = spot_image.template_model(theta, which, template, out=design)
-        weight = 1.0 / spot_image.variance(level, noise, frames, weights)
-        residual = flat - level
-        theta, length, inverse, weighted = _step(theta, design, weight, residual, weighted)
-        # Steps shrink at least as fast as the last one did, so that the one after this is known to be negligible.
-        still = length * np.minimum(length / before, 1.0) < _REST_PX
-        before = length
-        steps = np.where(still, np.minimum(steps, iteration), max_iterations + 1)
-        if np.all(still):
-            break
+    work = np.empty((2, count, 4, height * width))
+    rule = _Rule(template, noise, frames, weights)
+    last = rule.scored(image, theta, which, max_iterations, work)
+    better = _second_start(image, last, which, rule, edge_px, max_iterations)
+    if better is not None:
+        last = rule.scored(image, better, which, max_iterations, work)
+    theta, level, weight, residual, design = last.theta, last.level, last.weight, last.residual, last.design
     # The last design is one step old, below 1e-3 px; a fresh one would cost half as much again.
-    influence = inverse[:, :2] @ weighted
+    influence = last.inverse[:, :2] @ last.weighted
     temporal, fixed = spot_image.propagate(influence, level, noise, frames)
-    chi = np.einsum("bp,bp,bp->b", residual, residual, weight) / (flat.shape[1] - 4)
+    square = residual * residual * weight
+    pixels = residual.shape[1]
+    chi = square.sum(axis=1) / (pixels - 4)
+    core = design[:, 2] > CORE_SHARE * design[:, 2].max(axis=1, keepdims=True)
+    many = np.maximum(core.sum(axis=1), 1)
+    freedom = spot_image.excess(level, weight, noise, frames)
+    degrees = np.stack([_degrees(np.ones_like(core), freedom) - 4.0, _degrees(core, freedom)], axis=1)
     spot_image.check_edge(theta[:, :2], height, width, edge_px)
-    weak = theta[:, 2] < _FLUX_SIGMAS * np.sqrt(inverse[:, 2, 2])
+    weak = theta[:, 2] < _FLUX_SIGMAS * np.sqrt(last.inverse[:, 2, 2])
     spot_image.reject(weak, f"no spot: the flux is not significant (below {_FLUX_SIGMAS:g} sigma)")
     return SpotPositions(
         row=theta[:, 0],
@@ -131,12 +149,147 @@ def _score(
         fixed_covariance=fixed,
         flux=theta[:, 2],
         background=theta[:, 3],
-        converged=steps <= max_iterations,
-        iterations=iteration,
+        converged=last.steps <= max_iterations,
+        iterations=last.iterations,
         reduced_chi_square=chi,
         gain_maps=influence.reshape(count, 2, height, width) if keep_maps else None,
         light_dn=noise.light_signal_dn(level).reshape(count, height, width) if keep_maps else None,
+        core_chi_square=np.sum(square * core, axis=1) / many,
+        degrees=degrees,
+        median_square=np.median(square[:, ::_EVERY], axis=1) / _MEDIAN_SQUARE,
     )
+
+
+def _degrees(of: NDArray[np.bool_], excess: Array) -> Array:
+    """Degrees of freedom (B,) of the chi-square that has the variance of a sum of squares over some pixels (B, P), each
+    of which has the variance 2 + excess.
+    """
+    count = of.sum(axis=1)
+    return np.asarray(2.0 * count**2 / np.maximum(np.sum(of * (2.0 + excess), axis=1), 1e-300))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scored:
+    """Where scoring ended: theta (B, 4), step at which each came to rest (B,) (one more than allowed where it did not),
+    and of the last step level, weight and residual (B, P), design and design times weight (B, 4, P), inverse
+    information (B, 4, 4).
+    """
+
+    theta: Array
+    steps: NDArray[np.intp]
+    iterations: int
+    level: Array
+    weight: Array
+    residual: Array
+    design: Array
+    weighted: Array
+    inverse: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Rule:
+    """What a fit is of."""
+
+    template: SpotTemplate
+    noise: NoiseModel
+    frames: int
+    weights: str
+
+    def scored(
+        self, image: Array, theta: Array, which: NDArray[np.intp], most: int, work: Array, damped: bool = False
+    ) -> _Scored:
+        """Fisher scoring of spots (B, H, W) from some places; `work` (2, B, 4, P) holds the designs.
+
+        Damped, a step is halved until the squares under its weights become less.
+        """
+        flat = image.reshape(len(image), -1)
+        steps = np.full(len(image), most + 1)
+        before = np.full(len(image), _REST_PX)
+        design, weighted = work
+        for iteration in range(1, most + 1):
+            _, level = spot_image.template_model(theta, which, self.template, out=design)
+            weight = 1.0 / spot_image.variance(level, self.noise, self.frames, self.weights)
+            residual = flat - level
+            start = theta
+            theta, length, inverse, weighted = _step(theta, design, weight, residual, weighted)
+            if damped:
+                theta = self._descended(flat, start, theta, which, weight, residual)
+            # Steps shrink at least as fast as the last one did, so that the one after this is known to be negligible.
+            still = length * np.minimum(length / before, 1.0) < _REST_PX
+            before = length
+            steps = np.where(still, np.minimum(steps, iteration), most + 1)
+            if np.all(still):
+                break
+        return _Scored(theta, steps, iteration, level, weight, residual, design, weighted, inverse)
+
+    def _descended(
+        self, flat: Array, start: Array, end: Array, which: NDArray[np.intp], weight: Array, residual: Array
+    ) -> Array:
+        """The end of a step (B, 4), or nearer to its start where the squares would grow."""
+        square = np.sum(residual * residual * weight, axis=1)
+        for _ in range(_HALVINGS):
+            _, level = spot_image.template_model(end, which, self.template)
+            worse = np.sum((flat - level) ** 2 * weight, axis=1) > square * (1.0 + 1e-12)
+            if not np.any(worse):
+                break
+            end = np.where(worse[:, None], 0.5 * (start + end), end)
+        return end
+
+    def deviance(self, found: _Scored) -> Array:
+        """(B,) minus twice the logarithm of the likelihood, at the last step."""
+        return np.asarray(np.sum(found.residual**2 * found.weight - np.log(found.weight), axis=1))
+
+
+def _second_start(
+    image: Array, first: _Scored, which: NDArray[np.intp], rule: _Rule, edge_px: float, most: int
+) -> Array | None:
+    """Where the fits end that start where else the fitted shape is as like the image, (B, 4).
+
+    The correlation of image and shape has its largest value where the least squares are, of all places. Where it has no
+    other top as high as where the first fit ended, which is so for every sharp spot, both starts have the same end.
+    None where that holds for all spots.
+
+    Raises:
+        SpotError: two places fit the image alike.
+    """
+    _, height, width = image.shape
+    shape = first.design[:, 2].reshape(image.shape)
+    light = image - first.theta[:, 3, None, None]
+    # single precision finds the pixel
+    spectra = (fft.rfft2(one.astype(np.float32)) for one in (light, shape))
+    surface = fft.irfft2(next(spectra) * np.conj(next(spectra)), (height, width))
+    size, resting = np.array([height, width]), np.asarray(first.steps <= most)
+    lag = np.stack([_best_elsewhere(one) for one in surface])
+    again = np.flatnonzero(~resting | np.any(lag != 0, axis=1))
+    if not len(again):
+        return None
+    out, told = first.theta.copy(), rule.deviance(first)
+    chi = np.mean(first.residual**2 * first.weight, axis=1)
+    unclear: dict[int, str] = {}
+    for k in again.tolist():
+        own = slice(k, k + 1)
+        theta = first.theta[own].copy()
+        theta[:, :2] = np.clip(theta[:, :2] + lag[k], edge_px, size - 1 - edge_px)
+        try:
+            work = np.empty((2, 1, 4, height * width))
+            second = rule.scored(image[own], theta, which[own], _MOST_DAMPED, work, damped=True)
+        except (TemplateRangeError, np.linalg.LinAlgError):
+            continue
+        if second.steps[0] > _MOST_DAMPED:
+            continue
+        apart = float(np.max(np.abs(second.theta[0, :2] - first.theta[k, :2])))
+        gain = float(told[k] - rule.deviance(second)[0])
+        least = min(float(chi[k]), float(np.mean(second.residual**2 * second.weight)))
+        if not resting[k] or gain > 0.0:
+            out[k] = second.theta[0]
+        if resting[k] and apart > _AGREE_PX and abs(gain) < _DECISIVE * max(1.0, least):
+            places = ", ".join(
+                f"({row:.2f}, {column:.2f})" for row, column in (first.theta[k, :2], second.theta[0, :2])
+            )
+            unclear[k] = f"its shape fits alike in two places, {places} px, so that neither can be relied on"
+    if unclear:
+        raise SpotError(unclear)
+    return out
 
 
 def _start(
@@ -154,6 +307,20 @@ def _start(
         weight = 1.0 / spot_image.variance(level, noise, frames, "temporal")
         theta = _step(theta, design, weight, flat - level)[0]
     return theta
+
+
+def _best_elsewhere(surface: Array) -> NDArray[np.intp]:
+    """Row and column, px, from where a shape stands to where it is as like the image (H, W); 0 where there is no such
+    place farther than a step or two away.
+    """
+    size = np.array(surface.shape)
+    tops = np.argwhere((surface == ndimage.maximum_filter(surface, 5, mode="wrap")) & (surface > _LIKE * surface.max()))
+    lags = np.where(tops > size // 2, tops - size, tops)
+    away = np.any(np.abs(lags) > _SAME_PX, axis=1)
+    if not np.any(away):
+        return np.zeros(2, np.intp)
+    best = int(np.argmax(surface[tops[away, 0], tops[away, 1]]))
+    return np.asarray(lags[away][best])
 
 
 def _step(

@@ -3,10 +3,13 @@ value.
 
 Two kinds are kept apart because they behave differently in a before/after comparison:
 
-- temporal noise (photon shot noise, read noise, quantisation) is new in every frame, so the variance of a mean of N
-  frames is 1/N of it;
+- temporal noise (photon shot noise, read noise) is new in every frame, so the variance of a mean of N frames is 1/N of
+  it;
 - fixed-pattern noise (PRNU, DSNU) is the same in every frame, does not average down, and is common to all images that
   the same pixels take.
+
+Rounding to grey values is of the one kind or of the other (`analysis.spots.rounding`): new in every frame where noise
+spreads over the steps, and the same in every frame, though another one in every image, where it does not.
 
 What a detector has beyond that model is told as further terms of either kind, each by its variance; like the others
 they are independent from pixel to pixel.
@@ -22,6 +25,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+
+from analysis.spots import rounding
 
 __all__ = ["FurtherNoise", "NoiseModel"]
 
@@ -85,13 +90,10 @@ class NoiseModel:
 
     @property
     def dark_variance_dn2(self) -> float:
-        """The part of the temporal variance of one frame that does not depend on the signal: read noise and 1/12 DN^2.
-
-        Quantisation acts as white noise of 1/12 DN^2 only while other noise of sigma DN spreads over the steps. The
-        error goes as exp(-2 pi^2 sigma^2): some 2% of the variance at 0.5 DN, nothing at 1 DN, and below 0.24 DN (the
-        limit of EMVA 1288) quantisation is systematic and does not average down over frames.
+        """The part of the variance of one frame that does not depend on the signal: read noise, and the 1/12 DN^2 of
+        rounding, temporal or not.
         """
-        return (self.gain_dn_per_e * self.dark_noise_e) ** 2 + 1.0 / 12.0
+        return (self.gain_dn_per_e * self.dark_noise_e) ** 2 + rounding.WHOLE
 
     @property
     def dsnu_variance_dn2(self) -> float:
@@ -103,15 +105,29 @@ class NoiseModel:
         """The part of a mean grey value that light made, DN, >= 0: what PRNU scales."""
         return np.maximum(np.subtract(mean_signal_dn, self.dark_level_dn), 0.0)
 
-    def temporal_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float, frames: int) -> Any:
-        """Variance of a mean of `frames` frames from new noise in each, DN^2; shape of mean_signal_dn.
+    def frame_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
+        """Variance of one frame about its mean before rounding, DN^2, without the fixed pattern; shape of
+        mean_signal_dn.
 
         mean_signal_dn: expected grey values as recorded, black level included. Shot noise of the light and of the dark
             signal
         is K (y - offset) (EMVA 1288 eq. 12: the photon transfer line).
         """
+        return self._variance_dn2(mean_signal_dn, 1)
+
+    def temporal_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float, frames: int) -> Any:
+        """Variance of a mean of `frames` frames from new noise in each, DN^2; shape of mean_signal_dn.
+
+        mean_signal_dn: expected grey values as recorded, black level included.
+        """
         if int(frames) != frames or frames < 1:
             raise ValueError(f"noise model: frames must be an integer >= 1, found {frames!r}")
+        variance = self._variance_dn2(mean_signal_dn, frames)
+        if self._rounds_coarsely:
+            variance -= self.rounding_variance_dn2(mean_signal_dn) / frames
+        return variance
+
+    def _variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float, frames: int) -> Any:
         variance = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0)
         variance *= self.gain_dn_per_e / frames
         variance += self.dark_variance_dn2 / frames
@@ -121,13 +137,31 @@ class NoiseModel:
                 variance += self.gain_dn_per_e**2 / frames * term.temporal_variance_e2(electrons)
         return variance
 
-    def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
-        """Variance over pixels of the fixed pattern, prnu^2 s^2 + (K dsnu)^2 with s the light signal, DN^2, and of
-        further patterns.
+    @property
+    def _rounds_coarsely(self) -> bool:
+        """Whether read noise alone does not make rounding white at every signal."""
+        return self.gain_dn_per_e * self.dark_noise_e < rounding.FINE
 
-        Does not fall with the number of frames, and is the same draw in every image of the same pixels.
+    def rounding_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
+        """Of the variance of a frame what rounding does to every frame of an image alike, DN^2; shape of
+        mean_signal_dn. It does not fall with the number of frames.
+        """
+        if not self._rounds_coarsely:
+            return np.zeros(np.shape(mean_signal_dn))
+        electrons = np.maximum(np.subtract(mean_signal_dn, self.offset_dn), 0.0) / self.gain_dn_per_e
+        read = self.dark_noise_e**2 + sum(term.temporal_variance_e2(electrons) for term in self.further)
+        return rounding.systematic_variance(electrons, read, self.gain_dn_per_e)
+
+    def fixed_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
+        """Variance over pixels of what is the same in every frame, DN^2: the pattern prnu^2 s^2 + (K dsnu)^2 with s the
+        light signal, further patterns, and what rounding does to all frames alike.
+
+        Does not fall with the number of frames. The pattern is the same draw in every image of the same pixels,
+        rounding is not.
         """
         variance = self.prnu * self.light_signal_dn(mean_signal_dn)
         variance *= variance
         variance += self.dsnu_variance_dn2
+        if self._rounds_coarsely:
+            variance += self.rounding_variance_dn2(mean_signal_dn)
         return variance

@@ -4,6 +4,9 @@ and 8), and the correction of frames by these.
 Temporal variance is taken over the frames of a stack, so that neither fixed pattern nor an uneven light is in it; the
 mean of each frame is taken off first, so that a lamp that drifts is not noise. Non-uniformities are spatial variances
 of the mean frames without what is left of temporal noise; a quadratic surface is the light's and is taken off first.
+
+Rounding to grey values is taken off as `rounding` has it. Where noise is less than about half a grey value, what it
+does depends on where between two steps the pixels stand, which stands in the sigmas.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.spots import rounding
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 
@@ -25,6 +29,8 @@ Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
 """Of a pixel that can be used, over that of the others."""
+_NOTHING = 1e-12
+"""DN^2 that rounding may hide and nobody would see."""
 _LEAST_LIGHT = 10.0
 """Flat over dark level, in sigmas of a pixel of one dark frame, below which there is no light in a flat frame."""
 
@@ -158,33 +164,45 @@ def photon_transfer(dark: NDArray[Any], flat: NDArray[Any]) -> PhotonTransfer:
         raise FramesError(
             f"the flat frames are only {signal:.3g} DN brighter than the dark ones", "flat frames at half of saturation"
         )
-    shot = variance - dark_variance
-    spread = math.hypot(
-        variance * math.sqrt(2.0 / (pixels * (len(day) - 1))),
-        dark_variance * math.sqrt(2.0 / (pixels * (len(night) - 1))),
-    )
+    dark_steps, steps = rounding.temporal_part(dark_variance), rounding.temporal_part(variance)
+    shot = variance - dark_variance + (dark_steps - steps)
+    own = max(dark_variance - dark_steps, 0.0)
+    dark_spread = dark_variance * math.sqrt(2.0 / (pixels * (len(night) - 1)))
+    spread = math.hypot(variance * math.sqrt(2.0 / (pixels * (len(day) - 1))), dark_spread)
     if shot < 5.0 * spread:
         raise FramesError(
             "the flat frames are not noisier than the dark ones",
             "raw frames, neither averaged, smoothed nor compressed",
         )
+    # of few changes of a grey value another number might have been seen; frames of even light have pixels at all places
+    low, high = rounding.noise_range(dark_variance, 5.0 * dark_spread + 5.0 / (pixels * (len(night) - 1)))
+    dark_doubt = max(high - own, own - low)
+    if dark_doubt > 0.0:
+        spread = math.hypot(spread, dark_doubt)
+    if shot < 5.0 * spread:
+        raise FramesError(
+            f"the dark frames have noise of {math.sqrt(own):.2g} DN, so little that rounding to whole grey values "
+            "hides the gain",
+            "`photon_transfer: stated`, or frames with more grey values for an electron",
+        )
     gain = shot / signal
-    # without the converter's own steps
-    own = max(dark_variance - 1.0 / 12.0, 0.0)
     noise = math.sqrt(own) / gain
     noise_sigma = noise * math.hypot(spread / shot, 0.5 * math.sqrt(2.0 / (pixels * (len(night) - 1))))
-    dsnu, dsnu_sigma = _pattern(level, good, dark_variance / len(night))
-    prnu2 = _pattern_square(light - level, good) - variance / len(day) - dark_variance / len(night)
-    prnu = math.sqrt(max(prnu2, 0.0)) / signal
-    prnu_sigma = _square_root_sigma(prnu2, _pattern_square(light - level, good), pixels) / signal
+    if dark_doubt > 0.0:
+        noise_sigma = math.hypot(noise_sigma, _square_root_sigma(own, dark_doubt) / gain)
+    left, dark_left = variance / len(day), dark_variance / len(night)
+    stays, dark_stays = rounding.WHOLE - steps, rounding.WHOLE - dark_steps
+    hidden = float(rounding.systematic_variance(0.0, low, 1.0))
+    dsnu, dsnu_sigma = _pattern(level, good, (dark_left, dark_stays), hidden)
+    prnu, prnu_sigma = _pattern(light - level, good, (left, dark_left, stays + dark_stays), hidden)
     return PhotonTransfer(
         gain_dn_per_e=gain,
         gain_sigma=gain * spread / shot,
         dark_noise_e=noise,
         dark_noise_sigma=noise_sigma,
         dark_level_dn=float(level[good].mean()),
-        prnu=prnu,
-        prnu_sigma=prnu_sigma,
+        prnu=prnu / signal,
+        prnu_sigma=prnu_sigma / signal,
         dsnu_e=dsnu / gain,
         dsnu_sigma=dsnu_sigma / gain,
     )
@@ -195,15 +213,20 @@ def _pattern_square(image: Array, good: Mask) -> float:
     return float(np.square(rest[good]).sum() / max(np.count_nonzero(good) - 6, 1))
 
 
-def _pattern(image: Array, good: Mask, temporal: float) -> tuple[float, float]:
-    """Standard deviation of a pattern without temporal noise, and its own."""
-    whole = _pattern_square(image, good)
-    square = whole - temporal
-    return math.sqrt(max(square, 0.0)), _square_root_sigma(square, whole, int(np.count_nonzero(good)))
+def _pattern(image: Array, good: Mask, noise: tuple[float, ...], hidden: float) -> tuple[float, float]:
+    """Standard deviation of a pattern without the variance of noise, and its own; rounding may have made some of the
+    pattern's variance, or hidden some.
+    """
+    square = whole = _pattern_square(image, good)
+    for part in noise:
+        square -= part
+    spread = whole * math.sqrt(2.0 / int(np.count_nonzero(good)))
+    if hidden > _NOTHING:
+        spread = math.hypot(spread, hidden)
+    return math.sqrt(max(square, 0.0)), _square_root_sigma(square, spread)
 
 
-def _square_root_sigma(square: float, whole: float, pixels: int) -> float:
-    spread = whole * math.sqrt(2.0 / pixels)
+def _square_root_sigma(square: float, spread: float) -> float:
     return spread / (2.0 * math.sqrt(max(square, spread)))
 
 
@@ -227,7 +250,8 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
     sigma = 1.4826 * float(np.median(np.abs(away)))
     bad = np.abs(away) > _HOT_SIGMAS * max(sigma, 1e-9)
     variance = _temporal(np.where(bad, np.median(night, axis=(1, 2), keepdims=True), night))
-    left = math.sqrt(variance / len(night)) / noise.gain_dn_per_e
+    stays = float(noise.rounding_variance_dn2(noise.dark_level_dn))
+    left = math.sqrt(variance / len(night) + stays) / noise.gain_dn_per_e
     corrected = replace(noise, dsnu_e=left)
     response = np.ones_like(level)
     if flat is not None:
@@ -245,5 +269,7 @@ def pixel_correction(noise: NoiseModel, dark: NDArray[Any] | None, flat: NDArray
         response = light / _surface(light, usable)
         bad = bad | ~usable | (response < _RESPONSE[0]) | (response > _RESPONSE[1])
         response = np.where(bad, 1.0, response)
-        corrected = replace(corrected, prnu=math.sqrt(_temporal(day) / len(day) + variance / len(night)) / signal)
+        stays += float(noise.rounding_variance_dn2(noise.dark_level_dn + signal))
+        left = _temporal(day) / len(day) + variance / len(night) + stays
+        corrected = replace(corrected, prnu=math.sqrt(left) / signal)
     return PixelCorrection(level - float(np.mean(level[~bad])) + noise.dark_level_dn, response, bad, corrected)

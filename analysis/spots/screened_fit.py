@@ -27,7 +27,7 @@ from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SmearedShape, SpotTemplate, TemplateRangeError
 
-__all__ = ["FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
+__all__ = ["CORE_SHARE", "FitTerms", "ScreenedFit", "fit_screened", "model_parts", "one_shape"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -37,7 +37,7 @@ _REST_SIGMAS = 1e-4
 _FLUX_SIGMAS = 5.0
 _MOST_SMEAR = 25.0
 """Px^2; a spot that is smeared by more is another one."""
-_CORE_SHARE = 0.02
+CORE_SHARE = 0.02
 """Of the peak: where the shape of the spot is judged."""
 
 
@@ -112,12 +112,23 @@ class ScreenedFit:
         """
         return float(np.square(self.residual(mean)).sum())
 
-    def core_fits(self, learnt_from: ScreenedFit | None = None) -> bool:
+    def core_fits(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> bool:
         """Whether the core has the calibrated shape, at a false-alarm rate of 1e-6.
 
         Args:
             learnt_from: the fit to the image that the shape was learnt from, whose noise is in the shape, too; None for
                 a shape without noise.
+            noisier: by which factor the noise of the frames makes the variance in the core more than stated.
+        """
+        return self.core_widening(learnt_from, noisier) == 1.0
+
+    def core_widening(self, learnt_from: ScreenedFit | None = None, noisier: float = 1.0) -> float:
+        """Factor of sigma: 1 where the core has the calibrated shape, else the root of its reduced chi-square (as
+        `analysis.spots.fit_state.FitStates.widening`).
+
+        Args:
+            learnt_from: as of `core_fits`.
+            noisier: likewise.
         """
         value, count = self.core
         spread = 1.0
@@ -125,7 +136,9 @@ class ScreenedFit:
             # at the peak, where the noise is that of the light
             first, own = (float(one.variance.flat[int(np.argmax(one.level))]) for one in (learnt_from, self))
             spread += first / own * float(self.positions.flux[0] / learnt_from.positions.flux[0]) ** 2
-        return value / spread * count <= chi2.isf(1e-6, max(count - 4, 1))
+        if value / (noisier * spread) * count <= chi2.isf(1e-6, max(count - 4, 1)):
+            return 1.0
+        return float(max(np.sqrt(value / (noisier * spread)), 1.0 + 1e-9))
 
 
 def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> SpotTemplate:
@@ -240,7 +253,7 @@ def _fit(
     square = np.square(flat - level) * weight
     used = int(np.count_nonzero(use))
     shape = mean.shape
-    core = use & (design[2] > _CORE_SHARE * design[2].max())
+    core = use & (design[2] > CORE_SHARE * design[2].max())
     places = [model.other(theta, inverse, k) for k in range(len(terms.others))]
     smear, smear_sigma = model.smear_of(theta, inverse)
     positions = SpotPositions(

@@ -255,6 +255,20 @@ def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Arra
     return out
 
 
+def excess(level: Array, weight: Array, noise: NoiseModel, frames: int) -> Array:
+    """Excess kurtosis of the noise of a mean of frames by its shot noise, without unit; 0 for a normal distribution.
+
+    Args:
+        level: grey values, any shape, DN.
+        weight: 1 / variance, likewise, 1/DN^2.
+        noise: of the detector.
+        frames: of which an image is the mean.
+    """
+    # the fourth cumulant of Poisson numbers is their mean, of a mean of n of them 1/n^3 of it
+    fourth = noise.gain_dn_per_e**3 * noise.light_signal_dn(level) / float(frames) ** 3
+    return np.asarray(fourth * weight * weight)
+
+
 def template_model(
     theta: Array,
     which: NDArray[np.intp],

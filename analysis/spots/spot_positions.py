@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.measurement_error import MeasurementError
 from analysis.spots.noise import NoiseModel
 
 __all__ = ["NoiseParts", "SeriesNoise", "SpotError", "SpotPositions", "difference_covariance", "noise_parts"]
@@ -28,7 +29,7 @@ __all__ = ["NoiseParts", "SeriesNoise", "SpotError", "SpotPositions", "differenc
 Array = NDArray[np.float64]
 
 
-class SpotError(ValueError):
+class SpotError(MeasurementError, ValueError):
     """Spots that cannot be measured. `reasons` maps the index of each bad spot in the batch to a sentence."""
 
     def __init__(self, reasons: dict[int, str]) -> None:
@@ -51,6 +52,10 @@ class SpotPositions:
         spot.
     reduced_chi_square: (B,) sum of squared residuals over variance and degrees of freedom, near 1 when the spot has
         the shape that was assumed; NaN for an estimator without a shape.
+    core_chi_square: (B,) the same of the spot's core alone; None where no calibrated shape was fitted.
+    degrees: (B, 2) degrees of freedom of both, fewer than pixels where the noise is that of few electrons; likewise.
+    median_square: (B,) median of the squared residuals over variance, over that of a normal distribution: the noise of
+        the frames over the stated one, squared, whatever stands in a few pixels; likewise.
     gain_maps: (B, 2, H, W) px per DN, influence of each pixel on (row, column), or None when not kept.
     light_dn: (B, H, W) expected light signal, DN, that scales PRNU, or None when not kept.
     """
@@ -66,6 +71,9 @@ class SpotPositions:
     reduced_chi_square: Array
     gain_maps: Array | None = None
     light_dn: Array | None = None
+    core_chi_square: Array | None = None
+    degrees: Array | None = None
+    median_square: Array | None = None
 
     @property
     def covariance(self) -> Array:

@@ -25,6 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 from scipy.interpolate import BSpline
 
+from analysis.measurement_error import MeasurementError, UndeterminedError
+
 __all__ = ["SmearedShape", "SpotTemplate", "TemplateRangeError"]
 
 Array = NDArray[np.float64]
@@ -34,7 +36,7 @@ SHARPEST = 4.0
 """Most by which a frequency is raised where a shape is made sharper."""
 
 
-class TemplateRangeError(ValueError):
+class TemplateRangeError(MeasurementError, ValueError):
     """A spot position for which the detector would look beyond the template's grid. `indices` lists the spots."""
 
     def __init__(self, message: str, indices: list[int]) -> None:
@@ -118,7 +120,7 @@ class SpotTemplate:
         data = data - background
         flux = float(data.sum()) / oversampling**2
         if not flux > 0:
-            raise ValueError(
+            raise UndeterminedError(
                 f"spot template: image holds no flux after background {background} is taken off (sum {flux:g})"
             )
         coefficients = ndimage.spline_filter(data / flux, order=_DEGREE, mode="mirror", output=np.float64)

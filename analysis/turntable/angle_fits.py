@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
+from analysis.measurement_error import UndeterminedError
 from analysis.turntable.angle_network import NotConvergedError, network
 
 __all__ = [
@@ -107,7 +108,7 @@ class AngleFit:
         low, high = self.range
         slack = 1e-9 * (high - low)
         if not np.all((angle >= low - slack) & (angle <= high + slack)):
-            raise ValueError(
+            raise UndeterminedError(
                 f"{self.name}: {np.degrees(np.min(angle)):.4f} to {np.degrees(np.max(angle)):.4f} deg asked for, but "
                 f"calibrated from {np.degrees(low):.4f} to {np.degrees(high):.4f} deg; calibrate the whole range of use"
             )
@@ -220,12 +221,12 @@ def _points(name: str, angle: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> 
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(np.isfinite(s)) and np.all(s > 0.0)):
         raise ValueError(f"{name}: angles and values must be finite and sigmas greater than zero")
     if len(x) > 1 and np.ptp(x) == 0.0:
-        raise ValueError(f"{name}: all {len(x)} angles are the same; step the table through the region")
+        raise UndeterminedError(f"{name}: all {len(x)} angles are the same; step the table through the region")
     if np.any(np.diff(x) <= 0.0):
         raise ValueError(f"{name}: angles must increase; sort them, and average the repeats of one angle")
     need = fewest(name) if name in FITS else 0
     if len(x) < need:
-        raise ValueError(
+        raise UndeterminedError(
             f"{name}: {len(x)} angles, but at least {need} are needed; calibrate more, or take another fit"
         )
     return x, y, np.array(s)

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.measurement_error import MeasurementError
+
 __all__ = ["NotConvergedError", "gradient", "network", "response"]
 
 Array = NDArray[np.float64]
@@ -31,7 +33,7 @@ propagated sigma changes by 6% and agrees with the scatter of networks trained o
 MOST_ITERATIONS, TOLERANCE = 8000, 1e-4
 
 
-class NotConvergedError(RuntimeError):
+class NotConvergedError(MeasurementError, RuntimeError):
     """No training of the network came to a minimum."""
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from analysis.measurement_error import UndeterminedError
 from analysis.turntable.angle_fits import (
     FITS,
     GAP_ORDER,
@@ -71,7 +72,7 @@ class CalibrationSeries:
         if x.ndim != 1 or y.ndim != 2 or len(y) != len(x):
             raise ValueError(f"calibration: angles (N,) and comparisons (N, repeats), found {x.shape} and {y.shape}")
         if len(x) > 1 and np.ptp(x) == 0.0:
-            raise ValueError(f"calibration: all {len(x)} angles are the same; step the table through the region")
+            raise UndeterminedError(f"calibration: all {len(x)} angles are the same; step the table through the region")
         if np.any(np.diff(x) <= 0.0):
             raise ValueError("calibration: angles must increase; sort them, and put repeats of one angle in one row")
         if y.shape[1] < 2:
@@ -243,7 +244,7 @@ def choose(
             trials.append(Trial(name, None, None, str(error)))
     good = {trial.name: trial.validation.rms for trial in trials if trial.validation is not None}
     if not good:
-        raise ValueError(
+        raise UndeterminedError(
             f"no fit of the dividing error succeeded: {'; '.join(t.failure for t in trials) or 'none asked'}"
         )
     return Choice(tuple(trials), min(good, key=lambda name: good[name]))
@@ -351,7 +352,7 @@ def compensate(
     """
     trial = choice[name or choice.chosen]
     if trial.fit is None or trial.validation is None:
-        raise ValueError(f"compensation: {trial.failure}")
+        raise UndeterminedError(f"compensation: {trial.failure}")
     excess = trial.validation.excess
     common = white = 0.0
     if held_out is not None:

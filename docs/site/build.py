@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 from docs.site.link_check import faults
+from docs.site.policy import with_policy
 
 ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
@@ -19,10 +20,10 @@ NOTEBOOKS = ("start", "my_camera", "heat", "targets_mtf", "orbit_calibration", "
 GUIDES = (
     *("live", "monitor", "monitor_layout", "monitor_design", "disturbances", "finite_elements", "stray_light"),
     *("measured_frames", "coming_from", "camera", "prescriptions", "laboratory", "measured_laboratory"),
-    *("orbit", "measured_orbit", "orbit_files", "studies", "export"),
+    *("orbit", "measured_orbit", "orbit_files", "studies", "export", "limits"),
 )
 MEANING = ("conventions", "glossary")
-PROGRAM = ("architecture",)
+PROGRAM = ("promises", "architecture", "installed")
 """Pages of docs by the part of the site in which they stand, in order; other notebooks and pages follow these."""
 NEEDED = ("sphinx", "myst_nb", "furo", "sphinx_copybutton")
 _LINK = re.compile(r"\]\((?!https?://|#|mailto:)([^)#\s]+)")
@@ -58,6 +59,8 @@ def build(out: Path, notebooks: bool = True) -> int:
             raise BuildError(f"the reference cannot be made: {error}") from error
         _sphinx(source, made, Path(place) / "state", notebooks)
         pages = sorted(made.rglob("*.html"))
+        for page in pages:
+            page.write_text(with_policy(page.read_text("utf-8")), "utf-8")
         wrong = faults(made)
         if wrong:
             raise BuildError("\n".join(wrong))

@@ -15,10 +15,10 @@ from optics.design.design_variables import BIAS, Prescription, Variable
 from optics.geometry.tree import COMPLEX_STEP
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.aim import RayFan, aim
 from optics.raytrace.derivatives import jvp
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
-from optics.waves.imaging import aim_collimated
 
 LAUNCH_DISTANCE = 9.0
 """How far before the prescription's origin beams start, metres: well before every mirror."""
@@ -94,12 +94,12 @@ def trace_beams(
         AimError: a chief ray does not reach the stop.
         BeamMissedError: a beam is lost.
     """
-    assembly = prescription.assembly()
+    assembly = prescription.assembly
     along, axes = beam_axes(beams.fields, prescription.field_bias)
     count = len(along)
     to_stop = assemble(assembly, ["to_stop"]).take(np.zeros(count, dtype=int))
-    start = -LAUNCH_DISTANCE * along
-    chief = aim_collimated(backend, to_stop, along, start, np.zeros((1, 2)), axes[0, 0])[0][:, 0]
+    fan = RayFan(-LAUNCH_DISTANCE * along[:, None], along[:, None], axes[:, None], moves_position=True)
+    chief = fan.at(aim(backend, to_stop, fan, np.zeros((1, 2)))[0])[0][:, 0]
     reach = 0.5 * beams.diameter * beams.pupil
     launch = chief[:, None] + np.einsum("nk,fkx->fnx", reach, axes)
     heading = np.broadcast_to(along[:, None], launch.shape)
@@ -137,7 +137,7 @@ def _differentiated(
     # the chief ray's start is c = -L d + a e1 + b e2 with a, b such that it meets the vertex of the stop
     place = np.einsum("fx,fkx->fk", chief, axes)
     fixed = -LAUNCH_DISTANCE * along_step + np.einsum("fk,vfkx->vfx", place, axes_step)
-    single = assemble(prescription.assembly(), ["to_stop"])
+    single = assemble(prescription.assembly, ["to_stop"])
     twice = np.repeat(chief, 2, axis=0)[None], np.repeat(along, 2, axis=0)[None]
     slopes = jvp(backend, single, *twice, axes.reshape(1, -1, 3)).position[0, :, :2]
     slopes = np.swapaxes(slopes.reshape(fields, 2, 2), -1, -2)

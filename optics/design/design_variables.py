@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -134,6 +135,7 @@ class Prescription:
                 surfaces[name] = replace(surfaces[name], even=tuple(even))
         return Prescription(surfaces, stands, self.stop, bias)
 
+    @cached_property
     def assembly(self) -> Assembly:
         """The surfaces as bodies and elements, with the sequences ``imaging`` and ``to_stop``; no apertures."""
         bodies, elements = [], {}
@@ -149,7 +151,7 @@ class Prescription:
 
     def tangents(self, variables: Sequence[Variable], sequence: str) -> SystemBatch:
         """A batch of V equal systems; the v-th carries the derivative by the v-th variable."""
-        assembly = self.assembly()
+        assembly = self.assembly
         idle = (self.names[-1], "scale", 0)  # of a plane without size: changes nothing
         steps = [_step(v) if v.quantity in _STEPS else idle for v in variables]
         systems = assemble(assembly, [sequence], [{}] * len(variables), steps)

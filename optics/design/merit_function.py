@@ -29,6 +29,7 @@ class Operands:
         measure: ``wavefront`` (rms waves, piston and tilt removed) or ``spot`` (rms about the mean, in units of the
             wavelength times the focal ratio).
         distortion: weight of the chief rays' departure from L = f tan W, residuals per relative departure; 0 for none.
+        anamorphism: largest departure of f along the line from f across it, as a share of f across; None: free.
     """
 
     wavelength: float
@@ -38,6 +39,7 @@ class Operands:
     edge_margin: float = 0.005
     measure: str = "wavefront"
     distortion: float = 0.0
+    anamorphism: float | None = None
 
 
 @dataclass(frozen=True)
@@ -57,20 +59,29 @@ class Evaluation:
         residuals: their squares sum to the mean square error over the fields (waves^2), (P,).
         errors: rms error per field in waves, (F,).
         principal_distance: metres.
+        distance_across: the same across the line, of the fields in the plane of symmetry, metres.
         extents: along z from the farthest point of one surface to that of another, for all pairs, (E,), metres.
         clearances: of every passage, metres.
-        d_residuals, d_principal_distance, d_extents, d_clearances: derivatives, variables first; None if not wanted.
+        d_residuals, d_principal_distance, d_distance_across, d_extents, d_clearances: derivatives, variables first;
+            None if not wanted.
     """
 
     residuals: np.ndarray
     errors: np.ndarray
     principal_distance: float
+    distance_across: float
     extents: np.ndarray
     clearances: np.ndarray
     d_residuals: np.ndarray | None = None
     d_principal_distance: np.ndarray | None = None
+    d_distance_across: np.ndarray | None = None
     d_extents: np.ndarray | None = None
     d_clearances: np.ndarray | None = None
+
+    @property
+    def anamorphism(self) -> float:
+        """Principal distance along the line over that across it."""
+        return self.principal_distance / self.distance_across
 
     @property
     def envelope(self) -> float:
@@ -124,18 +135,20 @@ class MeritFunction:
         rays = trace_beams(self.backend, prescription, self.beams, variables)
         residuals, d_residuals, errors = self._errors(rays)
         distance, d_distance, departure, d_departure = self._principal_distance(rays, prescription)
+        across, d_across = self._distance_across(rays)
         extents, d_extents = _extents(rays)
         clearances = [self._clearance(rays, passage) for passage in self.passages]
         if self.operands.distortion:
             residuals = np.concatenate([residuals, self.operands.distortion * departure])
         value = np.array([c for c, _ in clearances])
         if d_residuals is None:
-            return Evaluation(residuals, errors, distance, extents, value)
+            return Evaluation(residuals, errors, distance, across, extents, value)
         if self.operands.distortion:
             assert d_departure is not None
             d_residuals = np.concatenate([d_residuals, self.operands.distortion * d_departure], axis=1)
         slopes = np.stack([slope for _, slope in clearances], axis=1)
-        return Evaluation(residuals, errors, distance, extents, value, d_residuals, d_distance, d_extents, slopes)
+        values = residuals, errors, distance, across, extents, value
+        return Evaluation(*values, d_residuals, d_distance, d_across, d_extents, slopes)
 
     def _errors(self, rays: DesignRays) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         """Residuals (P,), their derivatives (V, P), and errors per field (F,) in waves."""
@@ -202,6 +215,24 @@ class MeritFunction:
         assert rays.d_bias is not None
         d_distance = sign * d_slope / np.cos(bias) + distance * np.tan(bias) * rays.d_bias
         return distance, d_distance, departure, d_place / slope - np.outer(d_slope, place) / slope**2
+
+    def _distance_across(self, rays: DesignRays) -> tuple[float, np.ndarray | None]:
+        """Distance f across the line, f = sum(L tan W) / sum(tan^2 W) over the fields in the plane of symmetry beside
+        the line, L from the image of the field's centre (metres), and its derivatives; NaN where there are none.
+        """
+        fields = self.beams.fields
+        beside = (fields[:, 0] == 0.0) & (fields[:, 1] != 0.0)
+        centre = np.flatnonzero(np.all(fields == 0.0, axis=1))
+        if not beside.any() or not len(centre):
+            return np.nan, None if rays.d_position is None else np.full(len(rays.d_position), np.nan)
+        tangent = np.tan(fields[beside, 1])
+        weight = tangent / np.sum(tangent**2)
+        place = rays.position[beside, 0, 1] - rays.position[centre[0], 0, 1]
+        slope = float(place @ weight)
+        if rays.d_position is None:
+            return abs(slope), None
+        d_place = rays.d_position[:, beside, 0, 1] - rays.d_position[:, centre, 0, 1]
+        return abs(slope), np.sign(slope) * (d_place @ weight)
 
     def _clearance(self, rays: DesignRays, passage: Passage) -> tuple[float, np.ndarray]:
         """Least distance in y between a stretch of the beams and a surface's edge, and its derivatives (V,)."""

@@ -1,41 +1,53 @@
 """Optimises a mirror prescription by least squares with exact Jacobians, under constraints.
 
-Constraints are held by the shifted-penalty form of the method of multipliers: a violation g adds the residual
-rho (g + u), and after each round u takes up what is left of g; so they hold exactly in the end without a penalty so
-steep that it would hide the image errors. A much shorter envelope is reached in steps, each from the one before.
+Constraints are linearised at every step and held exactly (``optics.numerics.constrained_least_squares``), so that no
+penalty stands between the image errors and the constraints. A much shorter envelope is reached in steps, each from the
+one before. What comes out is a local optimum: ``optics.design.starts`` tries several.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import nnls
 
 from optics.design.design_rays import Beams
 from optics.design.design_variables import Prescription, Variable
 from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.numerics.backend import Backend
+from optics.numerics.constrained_least_squares import Sample, constrained_least_squares
+from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 
-PENALTY = 300.0
-"""Residual per metre of violation at the first round: 0.3 waves rms for 1 mm."""
-STEEPER = 3.0
-ROUNDS = 10
+ON_THE_WAY = 4
+"""Iterations at each step of the envelope before the last: enough to stay near the best of that length."""
+ITERATIONS = 400
+"""At most, at the last step."""
+SETTLED = 1e-6
+"""Share of the mean square error that an iteration has to be worth."""
 HELD = 2e-6
 """Violation, metres, below which a constraint counts as held."""
 LEAST_GAIN = 1e-3
 """Share by which the rms error has to fall for a prescription to count as improved: where least squares ends."""
-LOST = 1e3
-"""Residual of everything when light does not get through, so that the step is refused."""
 
 Advance = Callable[[int, int], None]
 
 
-class DesignError(ValueError):
-    """The constraints cannot be held together, or the start does not pass light."""
+class DesignError(PhysicalError, ValueError):
+    """The constraints cannot be held together, or the start does not pass light.
+
+    Attributes:
+        violated: kinds of the constraints that are not held, of ``constraint_values``; the one that is broken by the
+            largest share of what it asks for first.
+    """
+
+    def __init__(self, problem: str, violated: tuple[str, ...] = ()) -> None:
+        super().__init__(problem)
+        self.violated = violated
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class Held:
 
     Attributes:
         name: what it is about.
-        limit: what it asks for, metres.
+        limit: what it asks for, metres; of the anamorphism, a share of f.
         start: by how much the start broke it, metres; negative for room that the start had.
         worth: by how much the rms error over the fields would fall per metre that the limit is eased, waves/m, from the
             constraint's Lagrange multiplier.
@@ -61,20 +73,24 @@ class Design:
     """An optimised prescription.
 
     Attributes:
+        begun: what it is compared with.
         prescription: what came out.
-        before, after: judgements of the start and of the result.
+        before, after: judgements of both.
         variables: what was varied.
         merit: evaluated both; it names the passages.
         evaluations: traces with derivatives that it took.
+        converged: whether the search ended because nothing near is better.
         held: the constraints that keep it from being better, the dearest first.
     """
 
+    begun: Prescription
     prescription: Prescription
     before: Evaluation
     after: Evaluation
     variables: tuple[Variable, ...]
     merit: MeritFunction
     evaluations: int
+    converged: bool = True
     held: tuple[Held, ...] = ()
 
     @property
@@ -87,10 +103,14 @@ def constraint_values(evaluation: Evaluation, operands: Operands) -> tuple[np.nd
     """Violations (C,), metres, positive when violated (the first, of the principal distance, in both directions), and
     what each is about.
     """
-    out, names = [], []
+    out: list[Any] = []
+    names = []
     if operands.principal_distance is not None:
         out.append(evaluation.principal_distance - operands.principal_distance)
         names.append("principal distance")
+    if operands.anamorphism is not None:
+        out += _anamorphism(evaluation.principal_distance, evaluation.distance_across, operands.anamorphism)
+        names += ["anamorphism"] * 2
     if operands.envelope is not None:
         # one constraint for each pair of surfaces: their largest alone would have a kink wherever two pairs are equal
         out += list(evaluation.extents - operands.envelope)
@@ -101,6 +121,11 @@ def constraint_values(evaluation: Evaluation, operands: Operands) -> tuple[np.nd
     return np.array(out), names
 
 
+def _anamorphism(along: Any, across: Any, most: float) -> list[Any]:
+    """By how much f along is above, and below, what f across allows, metres; of derivatives likewise."""
+    return [along - (1.0 + most) * across, (1.0 - most) * across - along]
+
+
 def _constraint_slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
     """Derivatives of the violations, (V, C)."""
     assert evaluation.d_residuals is not None
@@ -108,6 +133,10 @@ def _constraint_slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray
     if operands.principal_distance is not None:
         assert evaluation.d_principal_distance is not None
         columns.append(evaluation.d_principal_distance)
+    if operands.anamorphism is not None:
+        assert evaluation.d_principal_distance is not None
+        assert evaluation.d_distance_across is not None
+        columns += _anamorphism(evaluation.d_principal_distance, evaluation.d_distance_across, operands.anamorphism)
     if operands.envelope is not None:
         assert evaluation.d_extents is not None
         columns += list(evaluation.d_extents.T)
@@ -117,6 +146,29 @@ def _constraint_slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray
     return np.stack(columns, axis=1) if columns else np.zeros((len(evaluation.d_residuals), 0))
 
 
+def _equations(operands: Operands, count: int) -> np.ndarray:
+    """Which of C constraints are equations, (C,)."""
+    return (operands.principal_distance is not None) & (np.arange(count) == 0)
+
+
+def judged(
+    backend: Backend, start: Prescription, variables: Sequence[Variable], beams: Beams, operands: Operands
+) -> tuple[MeritFunction, Evaluation]:
+    """The merit function of a design that begins at a prescription, and that prescription's evaluation.
+
+    Raises:
+        DesignError: the start passes no light or breaks a bound.
+    """
+    for variable, value in zip(variables, start.values(variables), strict=True):
+        if not variable.low <= value <= variable.high:
+            raise DesignError(f"{variable.name} starts at {value:.6g}, outside its bounds")
+    try:
+        merit = MeritFunction.of(backend, start, beams, operands)
+        return merit, merit.evaluate(start)
+    except (AimError, BeamMissedError) as error:
+        raise DesignError(f"the prescription that the design starts from passes no light: {error}") from error
+
+
 def optimise(
     backend: Backend,
     start: Prescription,
@@ -124,10 +176,10 @@ def optimise(
     beams: Beams,
     operands: Operands,
     steps: int = 1,
-    iterations: int = 60,
+    iterations: int = ITERATIONS,
     advance: Advance | None = None,
 ) -> Design:
-    """Optimise a prescription.
+    """Optimise a prescription from one start.
 
     Args:
         backend: where to trace.
@@ -136,46 +188,82 @@ def optimise(
         beams: fields and pupil.
         operands: merit and constraints.
         steps: of the envelope from the start's to the goal's.
-        iterations: of least squares, at most, in each round.
-        advance: told (done, total) after each round of the last step, or each step before it.
+        iterations: of least squares, at most, at the last step.
+        advance: told (done, total) after each step.
 
     Raises:
         DesignError: the start passes no light or breaks a bound, or constraints cannot be held together.
     """
-    variables = tuple(variables)
-    x = start.values(variables)
-    for variable, value in zip(variables, x, strict=True):
-        if not variable.low <= value <= variable.high:
-            raise DesignError(f"{variable.name} starts at {value:.6g}, outside its bounds")
-    try:
-        merit = MeritFunction.of(backend, start, beams, operands)
-        before = merit.evaluate(start)
-    except (AimError, BeamMissedError) as error:
-        raise DesignError(f"the prescription that the design starts from passes no light: {error}") from error
-    evaluations, current = 0, start
-    total = steps + ROUNDS
+    merit, before = judged(backend, start, variables, beams, operands)
+    return descend(merit, start, before, start, variables, steps, iterations, advance)
+
+
+def descend(
+    merit: MeritFunction,
+    begun: Prescription,
+    before: Evaluation,
+    start: Prescription,
+    variables: Sequence[Variable],
+    steps: int = 1,
+    iterations: int = ITERATIONS,
+    advance: Advance | None = None,
+) -> Design:
+    """The local optimum that is reached from a start, which need not be what ``merit`` took the passages from.
+
+    Args:
+        merit: with the constraints.
+        begun: what the result is compared with.
+        before: its evaluation.
+        start: where to begin; it passes all light and keeps the bounds.
+        variables: what may vary.
+        steps: of the envelope from the start's to the goal's.
+        iterations: of least squares, at most, at the last step.
+        advance: told (done, total) after each step.
+
+    Raises:
+        DesignError: constraints cannot be held together.
+    """
+    variables, operands = tuple(variables), merit.operands
+    current, evaluations, converged = start, 0, False
+    first = merit.evaluate(start).envelope
     for step in range(1, steps + 1):
         eased = operands
         if operands.envelope is not None:
-            share = step / steps
-            eased = replace(operands, envelope=before.envelope + share * (operands.envelope - before.envelope))
-        own = replace(merit, operands=eased)
-        shift: np.ndarray | None = None
-        penalty = PENALTY
-        rounds = ROUNDS if step == steps else 1
-        for turn in range(rounds):
-            current, spent, shift, worst = _round(own, current, variables, shift, penalty, iterations)
-            evaluations += spent
-            if advance is not None:
-                advance(steps + turn if step == steps else step, total)
-            if worst < HELD and turn >= 1:
-                break
-            penalty *= STEEPER
+            eased = replace(operands, envelope=first + step / steps * (operands.envelope - first))
+        most = iterations if step == steps else min(ON_THE_WAY, iterations)
+        current, spent, converged = _step(replace(merit, operands=eased), current, variables, most)
+        evaluations += spent
+        if advance is not None:
+            advance(step, steps)
     after = merit.evaluate(current)
     _require_held(merit, after)
-    if advance is not None:
-        advance(total, total)
-    return Design(current, before, after, variables, merit, evaluations, held_by(merit, current, variables, before))
+    held = held_by(merit, current, variables, before)
+    return Design(begun, current, before, after, variables, merit, evaluations, converged, held)
+
+
+def _step(
+    merit: MeritFunction, start: Prescription, variables: tuple[Variable, ...], iterations: int
+) -> tuple[Prescription, int, bool]:
+    """One constrained least squares solution, how many Jacobians it took, and whether it converged."""
+    size = _sizes(start, variables)
+
+    def evaluate(x: np.ndarray, differentiate: bool) -> Sample | None:
+        try:
+            found = merit.evaluate(start.with_values(variables, x * size), variables if differentiate else None)
+        except (AimError, BeamMissedError):
+            return None
+        g, _ = constraint_values(found, merit.operands)
+        if found.d_residuals is None:
+            return Sample(found.residuals, g)
+        slopes = _constraint_slopes(found, merit.operands) * size[:, None]
+        return Sample(found.residuals, g, found.d_residuals.T * size, slopes.T)
+
+    x0 = start.values(variables) / size
+    count = len(constraint_values(merit.evaluate(start), merit.operands)[0])
+    equal = _equations(merit.operands, count)
+    low, high = np.array([v.low for v in variables]) / size, np.array([v.high for v in variables]) / size
+    found = constrained_least_squares(evaluate, x0, equal, low, high, iterations, SETTLED, 0.1 * HELD)
+    return start.with_values(variables, found.x * size), found.jacobians, found.converged
 
 
 def rms_error(evaluation: Evaluation) -> float:
@@ -205,11 +293,11 @@ def held_by(
     size = _sizes(prescription, variables)
     fall = -2.0 * (there.d_residuals @ there.residuals) * size
     slopes = _constraint_slopes(there, merit.operands) * size[:, None]
-    equal = merit.operands.principal_distance is not None
-    at_limit = np.flatnonzero((g > -_AT_LIMIT) | (equal & (np.arange(len(g)) == 0)))
+    equal = _equations(merit.operands, len(g))
+    at_limit = np.flatnonzero((g > -_AT_LIMIT) | equal)
     columns = [slopes[:, k] for k in at_limit]
     owners = [int(k) for k in at_limit]
-    if equal:  # held in both directions
+    if equal.any():  # held in both directions
         columns.append(-slopes[:, 0])
         owners.append(0)
     weights, _ = nnls(np.stack(columns, axis=1), fall)
@@ -226,6 +314,7 @@ def held_by(
 def _limits(operands: Operands, extents: int, clearances: int) -> list[float]:
     """What every one of ``constraint_values`` asks for, metres."""
     out = [] if operands.principal_distance is None else [operands.principal_distance]
+    out += [] if operands.anamorphism is None else [operands.anamorphism] * 2
     out += [] if operands.envelope is None else [operands.envelope] * extents
     return out + ([] if operands.clearance is None else [operands.clearance] * clearances)
 
@@ -234,6 +323,7 @@ def _constraint_names(merit: MeritFunction, prescription: Prescription, names: S
     """Names that tell the constraints of one kind apart."""
     surfaces = ("scene", *prescription.names)
     passages = iter(merit.passages)
+    sides = iter(("long", "short"))
     count = len(prescription.names)
     pairs = iter([(i, j) for i in range(count) for j in range(count) if i != j])
     out = []
@@ -245,6 +335,8 @@ def _constraint_names(merit: MeritFunction, prescription: Prescription, names: S
         elif name == "envelope":
             i, j = next(pairs)
             out.append(f"envelope, from {prescription.names[j]} to {prescription.names[i]}")
+        elif name == "anamorphism":
+            out.append(f"anamorphism, f along the line too {next(sides)} for f across")
         else:
             out.append(name)
     return out
@@ -252,64 +344,6 @@ def _constraint_names(merit: MeritFunction, prescription: Prescription, names: S
 
 _AT_LIMIT = 20e-6
 """Room, metres, below which a constraint is at its limit."""
-
-
-def _round(
-    merit: MeritFunction,
-    start: Prescription,
-    variables: tuple[Variable, ...],
-    shift: np.ndarray | None,
-    penalty: float,
-    iterations: int,
-) -> tuple[Prescription, int, np.ndarray, float]:
-    """One least-squares solution; the prescription, evaluations, new shifts and the worst violation, metres."""
-    equal = merit.operands.principal_distance is not None
-    last: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-    x0 = start.values(variables)
-    size = _sizes(start, variables)
-
-    def both(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if "at" in last and np.array_equal(last["at"][0], u):
-            return last["at"][1:]
-        try:
-            evaluated = merit.evaluate(start.with_values(variables, u * size), variables)
-        except (AimError, BeamMissedError):
-            value, slope = last["at"][1:]
-            return np.full_like(value, LOST), slope
-        assert evaluated.d_residuals is not None
-        g, _ = constraint_values(evaluated, merit.operands)
-        shifted = g + (0.0 if shift is None else shift)
-        active = shifted > 0.0
-        if equal:
-            active[0] = True
-        bound = penalty * np.where(active, shifted, 0.0)
-        slopes = penalty * np.where(active, _constraint_slopes(evaluated, merit.operands), 0.0)
-        value = np.concatenate([evaluated.residuals, bound])
-        slope = np.concatenate([evaluated.d_residuals, slopes], axis=1).T * size
-        last["at"] = (u.copy(), value, slope)
-        return value, slope
-
-    bounds = (np.array([v.low for v in variables]) / size, np.array([v.high for v in variables]) / size)
-    both(x0 / size)
-    found = least_squares(
-        lambda u: both(u)[0],
-        x0 / size,
-        lambda u: both(u)[1],
-        bounds,
-        x_scale="jac",
-        max_nfev=iterations,
-        ftol=1e-6,
-        xtol=1e-13,
-        gtol=1e-13,
-    )
-    ended = start.with_values(variables, found.x * size)
-    g, _ = constraint_values(merit.evaluate(ended), merit.operands)
-    moved = g + (0.0 if shift is None else shift)
-    moved = np.concatenate([moved[: int(equal)], np.maximum(moved[int(equal) :], 0.0)]) / STEEPER
-    worst = np.maximum(g, 0.0)
-    if equal:
-        worst[0] = abs(g[0])
-    return ended, int(found.njev), moved, float(worst.max(initial=0.0))
 
 
 def _sizes(prescription: Prescription, variables: Sequence[Variable]) -> np.ndarray:
@@ -333,19 +367,19 @@ _SMALLEST = {
 
 
 def _require_held(merit: MeritFunction, after: Evaluation) -> None:
-    """Raise DesignError that names the constraints which are not held."""
+    """Raise DesignError that names the constraints which are not held, the worst first."""
     g, names = constraint_values(after, merit.operands)
-    failed = []
-    for value, name in zip(g, names, strict=True):
-        if (abs(value) if name == "principal distance" else value) > 50.0 * HELD:
-            failed.append((name, float(value)))
-    if not failed:
+    violated = np.where(_equations(merit.operands, len(g)), np.abs(g), g)
+    kinds = tuple(dict.fromkeys(name for value, name in zip(violated, names, strict=True) if not value < 50.0 * HELD))
+    if not kinds:
         return
-    parts = []
-    for name in dict.fromkeys(name for name, _ in failed):
-        worst = max((value for own, value in failed if own == name), key=abs)
-        parts.append(f"{name} (off by {1e3 * worst:.3g} mm)")
+    worst = {kind: max((k for k, name in enumerate(names) if name == kind), key=violated.__getitem__) for kind in kinds}
+    limits = np.abs(_limits(merit.operands, len(after.extents), len(after.clearances)))
+    limits = np.where(np.array(names) == "anamorphism", limits * after.distance_across, limits)
+    kinds = tuple(sorted(kinds, key=lambda kind: -violated[worst[kind]] / max(limits[worst[kind]], HELD)))
+    parts = [f"{kind} (off by {1e3 * g[worst[kind]]:.3g} mm)" for kind in kinds]
     raise DesignError(
         f"no prescription near the start holds all constraints: {', '.join(parts)}; allow a longer envelope, less "
-        "clearance, a larger field bias, or more variables"
+        "clearance, a larger field bias, or more variables",
+        kinds,
     )

@@ -28,6 +28,27 @@ def area(polygons: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * np.sum(x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1], axis=-1))
 
 
+def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> np.ndarray:
+    """Which points (N, 2) lie in any of the convex counterclockwise polygons (B, K, V, 2), (B, N).
+
+    Args:
+        polygons: some may be empty, all their corners alike.
+        points: the same for all B.
+        smallest: area up to which a polygon is nothing.
+    """
+    out = np.zeros((len(polygons), len(points)), bool)
+    full = area(polygons) > smallest
+    for k in range(polygons.shape[1]):
+        corner = polygons[:, k]
+        way = np.roll(corner, -1, axis=1) - corner
+        within = np.repeat(full[:, k, None], len(points), axis=1)
+        for v in range(corner.shape[1]):
+            x, y = (points[:, i] - corner[:, v, i, None] for i in (0, 1))
+            within &= way[:, v, 0, None] * y - way[:, v, 1, None] * x >= 0.0
+        out |= within
+    return out
+
+
 def hull(points: np.ndarray) -> np.ndarray:
     """Convex hulls of N sets of P points, (N, P, D), counterclockwise, (N, V, D)."""
     x, y = points[..., 0], points[..., 1]

@@ -23,6 +23,7 @@ import numpy as np
 
 from optics.geometry.pose import Pose
 from optics.geometry.tree import PlacedBodies
+from optics.numerics.physical_error import PhysicalError
 
 if TYPE_CHECKING:  # takes a third of a second
     import trimesh
@@ -47,11 +48,11 @@ _Rings = dict[int, list[int]]
 """Face -> its corners, counterclockwise from outside."""
 
 
-class OpenBodyError(ValueError):
+class OpenBodyError(PhysicalError, ValueError):
     """The half-spaces do not bound a body."""
 
 
-class EmptyBodyError(ValueError):
+class EmptyBodyError(PhysicalError, ValueError):
     """No body, or one thinner than MERGED, lies in all half-spaces."""
 
 
@@ -218,7 +219,7 @@ class Coating(Enum):
     GROUND = "ground"  # ground and blackened: absorbs and scatters
 
 
-class SolidError(ValueError):
+class SolidError(PhysicalError, ValueError):
     """The faces do not enclose a body."""
 
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import j1
 
+from optics.numerics.physical_error import UnphysicalError
+
 PointMap = Callable[[np.ndarray], np.ndarray]
 """A smooth map of points, (N, 2) -> (N, 2), metres."""
 
@@ -246,7 +248,7 @@ class HalfPlane:
         normal = np.array([tangent[1], -tangent[0]])
         turn = float(normal @ inward)
         if turn == 0.0:
-            raise ValueError("the map has no inverse at the half plane's point")
+            raise UnphysicalError("the map has no inverse at the half plane's point")
         return HalfPlane(point, np.sign(turn) * normal)
 
 
@@ -352,7 +354,7 @@ def _polyline(
             return corners
         more = np.maximum(pieces + 1, np.ceil(pieces * np.sqrt(bend / tolerance)))
         if np.max(more[bend > tolerance]) > _MOST_PIECES:
-            raise ValueError(f"the map bends an edge too much for a tolerance of {tolerance:.3g} m")
+            raise UnphysicalError(f"the map bends an edge too much for a tolerance of {tolerance:.3g} m")
         pieces = np.where(bend > tolerance, more, pieces).astype(int)
 
 
@@ -362,7 +364,7 @@ def _apply(point_map: PointMap, points: np.ndarray) -> np.ndarray:
     if seen.shape != points.shape:
         raise ValueError(f"the map must take (N, 2) to (N, 2), but took {points.shape} to {seen.shape}")
     if not np.all(np.isfinite(seen)):
-        raise ValueError("the map gives points that are not finite; does the target leave the field?")
+        raise UnphysicalError("the map gives points that are not finite; does the target leave the field?")
     return seen
 
 

@@ -14,11 +14,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 
+from optics.materials.material import TemperatureRange
 from optics.materials.names import unknown_name
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
 
 REFERENCE_TEMPERATURE = 293.15
 """Temperature at which the dispersion formulas hold, kelvin (20 C)."""
+SCHOTT_RANGE = TemperatureRange.celsius(
+    -100.0, 140.0, 'Schott\'s measurements of dn/dT: Hartmann, "Optical Glass", SPIE Press 2014, sec. 3.7'
+)
 
 
 @dataclass(frozen=True)
@@ -29,6 +34,7 @@ class ThermalDispersion:
         d0, d1, d2: 1/K, 1/K^2, 1/K^3.
         e0, e1: um^2/K, um^2/K^2.
         lambda_tk: um.
+        known: temperatures at which the formula holds.
     """
 
     d0: float
@@ -37,6 +43,7 @@ class ThermalDispersion:
     e0: float
     e1: float
     lambda_tk: float
+    known: TemperatureRange = SCHOTT_RANGE
 
 
 @dataclass(frozen=True)
@@ -70,22 +77,22 @@ class Glass:
             temperature_k: of the glass, kelvin.
 
         Raises:
-            ValueError: the wavelength is outside the formula's range, the temperature is not above 0 K, or the glass
-                has no temperature constants and another temperature than 293.15 K is asked for.
+            ValueError: the wavelength or the temperature is outside the formula's range, the temperature is not above
+                0 K, or the glass has no temperature constants and another temperature than 293.15 K is asked for.
         """
         if not self.shortest <= wavelength_m <= self.longest:
-            raise ValueError(
+            raise UnphysicalError(
                 f"{self.name}: wavelength {wavelength_m * 1e9:.6g} nm is outside the range of its dispersion formula, "
                 f"{self.shortest * 1e9:.6g} to {self.longest * 1e9:.6g} nm"
             )
         w2 = (wavelength_m * 1e6) ** 2
         n = sqrt(1.0 + sum(b * w2 / (w2 - c) for b, c in zip(self.b, self.c, strict=True)))
         if not 0.0 < temperature_k < float("inf"):
-            raise ValueError(f"{self.name}: a temperature must be above 0 K and finite, found {temperature_k} K")
+            raise UnphysicalError(f"{self.name}: a temperature must be above 0 K and finite, found {temperature_k} K")
         t = temperature_k - REFERENCE_TEMPERATURE
         if t == 0.0:
             return n
-        k = self._constants()
+        k = self._constants(temperature_k)
         polynomial = k.d0 * t + k.d1 * t**2 + k.d2 * t**3 + (k.e0 * t + k.e1 * t**2) / (w2 - k.lambda_tk**2)
         return n + (n * n - 1.0) / (2.0 * n) * polynomial
 
@@ -98,15 +105,18 @@ class Glass:
     def dn_dt(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
         """Derivative of the absolute index by temperature, 1/K; errors as ``index``."""
         n = self.index(wavelength_m)
-        k = self._constants()
+        k = self._constants(temperature_k)
         t = temperature_k - REFERENCE_TEMPERATURE
         w2 = (wavelength_m * 1e6) ** 2
         slope = k.d0 + 2.0 * k.d1 * t + 3.0 * k.d2 * t**2 + (k.e0 + 2.0 * k.e1 * t) / (w2 - k.lambda_tk**2)
         return (n * n - 1.0) / (2.0 * n) * slope
 
-    def _constants(self) -> ThermalDispersion:
+    def _constants(self, temperature_k: float) -> ThermalDispersion:
         if self.thermal is None:
-            raise ValueError(f"{self.name}: no constants for the change of its index with temperature are known")
+            raise UnphysicalError(f"{self.name}: no constants for the change of its index with temperature are known")
+        known = self.thermal.known
+        if not known.holds(temperature_k, temperature_k):
+            raise UnphysicalError(f"{self.name}: its index is known from {known.text}, not at {temperature_k:.6g} K")
         return self.thermal
 
 

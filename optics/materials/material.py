@@ -1,4 +1,4 @@
-"""Materials of mirrors, prisms, boards and structures: what thermo-elastic models need, at room temperature.
+"""Materials of mirrors, prisms, boards and structures: what thermo-elastic models need, near room temperature.
 
 "Checked" in a source says that the number was compared with the named one again; the rest stands as quoted.
 """
@@ -10,6 +10,38 @@ from dataclasses import dataclass
 
 from optics.materials.names import unknown_name
 from optics.numerics.frozen_map import FrozenMap
+
+ZERO_CELSIUS = 273.15
+"""Kelvin."""
+
+
+@dataclass(frozen=True)
+class TemperatureRange:
+    """Where a material's data may be used.
+
+    Attributes:
+        coldest, hottest: kelvin.
+        source: why from there and up to there.
+    """
+
+    coldest: float
+    hottest: float
+    source: str
+
+    @classmethod
+    def celsius(cls, coldest: float, hottest: float, source: str) -> TemperatureRange:
+        """The range from one temperature to another, in degrees Celsius."""
+        return cls(ZERO_CELSIUS + coldest, ZERO_CELSIUS + hottest, source)
+
+    def holds(self, coldest: float, hottest: float) -> bool:
+        """Whether all temperatures from one to another, kelvin, are inside."""
+        return self.coldest <= coldest and hottest <= self.hottest
+
+    @property
+    def text(self) -> str:
+        """In words, in kelvin as in degrees Celsius."""
+        low, high = self.coldest - ZERO_CELSIUS, self.hottest - ZERO_CELSIUS
+        return f"{self.coldest:.6g} K to {self.hottest:.6g} K ({low:.4g} to {high:.4g} degC)"
 
 
 @dataclass(frozen=True)
@@ -24,6 +56,8 @@ class Material:
         poisson_ratio: 1.
         conductivity: thermal, W/(m K).
         source: where the numbers come from.
+        known: temperatures at which the one number of its expansion stands for it: within some tenth of it, or within
+            what makers' sheets differ by.
     """
 
     name: str
@@ -33,6 +67,7 @@ class Material:
     poisson_ratio: float
     conductivity: float
     source: str
+    known: TemperatureRange
 
     def __post_init__(self) -> None:
         """Check that the numbers can be those of a solid."""
@@ -52,6 +87,9 @@ _ALL = (
         1.46,
         "Schott, ZERODUR catalogue. CTE is the middle of the makers' class: 0 +- 0.05e-6/K in class 1, mean of 0..50 C "
         "(checked against Schott's table of classes; down to 0 +- 0.007e-6/K can be had). Other sheets give E = 91 GPa",
+        TemperatureRange.celsius(
+            -50.0, 100.0, "Schott's curves stay within 0.1e-6/K of zero there (not checked); its classes are of 0..50 C"
+        ),
     ),
     Material(
         "fused silica",
@@ -62,6 +100,9 @@ _ALL = (
         1.38,
         "Corning HPFS 7980: CTE (5..35 C) and density checked against Corning's Zemax catalogue, E and Poisson's ratio "
         "from its data sheet. Heraeus states 0.51e-6/K. Conductivity: makers state 1.30 (Corning) to 1.38 (Heraeus)",
+        TemperatureRange.celsius(
+            -100.0, 200.0, "Corning's means of -100..200 C and of 0..200 C, 0.48 and 0.57e-6/K (not checked)"
+        ),
     ),
     Material(
         "N-BK7",
@@ -71,6 +112,7 @@ _ALL = (
         0.206,
         1.114,
         "Schott data sheet N-BK7; CTE of -30..70 C; CTE and density checked against Schott's Zemax catalogue",
+        TemperatureRange.celsius(-30.0, 70.0, "Schott's CTE is the mean of that range"),
     ),
     Material(
         "SiC",
@@ -81,6 +123,7 @@ _ALL = (
         180.0,
         "sintered SiC-100 (Boostec/Mersen) data sheet, room temperature; not reached for a check. Sintered SiC "
         "in general: E 370..490 GPa, Poisson's ratio 0.14..0.21, density 3000..3200 kg/m^3",
+        TemperatureRange.celsius(0.0, 50.0, "room temperature; its CTE grows by half a per cent in 1 K (not checked)"),
     ),
     Material(
         "Invar",
@@ -92,6 +135,7 @@ _ALL = (
         "Invar 36 as in Yoder, Opto-Mechanical Systems Design; CarTech's sheet has the density and 10 W/(m K). CTE "
         "hangs on the heat treatment: the fit of NIST's cryogenic data base gives 0.94e-6/K at 20 C (E 152 GPa, "
         "13.8 W/(m K)), ASTM F1684 allows 1.2..2.7e-6/K over 30..150 C",
+        TemperatureRange.celsius(-50.0, 150.0, "makers' sheets differ by more than the CTE changes by there"),
     ),
     Material(
         "Ti-6Al-4V",
@@ -101,6 +145,7 @@ _ALL = (
         0.342,
         6.7,
         "annealed, ASM/MatWeb and Allvac: CTE of 20..100 C; makers' sheets differ by 4 % in CTE and 7 % in E and k",
+        TemperatureRange.celsius(-50.0, 100.0, "CTE of 20..100 C; at -50 C it is some 6 % less (not checked)"),
     ),
     Material(
         "CFRP",
@@ -110,9 +155,17 @@ _ALL = (
         0.30,
         35.0,
         "typical quasi-isotropic high-modulus laminate, in plane; a design value, real laminates range -1..1e-6/K",
+        TemperatureRange.celsius(-100.0, 100.0, "laminates differ by more than the CTE changes by there"),
     ),
     Material(
-        "aluminium", 23.6e-6, 2700.0, 68.9e9, 0.33, 167.0, "6061-T6, ASM Metals Handbook vol. 2; CTE of 20..100 C"
+        "aluminium",
+        23.6e-6,
+        2700.0,
+        68.9e9,
+        0.33,
+        167.0,
+        "6061-T6, ASM Metals Handbook vol. 2; CTE of 20..100 C",
+        TemperatureRange.celsius(-50.0, 100.0, "CTE of 20..100 C; at -50 C it is some 8 % less (not checked)"),
     ),
     Material(
         "alumina",
@@ -124,6 +177,7 @@ _ALL = (
         "96 % alumina of circuit boards, Kyocera A-476 (density, E, k checked). Kyocera's CTE of 7.2e-6/K is the mean "
         "of 40..400 C; at 20 C it is 5.4e-6 +- 0.8e-6/K (Touloukian et al., Thermophysical Properties of Matter 13, "
         "not checked)",
+        TemperatureRange.celsius(0.0, 50.0, "at 20 C with its +- 0.8e-6/K, by which it changes in some 30 K"),
     ),
     Material(
         "AlN",
@@ -135,6 +189,7 @@ _ALL = (
         "aluminium nitride of circuit boards, makers' sheets (density 3250..3300, E 320..331 GPa, k 170..175 checked). "
         "Their CTE of 4.5..4.6e-6/K is the mean of 20..400 C; at 20 C it is 2.6..3.3e-6/K (after Slack and Bartram, "
         "J. Appl. Phys. 46, 89 (1975); not checked)",
+        TemperatureRange.celsius(0.0, 50.0, "at 20 C with what sources differ by, by which it changes in some 30 K"),
     ),
 )
 MATERIALS: Mapping[str, Material] = FrozenMap({m.name: m for m in _ALL})

@@ -9,6 +9,7 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Assembly, Element
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
@@ -17,7 +18,7 @@ DEFAULT_TOLERANCE = 1e-11
 MAX_ITERATIONS = 25
 
 
-class AimError(RuntimeError):
+class AimError(PhysicalError, RuntimeError):
     """No ray from the given place reaches the given point."""
 
 

@@ -34,6 +34,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Body
 from optics.numerics.array_math import inner, norm
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.assembly import Element, Interaction
 
 EDGE = 0.003
@@ -199,7 +200,7 @@ def prism_0(mount: Mount) -> ReflectorParts:
     shift, width = mount.length, mount.width
     half = 0.5 * width + EDGE
     if shift < half + 0.5 * width:
-        raise ValueError(
+        raise UnphysicalError(
             f"{mount.path}: a rhomboid of width {1e3 * width:.4g} mm cannot displace the beam by only "
             f"{1e3 * shift:.4g} mm; at least {1e3 * (half + 0.5 * width):.4g} mm"
         )
@@ -234,7 +235,7 @@ def hollow_transfer(mount: Mount) -> ReflectorParts:
     # how far roof_a reaches back along the transfer, over the ridge's side, and the mirror toward it
     least = sqrt(2.0) * off + (sqrt(3.0) + 1.0) * half + 3.0 * (EDGE + _thickness(width))
     if length < least:
-        raise ValueError(
+        raise UnphysicalError(
             f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot transfer the beam by only "
             f"{1e3 * length:.4g} mm; at least {1e3 * least:.4g} mm"
         )
@@ -275,7 +276,7 @@ def periscope(mount: Mount) -> ReflectorParts:
     shift, width = mount.length, mount.width
     least = width + 2.0 * (EDGE + _thickness(width))
     if shift < least:
-        raise ValueError(
+        raise UnphysicalError(
             f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot displace the beam by only "
             f"{1e3 * shift:.4g} mm; at least {1e3 * least:.4g} mm"
         )

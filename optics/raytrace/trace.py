@@ -11,6 +11,7 @@ import numpy as np
 from optics.geometry.surface import SurfaceNumbers, along, level, newton_step
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import map_leaves
+from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Interaction
 from optics.raytrace.element_numbers import CoordinateNumbers, ElementNumbers, FrameNumbers, IndexNumbers
 from optics.raytrace.graded_ray import GradedRay
@@ -33,7 +34,7 @@ CONVERGED = 1e-12
 """Largest distance to the surface of a valid hit, metres."""
 
 
-class BeamMissedError(RuntimeError):
+class BeamMissedError(PhysicalError, RuntimeError):
     """No ray of a bundle gets through a sequence."""
 
 

@@ -9,9 +9,10 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
 
 
-class TooNarrowError(ValueError):
+class TooNarrowError(PhysicalError, ValueError):
     """The collimator's aperture does not hold the camera's beam."""
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
 
 from optics.geometry.vector_shape import Disk, FiniteShape, HalfPlane, Polygon
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import gauss
 from optics.numerics.threads import one_blas_thread
 from optics.targets.target_shapes import Target
@@ -104,7 +105,7 @@ class EdgeProfile:
         """
         distance = np.asarray(distance, float)
         if distance.size and np.max(np.abs(distance)) > self.reach * (1.0 + 1e-12):
-            raise ValueError(
+            raise UnphysicalError(
                 f"the edge profile reaches {self.reach:.3g} m, but {np.max(np.abs(distance)):.3g} m is asked for"
             )
         return np.asarray(self.spline(distance))
@@ -216,7 +217,7 @@ def _finite_image(
         guard = overhang + max(LEAST_GUARD / cutoff, overhang)
     _check_positive(guard=guard)
     if overhang > 0.5 * guard:
-        raise ValueError(
+        raise UnphysicalError(
             f"a shape reaches {overhang:.3g} m beyond the window and does not fit into its period; with a guard of"
             f" {guard:.3g} m it may reach {0.5 * guard:.3g} m: enlarge the guard or the window"
         )

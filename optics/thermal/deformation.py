@@ -16,6 +16,7 @@ from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
 from optics.numerics import quadrature
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
 
 _INSIDE = 1e-9  # how far outside of a cell, in cells, a point may lie for that cell to be taken at once
 _NEAR = 1e-3  # the same for a cell to be taken when none of the nearest cells holds the point: a curved face or rim
@@ -114,7 +115,7 @@ class Finder:
                 chosen = some[better]
                 best[chosen], cell[chosen], place[chosen] = outside[better], tried[better], local[better]
         if len(points) and np.max(best) > _BEYOND:
-            raise ValueError(f"the point {points[int(np.argmax(best))].tolist()} m lies outside of the body")
+            raise UnphysicalError(f"the point {points[int(np.argmax(best))].tolist()} m lies outside of the body")
         return self._dofs[:, cell].T, np.stack(
             [self._element.lbasis(place.T, i)[0] for i in range(len(self._dofs))], axis=-1
         )

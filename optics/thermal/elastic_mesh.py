@@ -11,6 +11,7 @@ from skfem import MeshHex1, MeshHex2, MeshTet1
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
+from optics.numerics.physical_error import UnphysicalError
 
 CLOSE = 1e-3
 """Corners nearer to each other than this part of the spacing are one for a mesh: what so small a facet changes is far
@@ -57,7 +58,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, thickness: float, behind: 
             assert_never(aperture)
     sag = surface.sag(x, y)
     if not np.all(np.isfinite(sag)):
-        raise ValueError("the aperture reaches beyond the domain of its surface")
+        raise UnphysicalError("the aperture reaches beyond the domain of its surface")
     back = behind * (np.max(behind * sag) + thickness)
     # as a displacement from the sag, so that the nodes of the face carry it to the last bit
     z = sag + depth * (back - sag)
@@ -141,7 +142,7 @@ def _right_handed(mesh: MeshHex2) -> MeshHex2:
     """Return the mesh after a check that no cell is turned inside out (all have one sign of volume)."""
     volume = mesh.mapping().detDF(np.array([[0.1, 0.9, 0.5], [0.1, 0.9, 0.5], [0.1, 0.9, 0.5]]))
     if not (np.all(volume > 0.0) or np.all(volume < 0.0)):
-        raise ValueError("the face is too steep for its mesh: a cell is turned inside out")
+        raise UnphysicalError("the face is too steep for its mesh: a cell is turned inside out")
     return mesh
 
 
@@ -168,14 +169,16 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
     size = float(np.max(np.ptp(points, axis=0)))
     middle = np.mean(points, axis=0)
     if np.linalg.svd(points - middle, compute_uv=False)[-1] <= _FLAT * size:
-        raise ValueError("the polyhedron is degenerate: its vertices lie in a plane")
+        raise UnphysicalError("the polyhedron is degenerate: its vertices lie in a plane")
     try:
         hull = ConvexHull(points)
     except QhullError as error:
-        raise ValueError(f"the polyhedron is degenerate: {str(error).splitlines()[0]}") from error
+        raise UnphysicalError(f"the polyhedron is degenerate: {str(error).splitlines()[0]}") from error
     depth = np.max(points @ hull.equations[:, :3].T + hull.equations[:, 3], axis=1)
     if np.min(depth) < -_FLAT * size:
-        raise ValueError(f"the polyhedron is not convex: vertex {int(np.argmin(depth))} lies inside the others' hull")
+        raise UnphysicalError(
+            f"the polyhedron is not convex: vertex {int(np.argmin(depth))} lies inside the others' hull"
+        )
     hull = ConvexHull(_apart(points[hull.vertices], CLOSE * spacing))
     fans = [_fan(corners, faces) for corners, faces in _slabs(*_faces(hull, _PLANE * size), spacing)]
     first = np.cumsum([0, *(len(n) for n, _ in fans)])
@@ -185,7 +188,7 @@ def polyhedron_mesh(vertices: Any, spacing: float) -> MeshTet1:
     volumes = _volumes(nodes, tetrahedra)
     skin = _skin_area(nodes, tetrahedra)
     if np.min(volumes) <= 0.0 or abs(np.sum(volumes) / hull.volume - 1.0) + abs(skin / hull.area - 1.0) > 1e-9:
-        raise ValueError(
+        raise UnphysicalError(
             f"the polyhedron's mesh is not watertight: {np.sum(volumes)} m^3 in {skin} m^2 of skin instead of "
             f"{hull.volume} m^3 in {hull.area} m^2"
         )

@@ -32,6 +32,7 @@ from optics.geometry.pose import triple
 from optics.geometry.surface import GridFigure, Surface
 from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
 
 TERMS = 36
 """Zernike terms by default: to seventh order."""
@@ -57,7 +58,7 @@ _BENDING = 1e-6  # weight of a second difference of spline coefficients against 
 _ROUNDING = 1e-14  # metres rms: a residual below is rounding and gets no grid
 
 
-class NodesError(ValueError):
+class NodesError(PhysicalError, ValueError):
     """Nodes that do not describe the face.
 
     Attributes:

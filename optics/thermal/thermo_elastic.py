@@ -20,6 +20,7 @@ from scipy.sparse.linalg import splu
 from skfem import CellBasis, ElementHex2, ElementTetP2, MeshHex2, MeshTet1
 
 from optics.materials.material import Material
+from optics.numerics.physical_error import UnphysicalError
 from optics.thermal.deformation import Displacement, FaceChange, Finder, face_change, rigid_modes
 
 __all__ = [
@@ -58,7 +59,7 @@ class Kinematic:
         if points.shape != (3, 3) or not np.all(np.isfinite(points)):
             raise ValueError(f"a kinematic support needs three finite points (3, 3), found shape {points.shape}")
         if _on_a_line(points):
-            raise ValueError("the three points of a kinematic support lie on a line")
+            raise UnphysicalError("the three points of a kinematic support lie on a line")
         points.setflags(write=False)
         object.__setattr__(self, "points", points)
 
@@ -191,7 +192,9 @@ class ElasticBody:
         """Numbers of the nodes that a bond holds."""
         chosen = np.flatnonzero(np.asarray(support.where(self.nodes), bool))
         if len(chosen) < 3 or _on_a_line(self.nodes[chosen]):
-            raise ValueError(f"a bonded support needs three nodes that are not on a line; it holds {len(chosen)} nodes")
+            raise UnphysicalError(
+                f"a bonded support needs three nodes that are not on a line; it holds {len(chosen)} nodes"
+            )
         return chosen
 
     def _solved(self, load: np.ndarray, fixed: np.ndarray, values: np.ndarray) -> np.ndarray:

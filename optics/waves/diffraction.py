@@ -123,19 +123,46 @@ def _irradiance(field: PupilField, k: float, x: Grid, y: Grid, kind: type, out: 
     first = 0.0 if y.count % 2 else 0.5 * y.step
     middle = y.start + 0.5 * (y.count - 1) * y.step
     factor = field.amplitude * np.exp(1j * k * (field.eikonal + middle * field.v))
-    rows = _waves(k * field.v, Grid(first, y.step, half), 1.0, kind)
-    columns = _waves(k * field.u, x, factor, kind)
     real = np.float32 if kind is np.complex64 else np.float64
-    # a complex number is two real ones: (B, N, 2 half), its cosines and sines by turns, and (B, N, 2 C)
-    left, right = np.swapaxes(rows.view(real), 1, 2), columns.view(real)
-    product = left[..., :_SUMMED] @ right[:, :_SUMMED]
-    for start in range(_SUMMED, nodes, _SUMMED):
-        product += left[..., start : start + _SUMMED] @ right[:, start : start + _SUMMED]
-    even, odd = np.moveaxis(product.view(kind).reshape(count, half, 2, x.count), 2, 0)
+    product: np.ndarray = np.zeros((count, 2 * half, 2 * x.count), real)
+    tables = max(1, _TABLES // (count * _SUMMED * (half + x.count))) * _SUMMED
+    for begin in range(0, nodes, tables):
+        some = slice(begin, begin + tables)
+        rows = _waves(k * field.v[:, some], Grid(first, y.step, half), 1.0, kind)
+        columns = _waves(k * field.u[:, some], x, factor[:, some], kind)
+        # a complex number is two real ones: (B, N, 2 half), its cosines and sines by turns, and (B, N, 2 C)
+        left, right = np.swapaxes(rows.view(real), 1, 2), columns.view(real)
+        for start in range(0, left.shape[-1], _SUMMED):
+            product += left[..., start : start + _SUMMED] @ right[:, start : start + _SUMMED]
+    terms: np.ndarray = product.view(kind).reshape(count, half, 2, x.count)
+    even, odd = terms[:, :, 0], terms[:, :, 1]
     scale = 1.0 / field.wavelength**2
     for sign, part in ((1.0, out[:, y.count - half :]), (-1.0, out[:, half - 1 :: -1])):
         one, two = even.real - sign * odd.imag, even.imag + sign * odd.real
         np.multiply(one * one + two * two, scale, out=part)
+
+
+def at_crossings(field: PupilField, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Irradiance where a few columns of each image cross a few rows, (B, R, C): the sum of ``image``, term by term.
+
+    Phases are worked out in double, waves in single precision: right to some 1e-6 of the peak.
+
+    Args:
+        field: B pupils.
+        x: of the columns, (B, C), metres.
+        y: of the rows, (B, R), metres.
+    """
+    turns = 1.0 / field.wavelength
+
+    def waves(cycles: np.ndarray) -> np.ndarray:
+        phase = (2.0 * np.pi * (cycles - np.rint(cycles))).astype(np.float32)
+        return np.asarray(np.cos(phase) + 1j * np.sin(phase))
+
+    rows = waves(turns * (field.eikonal[:, None] + y[..., None] * field.v[:, None]))
+    rows *= field.amplitude[:, None].astype(np.float32)
+    columns = waves(turns * x[..., None] * field.u[:, None])
+    wave = rows @ np.swapaxes(columns, 1, 2)
+    return np.asarray((wave.real.astype(np.float64) ** 2 + wave.imag.astype(np.float64) ** 2) / field.wavelength**2)
 
 
 def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid) -> np.ndarray:
@@ -165,6 +192,10 @@ def image_derivative(field: PupilField, tangent: PupilTangent, x: Grid, y: Grid)
 
 _AT_ONCE = 2
 """Images whose wave tables are worked on together: they should stay in the processor's cache."""
+
+_TABLES = 1 << 21
+"""Numbers in the wave tables of some nodes, which are made and summed before the next: memory does not grow with the
+nodes. Sums have the same order whatever it is."""
 
 _SUMMED = 160
 """Nodes summed in one go: sums of sums lose less by rounding than one long sum, which matters in single precision."""

@@ -9,12 +9,28 @@ import cv2
 import numpy as np
 from scipy.special import j1
 
+from optics.numerics.physical_error import PhysicalError
 from optics.numerics.threads import cores
 
 FIT_ERROR = 1e-6
 """Largest error of the matched transfer function; kernels grow until they reach it."""
 
-MAX_REACH = 6
+MAX_REACH = 10
+"""Pixels to which a kernel may reach: enough for three quarters of what pixels can sample."""
+
+
+class UnsampledImageError(PhysicalError, ValueError):
+    """An image is too fine for its pixels, or the source's image too wide for the filter.
+
+    Attributes:
+        remedy: what would do.
+        of_source: whether that is a smaller source.
+    """
+
+    def __init__(self, text: str, remedy: str, of_source: bool) -> None:
+        self.remedy = remedy
+        self.of_source = of_source
+        super().__init__(text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +62,14 @@ class PixelResponse:
             cutoff: highest spatial frequency of the irradiance, cycles/m.
 
         Raises:
-            ValueError: the image is not well enough sampled by the pixels.
+            UnsampledImageError: the image is not well enough sampled by the pixels.
         """
         limit = cutoff * pitch  # cycles per pixel
         if limit > 0.45:
-            raise ValueError(
-                f"irradiance with {limit:.2f} cycles per pixel is not sampled by its pixels; oversample it"
+            raise UnsampledImageError(
+                f"the image has up to {limit:.2f} cycles per pixel, and its pixels sample 0.45",
+                "smaller pixels, a longer focal length, a longer wavelength or a narrower beam",
+                of_source=False,
             )
         f = np.linspace(-limit, limit, 41)
         fx, fy = (a.ravel() for a in np.meshgrid(f, f))
@@ -63,7 +81,12 @@ class PixelResponse:
             if error <= FIT_ERROR:
                 kernel.setflags(write=False)
                 return cls(kernel)
-        raise ValueError(f"the pixel response cannot be matched to better than {error:.1g}; oversample the image")
+        raise UnsampledImageError(
+            f"pixels and a source of {disk / pitch:.3g} pixels cannot be followed to better than {error:.1g} of the "
+            f"peak in an image of up to {limit:.2f} cycles per pixel",
+            "a smaller source or smaller pixels",
+            of_source=disk > pitch,
+        )
 
     def apply(self, images: np.ndarray) -> np.ndarray:
         """Filter images (B, R, C); returns (B, R - 2 reach, C - 2 reach)."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optics.numerics.physical_error import UnphysicalError
+
 WORST_BEND = 0.3
 """Largest sum of n^2 |c_n|: up to there the edge is convex and the iterations for its chords converge."""
 
@@ -37,7 +39,9 @@ class PupilEdge:
         last = len(self.harmonics) // 2
         bend = float(np.max(np.arange(-last, last + 1) ** 2 @ np.abs(self.harmonics)) - 1.0)
         if bend > WORST_BEND:
-            raise ValueError(f"the pupil's edge is too far from an ellipse: sum n^2 |c_n| = {bend:.2g} > {WORST_BEND}")
+            raise UnphysicalError(
+                f"the pupil's edge is too far from an ellipse: sum n^2 |c_n| = {bend:.2g} > {WORST_BEND}"
+            )
 
     def boundary(self, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Edge points B and dB/da at angles a of the stop's rim, complex, of the angles' shape; of S edges (S, ...)."""

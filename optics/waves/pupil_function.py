@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from optics.numerics.physical_error import PhysicalError, UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
 from optics.waves.diffraction import PupilField
@@ -88,7 +89,7 @@ class PupilFunction:
         return float(power * abs(np.linalg.det(self.axes)))
 
 
-class RoughWavefrontError(ValueError):
+class RoughWavefrontError(PhysicalError, ValueError):
     """A wavefront that the polynomials of a pupil do not follow."""
 
 
@@ -114,7 +115,7 @@ def fit_pupils(
     if np.any(dark):
         which = int(np.argmax(dark))
         share = float(np.mean(field.amplitude[which] == 0.0))
-        raise ValueError(
+        raise UnphysicalError(
             f"{share:.1%} of the pupil of image {which} carries no light: a beam that another aperture than the stop "
             "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
         )

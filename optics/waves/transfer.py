@@ -23,6 +23,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.ndimage import map_coordinates, spline_filter
 
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.pupil_function import PupilFunction
@@ -263,7 +264,7 @@ class TransferTable:
             rings = rings if radial < TABLE_TAIL else 4 * rings // 3
             arms = arms if around < TABLE_TAIL else 4 * arms // 3
             if max(rings, arms) > _MOST_NODES:
-                raise ValueError("the wavefront has too many waves for a table of its transfer function")
+                raise UnphysicalError("the wavefront has too many waves for a table of its transfer function")
         terms = _polar_terms(pupil, wavelengths, defocus, centroid, rings, arms)
         cells, directions = _DENSE
         radius = np.arange(-_PAD, cells + _PAD) / cells

@@ -108,3 +108,28 @@ def fit_wavefront(
     rms = np.sqrt(np.sum(rest**2 * share, axis=-1))
     residual = np.sqrt(np.sum((difference - fitted) ** 2 * share, axis=-1))
     return WavefrontFit(coefficients, rms, residual)
+
+
+def orthonormal_parts(
+    x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int
+) -> np.ndarray:
+    """What Zernike terms make of the rms of path differences over any part of the unit disk, in Noll's order.
+
+    The terms are made orthonormal over the weight one after the other (Gram and Schmidt, as of annular pupils: Mahajan,
+    J. Opt. Soc. Am. 71, 75, 1981). Over the whole disk they are themselves; over a part of it fitted coefficients are
+    no parts of the rms: two terms that are alike there may each be larger than the whole.
+
+    Args:
+        x: on the unit disk, (N,).
+        y: likewise.
+        weight: of a quadrature over what is lit, (N,); 0 where no light is.
+        difference: of optical paths, (N,).
+        last: highest Noll index.
+
+    Returns:
+        (last,), in the unit of ``difference``, with the signs of the terms.
+    """
+    lit = weight > 0.0
+    root = np.sqrt(weight[lit] / np.sum(weight))
+    q, r = np.linalg.qr(zernike.basis(last, x[lit], y[lit]) * root[:, None])
+    return np.asarray(np.sign(np.diag(r)) * (q.T @ (difference[lit] * root)))

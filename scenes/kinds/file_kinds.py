@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
+from scenes.specs.camera import CameraSpec, MonitorDesignSpec
+from scenes.specs.camera_design import CameraDesignSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec

@@ -11,7 +11,8 @@ from optics.design.merit_function import Operands
 from optics.geometry.surface import plane
 from optics.numerics import quadrature
 from scenes.models.camera_model import IMAGE, surface_of
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
+from scenes.specs.camera import CameraSpec, ImageSpec
+from scenes.specs.camera_design import CameraDesignSpec
 from scenes.specs.load import find_camera, load_camera
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.errors import names_text, nearest
@@ -66,7 +67,14 @@ def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: f
     """What is asked for, given the start's principal distance and envelope, metres."""
     largest = None if setup.test.envelope is None else setup.test.envelope * envelope
     camera = setup.camera
-    return Operands(camera.wavelength, principal_distance, largest, setup.test.clearance, camera.edge_margin)
+    return Operands(
+        camera.wavelength,
+        principal_distance,
+        largest,
+        setup.test.clearance,
+        camera.edge_margin,
+        anamorphism=setup.test.anamorphism,
+    )
 
 
 def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:

@@ -208,6 +208,9 @@ def _remedy(path: str) -> tuple[int, KeyPath, str]:
     return 3, ("cameras", _camera(path), "position"), "a position"
 
 
+_CLOSED = "measures and angle_errors with which its faces enclose a body, each with a part of its own"
+
+
 def _camera(path: str) -> str:
     """Name of the camera that a body belongs to; "" for the central prism."""
     return "" if path == CENTRAL_PRISM else path.split("/")[1]
@@ -224,7 +227,7 @@ def check_solids(assembly: Assembly, solids: Sequence[Solid]) -> None:
         try:
             solid_mesh(solid, placed)
         except SolidError as error:
-            raise MisplacedError(str(error), key_of(solid.path), channel_of(solid.path)) from error
+            raise MisplacedError(str(error), key_of(solid.path), _CLOSED, channel_of(solid.path)) from error
         for face in solid.faces:
             for element in assembly.elements.values():
                 if face.body in (element.body, element.body.rpartition("/")[0]) and face.body != solid.path:
@@ -251,13 +254,17 @@ def _check_inside(element: Element, face: Face, solid: Solid, placed: PlacedBodi
     if over > 0.0:
         what = f"the clear aperture of {element.name} reaches {1e3 * over:.3g} mm over the edge of its face"
         camera, side = element.name.split("/")[:2]
-        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", _key_of_edge(solid.path, across), (camera, side))
+        key, choice = _way_to_edge(solid.path, across, over)
+        raise MisplacedError(f"{solid.path}: {what}, beyond {across}", key, choice, (camera, side))
 
 
-def _key_of_edge(path: str, across: str) -> KeyPath:
-    """What to change when a clear aperture reaches over a face's edge to the face named ``across``."""
+def _way_to_edge(path: str, across: str, over: float) -> tuple[KeyPath, str]:
+    """What to change when a clear aperture reaches over a face's edge to the face named ``across``, by so many metres,
+    and what to choose there.
+    """
     if path != CENTRAL_PRISM:
-        return key_of(path)
+        return key_of(path), "a width, shift and angle_errors with faces that hold their clear apertures"
     if across == "bottom":
-        return (CENTRAL_KEY, "height")
-    return ("monitor", "return_face", "aperture")
+        return (CENTRAL_KEY, "height"), f"a height that is at least {1e3 * over:.3g} mm larger"
+    smaller = f"an aperture that is at least {2e3 * over:.3g} mm smaller, or a spread that is as much larger"
+    return ("monitor", "return_face", "aperture"), smaller

@@ -163,6 +163,13 @@ def heated_body(thermal: ThermalModel, job: JobSpec, path: str, spec: TableTempe
         if not thermal.reference + values[coldest] > 0.0:
             text = f"a node would be at {thermal.reference + values[coldest]:.4g} K"
             raise NodesError(text, "absolute temperatures under 'T [K]' or 'T [degC]', changes under 'dT [K]'")
+        known = thermal.known(path)
+        if not known.holds(thermal.reference + float(values[coldest]), thermal.reference + float(np.max(values))):
+            low, high = (thermal.reference + float(value) for value in (values[coldest], np.max(values)))
+            raise NodesError(
+                f"its nodes are at {low:.6g} K to {high:.6g} K, where {thermal.materials[path].name} is not known",
+                f"{known.text} ({known.source}), or another material in the instrument",
+            )
         return _heated(thermal, path, NodalTemperature(points, values))
     except NodesError as error:
         text = f"{spec.table} does not describe the temperature of {path}: {error}"

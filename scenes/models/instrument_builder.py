@@ -4,7 +4,7 @@ faces.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations, permutations
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ from optics.geometry.solid import Solid
 from optics.geometry.surface import plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
+from optics.materials.material import TemperatureRange, material
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
@@ -22,6 +23,7 @@ from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
 from scenes.models.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
 from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.camera_sharpness import no_cameras
 from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
 from scenes.models.monitor_chain import (
@@ -34,9 +36,10 @@ from scenes.models.monitor_chain import (
 )
 from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
+from scenes.specs.camera import CameraSpec
 from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
 from scenes.specs.job import NodeInfo
-from scenes.yaml.errors import names_text, nearest
+from scenes.yaml.errors import InputError, Issue, names_text, nearest
 
 if TYPE_CHECKING:
     from scenes.specs.instrument import InstrumentSpec
@@ -69,7 +72,18 @@ def build_instrument(
         return _build(spec, camera_specs, backend, free_beams, free_bodies)
     except MisplacedError as error:
         key = error.key if error.channel is None else spec.key_of(*error.channel, error.key)
-        raise spec.error(str(error), key) from error
+        issue = spec.issue(str(error), key, allowed=error.remedy)
+        raise InputError(*_no_cameras(camera_specs, backend), issue) from error
+    except InputError as error:
+        first = _no_cameras(camera_specs, backend)
+        if not first:
+            raise
+        raise InputError(*first, *error.issues) from error
+
+
+def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[Issue, ...]:
+    """What is wrong with the cameras themselves, if anything is; of an instrument that is refused."""
+    return no_cameras([one for one in camera_specs.values() if isinstance(one, CameraSpec)], backend)
 
 
 def _build(
@@ -121,6 +135,7 @@ def _build(
     farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
     spread = max(x for x, _ in farthest), max(y for _, y in farthest)
     solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
+    _check_temperature(spec, solids)
     index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
     cameras = FrozenMap({name: derived[site.camera] for name, site in spec.cameras.items()})
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
@@ -144,6 +159,25 @@ def _build(
     if free_beams:
         check_beams(instrument, backend)
     return instrument
+
+
+def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:
+    """Refuse an instrument that is at home where the data of its materials are not."""
+    named = {name: f"materials.{name}" for name in type(spec.materials).model_fields}
+    used = {material(getattr(spec.materials, name)): where for name, where in named.items()}
+    used |= {material(solid.material): solid.path for solid in solids}
+    unknown = [stuff for stuff in used if not stuff.known.holds(spec.temperature, spec.temperature)]
+    if unknown:
+        least = min(unknown, key=lambda stuff: stuff.known.hottest - stuff.known.coldest)
+        ends = max(stuff.known.coldest for stuff in used), min(stuff.known.hottest for stuff in used)
+        all_of_them = TemperatureRange(*ends, "all materials").text
+        raise spec.error(
+            f"the expansion of {least.name} ({used[least]}) is known from {least.known.text} only"
+            f" ({least.known.source})",
+            ("temperature",),
+            found=f"{spec.temperature:.6g} K",
+            allowed=f"{all_of_them} for all of its materials together, or other materials",
+        )
 
 
 def _check_alike(spec: InstrumentSpec, assembly: Assembly) -> None:
@@ -175,6 +209,12 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
     for first, second in combinations(out, 2):
         chips = np.abs(np.subtract(first.ccd, second.ccd)) < 2.0 * half
         pinholes = [np.abs(np.subtract(a.pinhole, b.ccd)) < half + edge for a, b in permutations((first, second))]
+        if not np.all(chips) and np.any(np.all(pinholes, axis=-1)) and edge > max(half):
+            raise spec.error(
+                f"the pinholes are wider than the CCDs: that of {first.key} or {second.key} reaches to the other CCD",
+                ("monitor", "reticle", "pinhole"),
+                allowed=f"less than {2e3 * max(half):.4g} mm",
+            )
         if np.all(chips) or np.any(np.all(pinholes, axis=-1)):
             apart = 1e3 * abs(second.ccd[1] - first.ccd[1])
             raise spec.error(

@@ -9,6 +9,7 @@ import numpy as np
 
 from optics.geometry.solid import Solid
 from optics.geometry.tree import PlacedBodies
+from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
@@ -73,17 +74,18 @@ class Instrument:
         return [2 * i + axis for i in self.channels_of(camera) for axis in (0, 1)]
 
 
-class MisplacedError(ValueError):
+class MisplacedError(PhysicalError, ValueError):
     """A part of the monitor cannot stand as the instrument's file says.
 
     Attributes:
         key: of the file, what to change, as it is for all channels.
+        remedy: what to choose there.
         channel: camera and name of the channel that it is about, which may say it itself; None for none.
     """
 
-    def __init__(self, problem: str, key: KeyPath, channel: tuple[str, str] | None = None) -> None:
+    def __init__(self, problem: str, key: KeyPath, remedy: str, channel: tuple[str, str] | None = None) -> None:
         super().__init__(problem)
-        self.key, self.channel = key, channel
+        self.key, self.remedy, self.channel = key, remedy, channel
 
 
 def key_of(path: str) -> KeyPath:

@@ -11,6 +11,7 @@ import numpy as np
 
 from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.geometry.surface import Surface
+from optics.numerics.physical_error import UnphysicalError
 from scenes.models.camera_model import CameraModel
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.nda
     x, y = 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v
     z = surface.sag(x, y)
     if not np.all(np.isfinite(z)):
-        raise ValueError("a surface ends before its clear aperture does")
+        raise UnphysicalError("a surface ends before its clear aperture does")
     n = cells + 1
     i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
     triangles = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])

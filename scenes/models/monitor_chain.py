@@ -31,13 +31,15 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel
+from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
 from scenes.yaml.errors import KeyPath
 
 if TYPE_CHECKING:
     from scenes.specs.instrument import ChannelParts, InstrumentSpec
 
 
+_CARRIED = "a field and a pupil_offset whose beam all mirrors of the camera carry"
+_FACET = "a position to which the prisms, with their angle_errors, lead the beam"
 _OUTLINE = 2000  # points of a clear aperture's edge: a few millimetres apart at most
 
 
@@ -106,7 +108,7 @@ def _leaving(
             try:
                 _traced_out(model, [channel], distance, to_base, backend)
             except MisplacedError as error:
-                raise MisplacedError(str(error), error.key, (channel.camera, channel.side)) from error
+                raise MisplacedError(str(error), error.key, error.remedy, (channel.camera, channel.side)) from error
         raise
 
 
@@ -134,7 +136,7 @@ def _traced_out(
     position, direction = fan.at(q)
     chief = trace(backend, outgoing, make_rays(backend, position, direction)).numpy()
     if not chief[3].all():
-        raise MisplacedError(f"light of the monitor channels {where} misses a mirror", ("monitor", "field"))
+        raise MisplacedError(f"light of the monitor channels {where} misses a mirror", ("monitor", "field"), _CARRIED)
     centres = chief[0][0, 0::2, :2] + np.array([c.pupil_offset for c in channels])
     q = _aimed(backend, outgoing, fan, np.repeat(centres, 2, axis=0)[None], where, ("monitor", "field"), start=q)
     position, direction = fan.at(q)
@@ -276,7 +278,9 @@ def _made(
     try:
         return reflector.parts(mount)
     except ValueError as error:
-        raise spec.error(str(error), spec.key_of(channel.camera, channel.side, ("monitor", prism, key))) from error
+        problem, _, least = str(error).partition("; ")
+        where = spec.key_of(channel.camera, channel.side, ("monitor", prism, key))
+        raise spec.error(problem, where, allowed=least or "measures with which the prism can be made") from error
 
 
 def _turn(tilt: tuple[float, float], about: tuple[float, float, float]) -> Pose:
@@ -378,7 +382,8 @@ def _aimed(
         return aim(backend, systems, fan, target, start)[0]
     except (AimError, np.linalg.LinAlgError) as error:
         why = f": {error}" if isinstance(error, AimError) else ""
-        raise MisplacedError(f"no light of {channels} gets to where it has to go{why}", key) from error
+        choice = _CARRIED if key[0] == "monitor" else _FACET
+        raise MisplacedError(f"no light of {channels} gets to where it has to go{why}", key, choice) from error
 
 
 def _missed(
@@ -395,9 +400,12 @@ def _missed(
             what += f": it passes {1e3 * off:.3g} mm beside the clear aperture"
         elif element.interaction is Interaction.TOTAL:
             what += ", or is not totally reflected there"
-        what += "; where it goes depends on pupil_offset, monitor.field and the prisms' angle_errors"
-        return MisplacedError(what, key_of(element.body), (channel.camera, channel.side))
-    return MisplacedError(f"the middle of the beam {channel.key} misses its facet", (CENTRAL_KEY, "position"))
+        choice = "a pupil_offset, monitor.field and angle_errors of the prisms with which it passes"
+        if prism_of(element.body) is None and element.body != channel.face_body:
+            choice = f"{_CARRIED}, or a camera with another {element.body.rpartition('/')[2]}"
+        return MisplacedError(what, key_of(element.body), choice, (channel.camera, channel.side))
+    problem = f"the middle of the beam {channel.key} misses its facet"
+    return MisplacedError(problem, (CENTRAL_KEY, "position"), _FACET)
 
 
 def beside(

@@ -218,7 +218,9 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
     try:
         beams = monitor_beams(instrument, backend, _WHOLE)
     except AimError as error:
-        raise MisplacedError(f"light of the monitor does not get to its return faces: {error}", ("monitor",)) from error
+        problem = f"light of the monitor does not get to its return faces: {error}"
+        choice = "a field, prisms and a pupil_offset with which the mirrors of both cameras carry the whole beam"
+        raise MisplacedError(problem, ("monitor",), choice) from error
     placed = instrument.assembly.place()
     bodies = convex_bodies(instrument, placed)
     hulls = {path: ConvexHull(corners).equations for path, corners in bodies.items()}
@@ -285,7 +287,11 @@ def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
     off = beside(assembly, backend, names[:count], beam.position, beam.direction, ~alive)
     how = "" if off is None else f": it reaches {1e3 * off:.3g} mm beyond the clear aperture"
     key = key_of(element.body)
-    key = instrument.spec.key_of(channel.camera, channel.side, key if key[0] == "cameras" else (*key, "width"))
+    if element.body == channel.face_body:
+        key = ("monitor", "return_face", "aperture")
+    elif key[0] != "cameras":
+        key = (*key, "width")
+    key = instrument.spec.key_of(channel.camera, channel.side, key)
     return instrument.spec.issue(
         f"the beam {channel.key} is cut at {element.name} on {element.body}{how}",
         key,

@@ -21,7 +21,8 @@ from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.surface import Surface
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
-from optics.materials.material import Material, material
+from optics.materials.material import Material, TemperatureRange, material
+from optics.numerics.physical_error import PhysicalError
 from optics.thermal.deformation import Displaced, Displacement, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, carried_motion
@@ -45,7 +46,7 @@ Held = tuple[ElasticBody, Kinematic]
 """Finite elements and what holds them."""
 
 
-class TemperatureError(ValueError):
+class TemperatureError(PhysicalError, ValueError):
     """A temperature that cannot be.
 
     Attributes:
@@ -122,7 +123,7 @@ class ThermalModel:
         return out
 
     def check(self, temperatures: Mapping[str, Temperature]) -> None:
-        """Check that no body gets to 0 K, and that the indices of all glasses are known at their temperatures.
+        """Check that no body gets to where its material's expansion or its glass's index is not known.
 
         Raises:
             TemperatureError: names the body.
@@ -137,17 +138,43 @@ class ThermalModel:
                     origin,
                     f"changes from the instrument's {self.reference:.6g} K that stay above 0 K everywhere on the body",
                 )
+            self._check_known(path, field, origin)
             if path in self._solids and self._solids[path].transparent:
                 try:
                     self._index(path, field)
                 except ValueError as error:
                     raise TemperatureError(f"{path}: {error}", origin, "a glass with known dn/dT") from error
 
+    def _check_known(self, path: str, field: Temperature, origin: str) -> None:
+        coldest, hottest, known = self.coldest(path, field), self.hottest(path, field), self.known(path)
+        if field != Temperature() and not known.holds(coldest, hottest):
+            reached = coldest if coldest < known.coldest else hottest
+            raise TemperatureError(
+                f"{path} would be at {reached:.6g} K, where the expansion of {self.materials[path].name} is not known",
+                origin,
+                f"{known.text} on all of {path} ({known.source}), or another material for it in the instrument",
+            )
+
+    def known(self, path: str) -> TemperatureRange:
+        """Temperatures at which the data of a body's material may be used: expansion, and index where it is glass."""
+        stuff = self.materials[path].known
+        if path in self._solids and self._solids[path].transparent:
+            thermal = glass(self._solids[path].material).thermal
+            if thermal is not None:
+                low, high = max(stuff.coldest, thermal.known.coldest), min(stuff.hottest, thermal.known.hottest)
+                source = stuff.source if (low, high) == (stuff.coldest, stuff.hottest) else thermal.known.source
+                return TemperatureRange(low, high, source)
+        return stuff
+
     def coldest(self, path: str, field: Temperature) -> float:
         """Lowest absolute temperature that a field makes on a body, kelvin: at its corners for optics, else at its
         origin.
         """
         return float(self.reference + field.change + np.min(self._extent(path) @ np.array(field.gradient)))
+
+    def hottest(self, path: str, field: Temperature) -> float:
+        """Highest, likewise."""
+        return float(self.reference + field.change + np.max(self._extent(path) @ np.array(field.gradient)))
 
     def _extent(self, path: str) -> np.ndarray:
         """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""

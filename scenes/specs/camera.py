@@ -1,5 +1,5 @@
 """A camera, as a file in scenes/library/cameras gives it: its optical prescription, the line CCDs of its spectral bands
-with time delay and integration; and what is to be designed: a camera's prescription, or the layout of a monitor.
+with time delay and integration; and what is to be designed of the layout of a monitor.
 """
 
 from math import isinf
@@ -90,45 +90,6 @@ class BandSpec(Spec):
     def nyquist(self) -> float:
         """Nyquist frequency of the pixels, cycles/m."""
         return 0.5 / self.pitch
-
-
-IMAGE = "image"
-Vary = Literal["radius", "conic", "A4", "A6", "A8", "z"]
-
-
-class CameraDesignSpec(Spec):
-    """What is to be optimised.
-
-    The focal length along the line, the entrance pupil, the field and its bias stay as they are.
-
-    Attributes:
-        camera: prescription to start from, by name or path.
-        name: of the new camera.
-        description: of the new camera, for people.
-        vary: mirror, or ``image`` -> what of it varies.
-        envelope: extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
-        clearance: least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the
-            focal plane that it passes, metres.
-        steps: in which the envelope is brought from the start's to the goal's.
-        seed: nothing is drawn; there for the command's sake.
-    """
-
-    camera: Reference
-    name: Name
-    description: Text = ""
-    vary: Annotated[Named[tuple[Vary, ...]], Field(min_length=1)]
-    envelope: Annotated[float, Quantity(SCALE, above_zero=True, largest="200 percent")] | None = None
-    clearance: Length = 0.02
-    steps: Annotated[Whole, Field(ge=1, le=100)] = 8
-    seed: Annotated[Whole, Field(ge=0, le=0)] = 0
-
-    @model_validator(mode="after")
-    def _image_moves_only_along_z(self) -> "CameraDesignSpec":
-        for name, quantities in self.vary.items():
-            wrong = [q for q in quantities if name == IMAGE and q != "z"]
-            if wrong:
-                raise Problem("the image is a plane", wrong[0], "z", within=("vary", name))
-        return self
 
 
 LengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]

@@ -12,7 +12,7 @@ from scenes.specs.course import CourseSpec
 from scenes.specs.job import JobSpec, pivot_problem
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.translate import validate
 from scenes.yaml.units import (
     ANGLE,
@@ -73,7 +73,7 @@ def with_table(job: JobSpec) -> JobSpec:
         return job
     path = Path(job.source.file).parent / job.course.table
     if not is_file(path):
-        raise job.course.error(f"no such file: {path}", ("table",), allowed="a CSV file, relative to this file")
+        raise job.course.error(unusable(path), ("table",), allowed="a CSV file, relative to this file")
     course = _read(path, job.course)
     problem = pivot_problem(job.perturb, course)
     if problem is not None:

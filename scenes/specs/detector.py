@@ -12,7 +12,8 @@ from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Name, Named, Number, Spec, Text, Whole
 from scenes.yaml.units import LENGTH, TIME, format_quantity
 
-AreaSide = Annotated[Whole, Field(ge=24, le=8192)]
+LEAST_SIDE = 24
+AreaSide = Annotated[Whole, Field(ge=LEAST_SIDE, le=8192)]
 """Rows or columns of an area CCD, from what a spot can be measured in on."""
 PixelPitch = Annotated[float, Quantity(LENGTH, smallest="0.5 um", largest="1 mm")]
 """Metres; pixels smaller than the smallest that are made would be a mistaken unit."""

@@ -16,7 +16,7 @@ from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradien
 from scenes.yaml.bsdf_file import ENDING, read_bsdf
 from scenes.yaml.coating_file import read_coating
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest
-from scenes.yaml.input_file import digest_of, is_file
+from scenes.yaml.input_file import digest_of, is_file, unusable
 from scenes.yaml.node_table import (
     DECKS_NEED,
     HEAT_DECKS_NEED,
@@ -161,7 +161,7 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     place = (*key, "table")
     if not is_file(path):
         kinds = names_text((*TABLES, *MESHES))
-        raise owner.error(f"no such file: {path}", place, allowed=f"a file ({kinds}), relative to this one")
+        raise owner.error(unusable(path), place, allowed=f"a file ({kinds}), relative to this one")
     ending = path.suffix.lower()
     if ending in INPUT_DECKS:
         text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that can be read here"
@@ -317,7 +317,7 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
         place = (*key, kind, what)
         path = (Path(owner.source.file).parent / table.table).absolute()
         if not is_file(path):
-            raise owner.error(f"no such file: {path}", place, allowed="a file, relative to this one")
+            raise owner.error(unusable(path), place, allowed="a file, relative to this one")
         ending = path.suffix.lower()
         right = (ENDING,) if what == "bsdf" else TABLES
         if ending not in right:

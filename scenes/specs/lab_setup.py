@@ -19,7 +19,7 @@ from scenes.specs.load import (
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import names_text, nearest
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.yaml_file import read_yaml
 
@@ -183,7 +183,7 @@ def _found(files: Spec, name: str, path: Path) -> Path:
     except OSError:
         beside = []
     meant = nearest(path.name, beside)
-    raise files.error(f"no such file: {path}", (name,), allowed="a CSV file, relative to this file", suggestion=meant)
+    raise files.error(unusable(path), (name,), allowed="a CSV file, relative to this file", suggestion=meant)
 
 
 def _require_plane(test: Spec, camera: CameraSpec) -> None:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
+from scenes.specs.camera import CameraSpec, MonitorDesignSpec
+from scenes.specs.camera_design import CameraDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
@@ -17,7 +18,7 @@ from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
 from scenes.specs.turntable_test import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
@@ -244,7 +245,7 @@ def find_named(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
         raise owner.error(problem, key, found=reference, allowed=allowed, suggestion=meant)
     if not is_file(path):
         meant = nearest(path.stem, library_names(folder))
-        raise owner.error(f"no such file: {path}", key, allowed=_names_and_paths(folder), suggestion=meant)
+        raise owner.error(unusable(path), key, allowed=_names_and_paths(folder), suggestion=meant)
     return path
 
 

@@ -170,24 +170,32 @@ class BaseSpec(Spec):
     file: Reference
 
 
+TOTAL, NOISE = "_sigma", "_sigma_noise"
+"""Endings of standard deviations: of all that is stated, and of that what noise does; in results and of columns."""
+
+
 class ResponseSpec(Spec):
     """A number that is kept of every run.
 
     Attributes:
         key: where in the results: the run folder's JSON file without .json, then its keys and list indices.
         unit: of the number; read from the ending of its key if it is not given.
-        sigma: where its standard deviation stands, if the results have one.
+        sigma: where its standard deviation stands, if the results have one: of all that is stated, for readings of the
+            monitor noise and what may have moved and cannot be told apart.
+        noise: where its standard deviation by the noise of the run alone stands, which differs from run to run; for
+            readings of the monitor the key that ends in ``_sigma_noise``.
         minus: where a number stands that is subtracted: an error is what is recovered minus what is true.
     """
 
     key: Key
     unit: Text | None = None
     sigma: Key | None = None
+    noise: Key | None = None
     minus: Key | None = None
 
     @model_validator(mode="after")
     def _is_of_one_unit(self) -> "ResponseSpec":
-        for name, key in (("minus", self.minus), ("sigma", self.sigma)):
+        for name, key in (("minus", self.minus), ("sigma", self.sigma), ("noise", self.noise)):
             if key is not None and unit_of(key) != unit_of(self.key):
                 found = f"{unit_of(key) or 'no unit'} and {unit_of(self.key) or 'no unit'}"
                 raise Problem("two units in one response", found, "keys that end in the same unit", within=(name,))
@@ -197,6 +205,12 @@ class ResponseSpec(Spec):
     def units(self) -> str:
         """The unit, empty for a pure number."""
         return self.unit if self.unit is not None else unit_of(self.key)
+
+    @property
+    def stated(self) -> dict[str, KeyPath]:
+        """Ending of a column of the result -> where the standard deviation in it stands."""
+        given = {TOTAL: self.sigma, NOISE: self.noise}
+        return {ending: key for ending, key in given.items() if key is not None}
 
 
 class ThresholdSpec(Spec):
@@ -331,14 +345,16 @@ class StudySpec(Spec):
 
     def _clash(self) -> str | None:
         """A name that two columns of the result would have."""
-        sigmas = [f"{name}_sigma" for name, response in self.responses.items() if response.sigma is not None]
-        names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *sigmas]
+        stated = [f"{name}{ending}" for name, one in self.responses.items() for ending in one.stated]
+        names = ["run", "failed", "message", "seed", *self.factors, *self.responses, *stated]
         return next((name for name in names if names.count(name) > 1), None)
 
 
 def unit_of(key: KeyPath) -> str:
-    """The unit that the ending of a result's key says, empty if it says none: "um" for d_f_um and d_f_um_sigma."""
+    """The unit that the ending of a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma and
+    d_f_um_sigma_noise.
+    """
     last = next((str(part) for part in reversed(key) if isinstance(part, str)), "")
-    last = last.removesuffix("_sigma")
+    last = last.removesuffix(NOISE).removesuffix(TOTAL)
     endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
     return UNITS[max(endings, key=len)] if endings else ""

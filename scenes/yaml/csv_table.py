@@ -1,15 +1,15 @@
 """Tables of measured numbers from CSV files: heads with units, `time [s], x [mm]`, and one row for each reading.
 
 Columns may stand in any order and in any unit of their kind; numbers come out in SI units. Lines that are empty or
-begin with # are left out. A million rows take some seconds.
+begin with # are left out. A million rows take some seconds. Rows become numbers some thousands at a time, so that a
+table takes little more memory than its text and its numbers.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +20,8 @@ from scenes.yaml.errors import LONGEST_SHOWN, InputError, Issue, Problem, names_
 from scenes.yaml.input_file import read_text
 from scenes.yaml.units import TEMPERATURE, Kind, parse_quantity, unit_ratio
 
+LARGEST_NUMBER = 1e100
+"""In a table, in its unit: whatever is worked out of larger ones leaves the range of floating-point numbers."""
 LARGEST_TABLE = 1 << 30
 """Bytes."""
 _HEAD = re.compile(r"(?P<name>[^\[\]]*?)\s*(?:\[(?P<unit>[^\[\]]*)\])?")
@@ -112,27 +114,41 @@ def read_table(path: str | Path, columns: Sequence[Column], least_rows: int = 1)
             allowed; with the line and the head of the column.
     """
     file = str(path)
-    lines, rows = _rows(file, table_text(path))
+    pieces = _rows(file, table_text(path))
+    lines, rows = next(pieces, ([], []))
     allowed = ", ".join(repr(c.head) + ("" if c.needed else " (may be missing)") for c in columns)
     if not rows:
         raise InputError(Issue("an empty table", file, 1, allowed=f"a row of heads: {allowed}"))
     found = _heads(file, lines[0], rows[0], columns, allowed)
-    if len(rows) <= least_rows:
+    if len(rows) <= least_rows and len(rows) < _TOGETHER:
         text = f"{len(rows) - 1} rows below the heads"
         raise InputError(Issue(text, file, lines[0], allowed=f"{least_rows} or more"))
-    width, body = len(rows[0]), rows[1:]
-    uneven = next((k for k, row in enumerate(body) if len(row) != width), None)
+    heads = [head.strip() for head in rows[0]]
+    parts = [_numbers(file, lines[1:], rows[1:], heads, found)]
+    parts += [_numbers(file, lines, rows, heads, found) for lines, rows in pieces]
+    numbers = np.concatenate([own for own, _ in parts])
+    values = {column.name: np.concatenate([own[column.name] for _, own in parts]) for column, _, _ in found}
+    return Table(file, numbers, FrozenMap({column.name: heads[k] for column, k, _ in found}), FrozenMap(values))
+
+
+def _numbers(
+    file: str,
+    lines: Sequence[int],
+    rows: Sequence[Sequence[str]],
+    heads: Sequence[str],
+    found: Sequence[tuple[Column, int, _Scale]],
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Lines of some rows, and their SI numbers or names in the columns that were found."""
+    width = len(heads)
+    uneven = next((k for k, row in enumerate(rows) if len(row) != width), None)
     if uneven is not None:
-        text = f"{len(body[uneven])} cells under {width} heads"
+        text = f"{len(rows[uneven])} cells under {width} heads"
         allowed = "as many cells as heads, and a point in decimal numbers"
-        raise InputError(Issue(text, file, lines[1 + uneven], allowed=allowed))
-    cells = list(zip(*body, strict=True))
-    numbers = np.array(lines[1:])
-    values = {
-        column.name: _values(file, numbers, rows[0][k].strip(), column, cells[k], scale) for column, k, scale in found
+        raise InputError(Issue(text, file, lines[uneven], allowed=allowed))
+    numbers, cells = np.array(lines, int), list(zip(*rows, strict=True)) or [()] * width
+    return numbers, {
+        column.name: _values(file, numbers, heads[k], column, cells[k], scale) for column, k, scale in found
     }
-    heads = {column.name: rows[0][k].strip() for column, k, _ in found}
-    return Table(file, numbers, FrozenMap(heads), FrozenMap(values))
 
 
 def table_text(path: str | Path, what: str = "a CSV file", most: int = LARGEST_TABLE) -> str:
@@ -149,20 +165,39 @@ def table_text(path: str | Path, what: str = "a CSV file", most: int = LARGEST_T
     return read_text(path, what, most, (Path(path).suffix,))
 
 
-def _rows(file: str, text: str) -> tuple[list[int], list[list[str]]]:
-    """Lines and cells of the rows that hold something."""
-    first = next((row for row in text.splitlines() if row.strip() and not row.lstrip().startswith("#")), "")
+_TOGETHER = 1 << 16
+"""Rows that are cells of text at a time."""
+_LINE = re.compile(r"[^\r\n]*(?:\r\n?|\n)|[^\r\n]+")
+
+
+def lines_of(text: str) -> Iterator[str]:
+    """The lines of a text with their ends, as a file opened with ``newline=""`` has them, one at a time.
+
+    Args:
+        text: whole.
+    """
+    return (match[0] for match in _LINE.finditer(text))
+
+
+def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
+    """Lines and cells of the rows that hold something, ``_TOGETHER`` at a time."""
+    first = next((row for row in lines_of(text) if row.strip() and not row.lstrip().startswith("#")), "")
     delimiter = next((sign for sign in _DELIMITERS if sign in first), ",")
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
-    lines, rows = [], []
+    reader = csv.reader(lines_of(text), delimiter=delimiter, strict=True)
+    lines: list[int] = []
+    rows: list[list[str]] = []
     try:
         for row in reader:
             if row and any(row) and not row[0].lstrip().startswith("#") and any(map(str.strip, row)):
                 lines.append(reader.line_num)
                 rows.append(row)
+                if len(rows) == _TOGETHER:
+                    yield lines, rows
+                    lines, rows = [], []
     except csv.Error as error:
         raise InputError(Issue(f"not a CSV file: {error}", file, reader.line_num)) from None
-    return lines, rows
+    if rows:
+        yield lines, rows
 
 
 def _heads(
@@ -239,9 +274,13 @@ def _values(file: str, lines: np.ndarray, head: str, column: Column, cells: Sequ
     odd = next((k for k, cell in enumerate(cells) if "_" in cell), None)
     if odd is not None:  # Python takes 1_000 for a number
         raise wrong(odd, "not a number", "a number")
+    finite = np.isfinite(numbers)
+    huge = finite & (np.abs(numbers) > LARGEST_NUMBER)
+    numbers = np.where(huge, 0.0, numbers) if np.any(huge) else numbers
     numbers = (numbers + offset if offset else numbers) * factor
     for bad, problem in (
-        (~np.isfinite(numbers), "not a finite number"),
+        (~finite, "not a finite number"),
+        (huge, "larger than any quantity"),
         ((numbers < column.least) | (numbers > column.most), "out of range"),
         (column.whole & (numbers != np.floor(numbers)), "not a whole number"),
     ):

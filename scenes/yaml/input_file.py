@@ -23,17 +23,15 @@ def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> b
         InputError: there is none, it cannot be read or is too large.
     """
     file = str(path)
+    # A device or a pipe could be endless or block.
+    wrong = no_file(Path(path))
+    if wrong == MISSING:
+        raise InputError(Issue(wrong, file, suggestion=_file_beside(Path(path), ends)))
+    if wrong is not None:
+        raise InputError(Issue(wrong, file, allowed=what))
     try:
-        mode = Path(path).stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise InputError(Issue("is a directory, not a regular file", file, allowed=what))
-        # A device or a pipe could be endless or block.
-        if not stat.S_ISREG(mode):
-            raise InputError(Issue("is not a regular file", file, allowed=what))
         with Path(path).open("rb") as stream:
             content = stream.read(most + 1)
-    except FileNotFoundError:
-        raise InputError(Issue("no such file", file, suggestion=_file_beside(Path(path), ends))) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(Issue(f"cannot be read: {reason or error}", file)) from None
@@ -58,12 +56,44 @@ def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> st
         raise InputError(Issue(problem, str(path), line)) from None
 
 
+MISSING = "no such file"
+_KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+
+
 def is_file(path: Path) -> bool:
     """Whether there is a file; there is none of a name that no file can have."""
+    return no_file(path) is None
+
+
+def no_file(path: Path) -> str | None:
+    """Why a path is not that of a regular file, found without opening it; None where it is.
+
+    Args:
+        path: of what may be missing, or of a kind that could be endless or block: a device, a pipe.
+
+    Returns:
+        MISSING, "is a directory, not a regular file", "cannot be read: ..." and the like.
+    """
     try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
+        mode = stat.S_IFMT(path.stat().st_mode)
+    except FileNotFoundError:
+        return MISSING
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        return f"cannot be read: {reason or error}"
+    return None if mode == stat.S_IFREG else f"is {_KINDS.get(mode, 'something else')}, not a regular file"
+
+
+def unusable(path: Path) -> str:
+    """The same with the path, for a message at the key of the file that names it; of a path that is not a file's."""
+    wrong = no_file(path) or MISSING
+    return f"{wrong}: {path}" if wrong == MISSING else f"{path} {wrong}"
 
 
 def digest_of(path: Path) -> str:

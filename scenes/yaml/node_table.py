@@ -1,4 +1,4 @@
-"""Nodes of finite-element programs, with displacements or temperatures, from CSV files, and from meshes by meshio."""
+"""Nodes of finite-element programs, with displacements or temperatures, from CSV files, and from meshes by meshlane."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import LEAST_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
-from scenes.yaml.input_file import digest_of, is_file
+from scenes.yaml.input_file import digest_of, is_file, no_file
 from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_ratio
 
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
@@ -44,7 +44,7 @@ ZERO_CELSIUS = 273.15
 MOST_NODES = 1_000_000
 TABLES = (".csv", ".tsv", ".txt")
 MESHES = FrozenMap({".vtu": "vtu", ".vtk": "vtk", ".msh": "gmsh", ".med": "med"})
-"""Ending of a mesh's file -> its format in meshio: those that carry displacements of the nodes, all in one file."""
+"""Ending of a mesh's file -> its format in meshlane: those that carry displacements of the nodes, all in one file."""
 INPUT_DECKS = (".inp", ".bdf", ".nas", ".fem", ".dat", ".cdb", ".ans", ".rst", ".op2", ".f06", ".odb")
 """Input of NASTRAN, ANSYS and Abaqus has no results, and their own result files are not read."""
 HEAT_DECKS_NEED = "a table with the heads 'x [mm]', 'y [mm]', 'z [mm]', 'T [degC]', or a .vtu file"
@@ -166,18 +166,22 @@ def _one_load_case(table: Table, points: np.ndarray, values: np.ndarray, what: s
 
 
 def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes of a mesh, metres, (N, 3), and their vectors (N, 3) or temperatures (N,) as they stand in it, by meshio,
+    """Nodes of a mesh, metres, (N, 3), and their vectors (N, 3) or temperatures (N,) as they stand in it, by meshlane,
     whose readers end in any exception.
     """
-    import meshio  # only a job with a mesh waits for it
+    import meshlane  # only a job with a mesh waits for it
 
     file = str(path)
-    if not is_file(path):
-        raise InputError(Issue("no such file", file, allowed="a mesh"))
+    wrong = no_file(path)
+    if wrong is not None:
+        raise InputError(Issue(wrong, file, allowed="a mesh"))
     if path.stat().st_size > LARGEST_TABLE:
         raise InputError(Issue("too large", file, allowed="at most 1 GB"))
+    form = MESHES[path.suffix.lower()]
     try:
-        mesh = _in_time(path, lambda: meshio.read(file, file_format=MESHES[path.suffix.lower()]))
+        # of a file of HDF5 that it cannot read meshlane keeps the file open
+        content = io.BytesIO(path.read_bytes()) if form == "med" else file
+        mesh = _in_time(path, lambda: meshlane.read(content, file_format=form))
         points = np.asarray(mesh.points, np.float64)
         shapes = [(len(points), 3)] if what == "vectors" else [(len(points),), (len(points), 1)]
         fields = {
@@ -189,7 +193,7 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
         raise
     except (Exception, SystemExit) as error:
         reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
-        raise InputError(Issue(f"meshio cannot read this mesh: {reason}", file)) from None
+        raise InputError(Issue(f"meshlane cannot read this mesh: {reason}", file)) from None
     if field is None and len(fields) != 1:
         text = f"no {what} at its nodes" if not fields else f"several {what} at its nodes"
         remedy = need if not fields else "field: one of " + names_text(sorted(fields))
@@ -228,7 +232,7 @@ def _in_time(path: Path, read: Callable[[], Any]) -> Any:
         thread.start()
         thread.join(LONGEST_READING + path.stat().st_size * LONGEST_PER_BYTE)
     if thread.is_alive():
-        text = "meshio does not come to an end with this mesh"
+        text = "meshlane does not come to an end with this mesh"
         raise InputError(Issue(text, str(path), allowed="a whole file, whose counts are those of its nodes and cells"))
     if "error" in ended:
         raise ended["error"]

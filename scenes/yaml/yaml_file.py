@@ -32,6 +32,8 @@ from scenes.yaml.input_file import read_text
 from scenes.yaml.units import OTHER_MINUS, foreign_minus
 
 LARGEST_BYTES = 1_000_000
+MOST_VALUES = 100_000
+"""Keys and values, which take some seconds to read."""
 DEEPEST = 32
 SPACES = "spaces, for each level two more"
 
@@ -65,7 +67,8 @@ def read_yaml(path: str | Path) -> YamlFile:
 
     Raises:
         InputError: no such file, not a regular file, unreadable, larger than 1 MB, not UTF-8, empty, not YAML, several
-            documents, nested deeper than 32, or with duplicate keys, anchors, aliases, merge keys or tags.
+            documents, nested deeper than 32, with more than 100 000 keys and values, or with duplicate keys, anchors,
+            aliases, merge keys or tags.
     """
     return parse_yaml(read_text(path, "a YAML file", LARGEST_BYTES, (".yaml", ".yml")), str(path))
 
@@ -130,6 +133,11 @@ def _styled(value: Any) -> Any:
     return value
 
 
+UNWRITABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\ud800-\udfff\ufffe\uffff]")
+"""What a quoted text can name by its code and no table, page or data file can hold."""
+NO_TEXT, WRITABLE = "a control character, or half a character, in a text", "characters that can be printed"
+
+
 class _Builder:
     """Builds plain data from parser events and refuses what the twin's files do not need."""
 
@@ -138,6 +146,7 @@ class _Builder:
         self.lines: dict[KeyPath, int] = {}
         self._file = file
         self._documents = 0
+        self._values = 0
         # Open collections from the root down, each with its key path and, for a mapping, the key whose value comes
         # next.
         self._open: list[tuple[dict[str, Any] | list[Any], KeyPath]] = []
@@ -161,6 +170,10 @@ class _Builder:
                 )
             if event.tag is not None:
                 self._refuse(f"tags are not allowed, found {event.tag}", line, "plain values")
+            self._values += 1
+            if self._values > MOST_VALUES:
+                allowed = f"at most {MOST_VALUES} in a file; long lists belong into a CSV table where one can be named"
+                self._refuse("too many keys and values", line, allowed, self._here())
             self._value(event, line)
         elif isinstance(event, MappingEndEvent | SequenceEndEvent):
             self._open.pop()
@@ -185,6 +198,9 @@ class _Builder:
 
     def _plain(self, event: ScalarEvent, line: int) -> Any:
         text = event.value
+        if (wrong_character := UNWRITABLE.search(text)) is not None:
+            issue = Issue(NO_TEXT, self._file, line, self._here(), shown(wrong_character[0]), WRITABLE)
+            raise InputError(issue)
         if event.implicit[0] and text[:1] in OTHER_MINUS and not isinstance(_number_or_text("-" + text[1:]), str):
             wrong = foreign_minus(text)
             raise InputError(Issue(wrong.problem, self._file, line, self._here(), wrong.found, wrong.allowed))
@@ -203,6 +219,8 @@ class _Builder:
             self._refuse("a key must be a plain name", line)
             return
         key = event.value
+        if UNWRITABLE.search(key):
+            self._refuse(NO_TEXT, line, WRITABLE, path)
         if key == "<<" and event.implicit[0]:
             self._refuse("merge keys are not allowed, found <<", line, "writing the entries out", path)
         if key in mapping:
@@ -235,11 +253,16 @@ class _Builder:
 def _scalar(event: ScalarEvent) -> Any:
     """The value of a scalar by the core schema of YAML 1.2; quoted scalars are always text."""
     text = event.value
-    if not event.implicit[0]:
-        return text
-    if text in _WORDS:
-        return _WORDS[text]
-    return _number_or_text(text)
+    return plain_scalar(text) if event.implicit[0] else text
+
+
+def plain_scalar(text: str) -> Any:
+    """The value of an unquoted scalar by the core schema of YAML 1.2.
+
+    Args:
+        text: without spaces around it.
+    """
+    return _WORDS[text] if text in _WORDS else _number_or_text(text)
 
 
 def _number_or_text(text: str) -> int | float | str:

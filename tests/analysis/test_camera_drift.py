@@ -107,6 +107,7 @@ def test_what_the_monitor_does_not_tell_is_named():
     assert any("nadir d_f" in n for c in caught.value.open for n in c.names)
 
 
+@pytest.mark.slow
 def test_the_monitor_brings_heights_back():
     """Seven fields with drifts of 3 arcsec (1 sigma). One arcsec of the intersection angle is 3.2 m of height: the
     difference of two d_alpha of 3 arcsec each is 4.2 arcsec, 13.5 m RMS over passes; seven passes give it to 27%, and
@@ -136,6 +137,7 @@ def test_the_monitor_brings_heights_back():
     assert min(chi["still"], chi["told"]) > 1e-4
 
 
+@pytest.mark.slow
 def test_sigmas_with_a_monitor_are_right():
     """20 campaigns of three fields, false alarm 1e-3 to both sides together."""
     rng = np.random.default_rng(5)

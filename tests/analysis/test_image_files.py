@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import os
 import re
 import shutil
 import struct
@@ -94,7 +95,7 @@ def test_what_is_not_grey_is_told(tmp_path):
     tifffile.imwrite(path, FRAMES[0], photometric="miniswhite")
     np.testing.assert_array_equal(read(path)[0], 65535 - FRAMES[0])
     mean = ImageFile.open(path).read({"a": Region(0, 0, 20, 31)})["a"]
-    np.testing.assert_array_equal(mean, 65535.0 - FRAMES[0])
+    np.testing.assert_array_equal(mean, 65535.0 - FRAMES[:1])
     tifffile.imwrite(path, FRAMES[0].astype(np.float32), photometric="miniswhite")
     with pytest.raises(ImageError, match="largest value is black"):
         read(path)
@@ -265,3 +266,34 @@ def test_astropy_is_loaded_only_for_fits(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_a_damaged_picture_is_refused_without_a_word_of_its_library(tmp_path, capfd):
+    """libjpeg goes on with what it has and tells the terminal; libpng tells it before it fails."""
+    rows, columns = np.mgrid[0:64, 0:64]
+    edge = np.where(columns + 0.1 * rows > 35, 200, 40).astype(np.uint8)
+    for name in ("a.jpg", "a.png"):
+        cv2.imwrite(str(tmp_path / name), edge)
+        whole = (tmp_path / name).read_bytes()
+        assert read(tmp_path / name).shape[-2:] == (64, 64)
+        spoilt = bytearray(whole)
+        spoilt[len(whole) // 2 : len(whole) // 2 + 40] = bytes(40)
+        (tmp_path / name).write_bytes(spoilt)
+        with pytest.raises(ImageError, match="damaged"):
+            read(tmp_path / name)
+    said = capfd.readouterr()
+    assert said.err == ""
+
+
+def test_a_fits_file_that_cannot_be_read_is_closed(tmp_path):
+    fits.PrimaryHDU(FRAMES).writeto(tmp_path / "a.fits")
+    spoilt = (
+        (tmp_path / "a.fits").read_bytes().replace(b"BITPIX  =                   16", b"BITPIX  =                    x")
+    )
+    (tmp_path / "a.fits").write_bytes(spoilt)
+    with pytest.raises(ImageError):
+        read(tmp_path / "a.fits")
+    opened = [
+        os.readlink(f"/proc/self/fd/{k}") for k in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{k}")
+    ]
+    assert not [name for name in opened if name.endswith("a.fits")]

@@ -41,6 +41,7 @@ def limits(freedom):
     return stats.chi2.ppf([0.5e-4, 1 - 0.5e-4], freedom)
 
 
+@pytest.mark.slow
 def test_shift_without_noise_and_pixel_locking(clean, templates):
     """What is left is the spline's error for detail up to 0.45 cycles a pixel; it has the period of a pixel."""
     fits = least_squares(clean, templates, started())
@@ -119,6 +120,7 @@ def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpnes
     assert np.abs(error.mean(axis=0)).max() < 0.001
 
 
+@pytest.mark.slow
 def test_reference_of_finer_pixels(texture, clean):
     """Templates resampled from half the pixel, with an MTF of its own, about half a fine pixel off the coarse grid."""
     fine = 0.5 * texture.grid(
@@ -147,6 +149,7 @@ def test_covariance_with_noise(clean, templates, seed):
     assert fits.sigma.mean() == pytest.approx(np.sqrt(800 + 400), rel=0.02)
 
 
+@pytest.mark.slow
 def test_covariance_with_a_noisy_template(texture, clean, templates):
     """Image against image: both are noisy, the second is resampled at other phases, and errors keep in their sigmas."""
     shift = np.array([0.37, -0.21])
@@ -170,6 +173,7 @@ def test_covariance_with_a_noisy_template(texture, clean, templates):
     assert np.abs(2 * np.mean(error * np.sin(2 * np.pi * phase), axis=0)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_scatter_reaches_the_bound(texture, clean, templates):
     """Cramer-Rao bound for place, affine change, offset, gain and sharpness from the texture's exact derivatives and
     the known noise of each pixel. Equal weights lose a per cent to it; the noise's estimate has 4 per cent a point.

@@ -34,6 +34,7 @@ def way(places):
     return np.stack([22 + 5 * row + 3 * column**2, -20 + 2 * row * column - 8 * column], axis=1)
 
 
+@pytest.mark.slow
 def test_thirty_per_cent_wrong_patches(texture, frame, points):
     """500 points some 30 px off, 30 per cent replaced by another texture; the whole in seconds."""
     assert len(points) == 500

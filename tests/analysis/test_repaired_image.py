@@ -126,6 +126,7 @@ def test_nothing_to_repair_is_nothing_repaired(template, measure):
     assert 0.0 < cost < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measure", MEASURES)
 def test_sigma_holds_over_drawn_images(template, measure):
     """300 images with drawn noise, temporal and fixed: chi-square of 600 coordinates within 99.9 %."""

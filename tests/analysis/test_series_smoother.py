@@ -237,6 +237,7 @@ def test_as_conditioning_all_times_together(reference) -> None:
         close(found.filtered.noise[k], by_noise[0], prior)
 
 
+@pytest.mark.slow
 def test_of_many_drawn_series_the_sigmas_and_the_chi_square_are_right() -> None:
     """1000 series of all laws: errors over their sigma have a mean square of 1 and chi-square its distribution. Errors
     of one series are correlated, those of two are not: five standard deviations of a chi-square of 1000."""

@@ -221,6 +221,7 @@ def test_sparse_elimination_is_the_dense_covariance_of_all_image_points():
     assert points == pytest.approx(sigma[len(free) :], rel=1e-5)
 
 
+@pytest.mark.slow
 def test_wrong_matches_and_wrong_sigmas_are_found_among_shared_noise():
     """Attitude twice as noisy as claimed: its factor comes out as 4, image and control as 1, to 4.5 sigmas of
     sqrt(2 / redundancy), twice that variance for what groups take from each other. Five matches are 30 px off."""

@@ -159,6 +159,7 @@ def test_difference_agrees_with_stated_sigma(name, moved, template, before):
         assert np.all(np.abs(covariance[:, 0, 0] / separate[:, 0, 0] - 1) < 0.15)
 
 
+@pytest.mark.slow
 def test_likelihood_is_efficient(template):
     """600 spots: sigma within 10% of the Cramer-Rao bound.
 

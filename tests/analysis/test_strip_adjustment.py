@@ -48,6 +48,7 @@ def test_exact_rays_are_left_alone():
     assert {"attitude", "slow attitude", "station"} == set(found.corrections)
 
 
+@pytest.mark.slow
 def test_sigmas_are_right():
     """40 passes: the errors of one point of each, and the residuals of all; two-sided false alarm 1e-3 each."""
     rng, view, total, fit, readings = np.random.default_rng(2), strip(2, 40, 3.0), np.zeros(2), np.zeros(2), []
@@ -86,6 +87,7 @@ def test_corrections_take_the_errors_out_of_other_rays():
         found.corrected(replace(rays["aft"], time=None))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "least", "most"), [(WHITE, 0.02, 0.15), (SLOW, 0.2, 0.9)])
 def test_gain_in_height_is_large_for_slow_errors_only(noise, least, most):
     """The gain that the covariances predict, and the one that is met over five passes.

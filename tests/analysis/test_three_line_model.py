@@ -42,7 +42,11 @@ def cameras(change=None, mounted=True):
     change = change or {}
     return {
         k: LineModel.of(
-            mounting(k, mounted), np.array(INTERIOR[k]) + change.get(k, (0.0, 0.0, 0.0)), POSITION, DISTORTION[k]
+            mounting(k, mounted),
+            np.array(INTERIOR[k]) + change.get(k, (0.0, 0.0, 0.0)),
+            POSITION,
+            DISTORTION[k],
+            half_length=6000 * PITCH,
         )
         for k in LOOKS
     }

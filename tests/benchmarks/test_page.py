@@ -29,6 +29,7 @@ def quick() -> subprocess.CompletedProcess:
     return command("--quick", "--json", "--only", "psf, trace")
 
 
+@pytest.mark.slow
 def test_json_is_all_of_stdout_and_progress_is_on_stderr(quick) -> None:
     assert quick.returncode == 0, quick.stderr
     data = json.loads(quick.stdout)

@@ -40,7 +40,7 @@ LONG = 80
 SAMPLES = 8
 LEFT_OUT = {
     "": {"versions", "started_unix_s", "wall_time_s", "seconds", "worker_seconds", "states_per_second"},
-    "manifest.json": {"workers"},
+    "manifest.json": {"workers", "provenance", "digest"},
     "study_state.json": {"fingerprint", "content", "sources"},
     "study.nc": {"fingerprint"},
 }
@@ -144,11 +144,16 @@ def timeless(tree: Any, name: str = "") -> Any:
     if isinstance(tree, dict):
         left_out = LEFT_OUT[""] | LEFT_OUT.get(name, set())
         return {
-            str(key): sorted(below) if key == "sha256" and isinstance(below, dict) else timeless(below, name)
+            str(key): sorted(below) if _checksums(key, below, name) else timeless(below, name)
             for key, below in tree.items()
             if key not in left_out
         }
     return [timeless(below, name) for below in tree] if isinstance(tree, list) else tree
+
+
+def _checksums(key: str, below: Any, name: str) -> bool:
+    """Whether a value is a table of checksums by file."""
+    return isinstance(below, dict) and (key == "sha256" or (key == "inputs" and name == "manifest.json"))
 
 
 class Reader:

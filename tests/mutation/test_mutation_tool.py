@@ -79,6 +79,7 @@ def test_a_place_that_is_not_there_is_told(tmp_path):
     assert "optics/lens.py" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
     root = tmp_path / "tree"
     shutil.copytree(
@@ -104,6 +105,7 @@ def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
     assert summary(list(found.values()), {survivor.mutant.key: "times nothing"})["score"] == pytest.approx(1 / 2)
 
 
+@pytest.mark.slow
 def test_every_equivalent_mutant_still_exists_and_has_a_reason():
     root = Path(__file__).parents[2]
     keys = {one.key for one in mutants_below(root, ("optics", "analysis", "twin"))}

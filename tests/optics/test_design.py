@@ -9,6 +9,7 @@ from optics.design.design_rays import beam_axes
 from optics.design.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
 from optics.design.merit_function import MeritFunction, Operands
 from optics.design.optimiser import DesignError, optimise
+from optics.design.starts import drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 
 MIRRORS = ("M1", "M2", "M3")
@@ -50,6 +51,7 @@ def test_jacobian_is_what_differences_give(backend, start, beams, measure: str) 
         for name, rounding in (
             ("residuals", WAVES),
             ("principal_distance", METRES),
+            ("distance_across", METRES / np.tan(beams.fields[:, 1].max())),
             ("extents", METRES),
             ("clearances", METRES),
         ):
@@ -97,6 +99,36 @@ def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> Non
     assert abs(found.before.principal_distance - distance) > 0.01
     assert found.after.principal_distance == pytest.approx(distance, abs=2e-6)
     assert found.after.errors.max() < 0.05
+
+
+def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
+    """gf7 images 2.8 % larger across the line than along it; held to 2 %, at the same f along the line."""
+    nominal = prescription_of(gf7.spec)
+    variables = [Variable(m, q) for m in MIRRORS for q in ("curvature", "conic", "z")] + [Variable("image", "z")]
+    free = MeritFunction.of(backend, nominal, beams, Operands(650e-9)).evaluate(nominal)
+    assert free.anamorphism == pytest.approx(0.972, abs=5e-4)
+    operands = Operands(650e-9, principal_distance=free.principal_distance, anamorphism=0.02)
+    found = optimise(backend, nominal, variables, beams, operands, iterations=8)
+    assert found.after.anamorphism == pytest.approx(0.98, abs=2e-6)
+    # eight iterations bring it near
+    assert found.after.principal_distance == pytest.approx(free.principal_distance, abs=1e-5)
+    with pytest.raises(DesignError, match="anamorphism") as told:
+        optimise(backend, nominal, variables[-1:], beams, replace(operands, anamorphism=1e-3), iterations=5)
+    assert told.value.violated[0] == "anamorphism"
+
+
+def test_starts(backend, gf7, beams) -> None:
+    """Drawn starts follow from seed and number, pass light, and end where the camera itself does: one optimum."""
+    nominal = prescription_of(gf7.spec)
+    found = search(backend, nominal, CONICS, beams, Operands(650e-9), steps=5, starts=3, seed=4)
+    merit = found.best.merit
+    assert [attempt.drawn for attempt in found.attempts] == [False, True, True]  # no envelope: no order of its steps
+    drawn = [drawn_start(merit, nominal, CONICS, np.random.default_rng([4, n])).values(CONICS) for n in (1, 1, 2)]
+    np.testing.assert_array_equal(drawn[0], drawn[1])
+    assert np.min(np.abs(drawn[0] - drawn[2])) > 1e-3
+    assert found.agreeing == 3
+    assert not found.local
+    assert search(backend, nominal, CONICS, beams, Operands(650e-9), starts=1).local
 
 
 def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:

@@ -7,6 +7,7 @@ from scipy.special import j0, j1
 
 from optics.numerics import quadrature
 from optics.numerics.quadrature import PupilNodes
+from optics.waves import diffraction
 from optics.waves.diffraction import Grid, PupilField, airy, image
 
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
@@ -81,6 +82,15 @@ def test_images_of_a_batch() -> None:
     for i, field in enumerate(fields):
         np.testing.assert_allclose(batch[i], image(field, SMALL, shifted(SMALL, 1e-6))[0], rtol=1e-12)
     np.testing.assert_allclose(image(together[2:4], SMALL, SMALL), image(together, SMALL, SMALL)[2:4], rtol=1e-12)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_wave_tables_in_pieces_give_the_same_bits(single: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is bounded by making the waves of some nodes after the other; the sums are the same."""
+    axis = centred(95, 3e-6)
+    whole = image(perfect(0.001), axis, axis, single)
+    monkeypatch.setattr(diffraction, "_TABLES", 1)  # the fewest nodes at once
+    np.testing.assert_array_equal(image(perfect(0.001), axis, axis, single), whole)
 
 
 def test_a_slanted_beam_makes_the_same_spot() -> None:

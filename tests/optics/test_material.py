@@ -1,7 +1,7 @@
 import pytest
 
 from optics.materials.glass import GLASSES
-from optics.materials.material import MATERIALS, Material, material
+from optics.materials.material import MATERIALS, Material, TemperatureRange, material
 
 # name: range of CTE 1e-6/K, density, E GPa that handbooks give
 PLAUSIBLE = {
@@ -51,8 +51,11 @@ def test_names() -> None:
         material("xyz")
 
 
+ANY = TemperatureRange.celsius(-200.0, 200.0, "a test")
+
+
 def test_impossible_solids_are_refused() -> None:
     with pytest.raises(ValueError, match="positive"):
-        Material("x", 0.0, -1.0, 1.0, 0.3, 1.0, "")
+        Material("x", 0.0, -1.0, 1.0, 0.3, 1.0, "", ANY)
     with pytest.raises(ValueError, match="Poisson"):
-        Material("x", 0.0, 1.0, 1.0, 0.5, 1.0, "")
+        Material("x", 0.0, 1.0, 1.0, 0.5, 1.0, "", ANY)

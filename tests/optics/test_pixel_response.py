@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from optics.waves.diffraction import airy
-from optics.waves.pixel_response import PixelResponse
+from optics.waves.pixel_response import PixelResponse, UnsampledImageError
 
 PITCH, WAVELENGTH, F_NUMBER = 12e-6, 650e-9, 110.4
 
@@ -45,5 +45,12 @@ def test_flat_light_stays_flat() -> None:
 
 
 def test_coarse_pixels_are_refused() -> None:
-    with pytest.raises(ValueError, match="oversample"):
+    with pytest.raises(UnsampledImageError, match=r"0\.50 cycles per pixel"):
         PixelResponse.fit(PITCH, 0.0, cutoff=0.5 / PITCH)
+
+
+def test_a_source_far_wider_than_its_pixels_is_refused() -> None:
+    with pytest.raises(UnsampledImageError) as caught:
+        PixelResponse.fit(PITCH, 35 * PITCH, cutoff=0.2 / PITCH)
+    assert caught.value.of_source
+    assert caught.value.remedy.startswith("a smaller source")

@@ -13,7 +13,7 @@ from optics.geometry.solid import Coating, Face, Solid
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.tree import Body, Motion
 from optics.materials.glass import N_BK7, Glass, ThermalDispersion
-from optics.materials.material import Material, material
+from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Element, Interaction
 from optics.raytrace.element_numbers import Medium
@@ -62,7 +62,7 @@ NAMESPACE = {
         Material,
         FrozenMap,
     )
-} | {"array": np.array, "ThermalDispersion": ThermalDispersion}
+} | {"array": np.array, "ThermalDispersion": ThermalDispersion, "TemperatureRange": TemperatureRange}
 
 
 @pytest.mark.parametrize(("value", "other"), VALUES, ids=[type(v).__name__ for v, _ in VALUES])

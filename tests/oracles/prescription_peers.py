@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,8 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
 from scenes.lens.prescription import SEQUENCE, Glasses, Prescription
+
+sys.path.append(str(Path(sys.prefix, "peers")))  # ray-optics, which setup.sh --test keeps out of all else
 
 Rays = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Positions (N, 3) and directions (N, 3) in the image's frame, metres, and optical paths (N,), metres."""

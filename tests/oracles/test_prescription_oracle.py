@@ -34,6 +34,7 @@ from tests.oracles.prescription_peers import (
     ours,
     read_alike,
 )
+from twin.camera.camera_optics import CameraOptics
 
 pytestmark = pytest.mark.oracle
 
@@ -165,9 +166,9 @@ def stopped_as_batoid_stops(backend, name: str, rays: int) -> None:
     """Rays over more than the pupil: each comes through the camera made of the file, or is stopped, as in batoid."""
     batoid = pytest.importorskip("batoid")
     wavelength, pupil, fields = VIGNETTED[name]
-    path, largest = Path(batoid.__file__).parent / "data" / name, np.radians(max(fields))
-    around = ((0.0, 0.0), (0.0, largest), (0.0, -largest), (largest, 0.0))
-    made = camera_of(replace(read_batoid(path, wavelength), fields=around), "telescope", backend, Width(pupil))
+    path = Path(batoid.__file__).parent / "data" / name
+    lens = replace(read_batoid(path, wavelength), fields=around(max(fields)))
+    made = camera_of(lens, "telescope", backend, Width(pupil))
     model = derive_camera(made.camera, backend)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -206,6 +207,40 @@ def test_edges_stop_what_batoid_stops(backend, name: str) -> None:
 @pytest.mark.parametrize("name", VIGNETTED)
 def test_edges_stop_what_batoid_stops_of_a_million(backend, name: str) -> None:
     stopped_as_batoid_stops(backend, name, 1_000_000)
+
+
+CUT = {"HSC/HSC_no_obsc.yaml": (750e-9, 8.2, 0.75), "LSST/LSST_r.yaml": (622e-9, 8.36, 1.75)}
+"""File -> wavelength and pupil, metres, and the field's radius, degrees."""
+
+
+@pytest.mark.parametrize("name", ["LSST/LSST_r.yaml", pytest.param("HSC/HSC_no_obsc.yaml", marks=pytest.mark.slow)])
+def test_wavefront_errors_of_cut_pupils_as_batoid_has_them(backend, name: str) -> None:
+    """Rms without piston and tilt over the light that comes through, on the axis, between and in the field's corner."""
+    batoid = pytest.importorskip("batoid")
+    wavelength, pupil, largest = CUT[name]
+    path = Path(batoid.__file__).parent / "data" / name
+    made = camera_of(replace(read_batoid(path, wavelength), fields=around(largest)), "telescope", backend, Width(pupil))
+    optics = CameraOptics.alone(made.camera, backend)
+    peer = batoid.Optic.fromYaml(str(path))
+    count = 512
+    x, y = np.meshgrid(*2 * [np.linspace(-1.0, 1.0, count, endpoint=False)])
+    for share in (0.0, 0.6, 1.0):
+        wave = optics.wavefront((share, share))
+        angle = np.radians(share * largest) * np.sqrt(0.5)
+        theirs = batoid.wavefront(peer, angle, angle, wavelength, nx=count).array
+        seen = ~np.ma.getmaskarray(theirs)
+        level = np.stack([np.ones(np.count_nonzero(seen)), x[seen], y[seen]], axis=-1)
+        flat = np.asarray(theirs[seen]) - level @ np.linalg.lstsq(level, np.asarray(theirs[seen]), rcond=None)[0]
+        # 0.2 % of 10 000 rays here, 0.05 % of some 150 000 there; both programs' rays agree far beyond that
+        assert wave.rms == pytest.approx(float(np.sqrt(np.mean(flat**2))), rel=4e-3), share
+        strehl = abs(np.mean(np.exp(2j * np.pi * flat))) ** 2
+        assert wave.strehl == pytest.approx(strehl, abs=5e-3), share
+
+
+def around(largest: float) -> tuple[tuple[float, float], ...]:
+    """The fields of a round field of this radius, degrees."""
+    end = np.radians(largest)
+    return ((0.0, 0.0), (0.0, end), (0.0, -end), (end, 0.0))
 
 
 ZEMAX_FIELDS = ((1.0, 0.0), (0.0, 1.0), (0.5, 0.5))

@@ -102,20 +102,20 @@ def test_wavefront_error_on_and_off_the_line(short, bundles) -> None:
     assert len(errors) == 15
     assert max(errors) < WORST
     # what the design program says of its result
-    assert max(errors) == pytest.approx(0.0272, abs=0.0005)
-    # and what its file says: on the line it is worse than gf7, whose design errors there are 0.0145 to 0.0182
-    assert errors[1::3] == pytest.approx([0.0208, 0.0198, 0.0201, 0.0198, 0.0208], abs=0.0003)
+    assert max(errors) == pytest.approx(0.0231, abs=0.0003)
+    # and what its file says: on the line it is better than gf7, whose design errors there are 0.0145 to 0.0182
+    assert errors[1::3] == pytest.approx([0.0113, 0.0087, 0.0093, 0.0087, 0.0113], abs=0.0002)
     # mirror symmetric fields
     np.testing.assert_allclose(errors[:6], [*errors[12:15], *errors[9:12]], rtol=1e-4)
 
 
 def test_chief_rays_are_not_telecentric(bundles) -> None:
-    """2.5 deg in the plane of symmetry, and spreading along the line, as the file says of it."""
+    """0.85 deg in the plane of symmetry, as the file says; they spread by 0.18 deg to the line's ends."""
     (_, middle, _), (_, end, _) = bundles[0.0, 0.0], bundles[1.0, 0.0]
     slopes = [np.degrees(np.arctan(rays.v[0, :2] / rays.v[0, 2])) for rays in (middle, end)]
-    assert abs(slopes[0][1]) == pytest.approx(2.50, abs=0.01)
+    assert abs(slopes[0][1]) == pytest.approx(0.85, abs=0.01)
     assert abs(slopes[0][0]) < 1e-6
-    assert abs(slopes[1][0]) == pytest.approx(0.52, abs=0.01)
+    assert abs(slopes[1][0]) == pytest.approx(0.18, abs=0.01)
 
 
 def test_focal_length_is_that_of_gf7(camera, bundles, short) -> None:

@@ -1,20 +1,29 @@
-"""Spoils YAML files at random: bytes, tokens, the tree, and whatever looks like a path.
+"""Spoils files at random, by what they are: bytes of any file; words, numbers and lines of a text; the tree of YAML and
+JSON and whatever looks like a path in it; cells, rows and columns of a table; what an image or data set holds and says.
 
-changed = mutate(text, random.Random(7))
+changed = mutate("job.yaml", content, random.Random(7))
 changed.content     # bytes of the spoilt file
 changed.how         # what was done
 """
 
 from __future__ import annotations
 
+import json
 import random
 import re
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 
 from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from tests.robustness.mutate_data import DATA_SETS, IMAGES
+from tests.robustness.mutate_table import TABLES
 from tests.robustness.mutate_tree import TREES, YAMLS, paths
 from tests.robustness.nasty import NUMBERS, TEXTS, UNITS
+
+Mutator = Callable[[bytes, random.Random], bytes]
 
 
 @dataclass(frozen=True)
@@ -35,26 +44,41 @@ _UNIT = re.compile(r"(?<=\d) [A-Za-z%]+(?:/[A-Za-z]+(?:\^\d)?)?")
 _WORD = re.compile(r"[A-Za-z_]\w+")
 
 
-def mutate(text: str, chance: random.Random) -> Mutant:
-    """A file spoilt in one way, or in two or three at once."""
-    kind = chance.choices(("byte", "token", "tree", "path", "yaml"), (18, 26, 36, 10, 10))[0]
-    if kind == "byte":
-        content, how = text.encode(), []
-        for _ in range(chance.choice((1, 1, 1, 2, 3))):
-            mutator = chance.choice(BYTES)
-            content = mutator(content, chance)
-            how.append(mutator.__name__)
-        return Mutant(content, "byte: " + ", ".join(how))
-    table = {"token": TOKENS, "tree": TREES, "path": (paths,), "yaml": YAMLS}[kind]
-    how = []
+def form_of(name: str) -> str:
+    """What a file is to the mutators: "yaml", "json", "table", "image", "data", "binary" or "text"; by its ending."""
+    return _FORMS.get(PurePosixPath(name).suffix.lower(), "text")
+
+
+_FORMS = {
+    **dict.fromkeys((".yaml", ".yml"), "yaml"),
+    **dict.fromkeys((".json", ".geojson"), "json"),
+    ".csv": "table",
+    **dict.fromkeys((".tif", ".tiff", ".fits", ".png", ".jpg"), "image"),
+    ".nc": "data",
+    **dict.fromkeys((".npz", ".gtx", ".parquet"), "binary"),
+}
+
+
+def mutate(name: str, content: bytes, chance: random.Random) -> Mutant:
+    """A file spoilt in one way, or in two or three at once.
+
+    Args:
+        name: of the file, whose ending says what it is.
+        content: of the file as it is.
+        chance: what is done; the same state gives the same mutant.
+    """
+    form = form_of(name)
+    kinds = KINDS[form]
+    kind = chance.choices(list(kinds), [weight for weight, _ in kinds.values()])[0]
+    table, how = kinds[kind][1], []
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
         mutator = chance.choice(table)
         try:
-            text = mutator(text, chance)
-        except (InputError, IndexError, ValueError):  # nothing left to change
+            content = mutator(content, chance)
+        except FAILED:  # nothing left to change, or no longer what it was
             continue
         how.append(mutator.__name__)
-    return Mutant(text.encode("utf-8", "surrogatepass"), f"{kind}: " + ", ".join(how))
+    return Mutant(content, f"{kind}: " + ", ".join(how))
 
 
 # --- bytes
@@ -141,7 +165,7 @@ def huge(content: bytes, chance: random.Random) -> bytes:
     return b"x" * min(room, 300_000) + b": 1\n" + content
 
 
-BYTES: tuple[Callable[[bytes, random.Random], bytes], ...] = (
+BYTES: tuple[Mutator, ...] = (
     *(flip, flip, insert, insert, delete, delete, repeat, truncate, swap, binary, recode, line_ends, huge),
 )
 
@@ -235,34 +259,71 @@ NASTY = (
 )
 
 
-def spoilt(content: bytes, chance: random.Random) -> bytes:
-    """A file that is cut off, has other bytes or words, lines in another order, or another encoding."""
-    kind = chance.randrange(6)
-    if kind == 0:
-        return content[: chance.randrange(len(content))]
-    if kind == 1:
-        for _ in range(chance.choice((1, 2, 4))):
-            content = chance.choice(BYTES)(content, chance)
-        return content
-    wide = "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le" if b"\0" in content else "utf-8"
-    text = content.decode(wide)
-    if kind == 2:
-        lines = text.split("\n")
-        for _ in range(chance.randint(1, 4)):
-            at = chance.randrange(len(lines))
-            lines[at : at + 1] = chance.choice(([], [lines[at]] * 2, [chance.choice(lines)], [chance.choice(NASTY)]))
-            lines = lines or [""]
-        return "\n".join(lines).encode(wide, "surrogatepass")
-    if kind == 3:
-        words = text.split(" ")
-        for _ in range(chance.randint(1, 4)):
-            words[chance.randrange(len(words))] = chance.choice(NASTY)
-        return " ".join(words).encode(wide, "surrogatepass")
-    if kind == 4:
-        return text.encode(chance.choice(("utf-16-be", "utf-16-le", "utf-32", "utf-7", "cp500")))
-    for _ in range(chance.choice((1, 2, 3))):
-        try:
-            text = chance.choice(TOKENS)(text, chance)
-        except (IndexError, ValueError):
-            continue
-    return text.encode(wide, "surrogatepass")
+def lines(text: str, chance: random.Random) -> str:
+    """Lines are lost, doubled, exchanged for others, or for something else."""
+    found = text.split("\n")
+    for _ in range(chance.randint(1, 4)):
+        at = chance.randrange(len(found))
+        found[at : at + 1] = chance.choice(([], [found[at]] * 2, [chance.choice(found)], [chance.choice(NASTY)]))
+        found = found or [""]
+    return "\n".join(found)
+
+
+def nasty_words(text: str, chance: random.Random) -> str:
+    found = text.split(" ")
+    for _ in range(chance.randint(1, 4)):
+        found[chance.randrange(len(found))] = chance.choice(NASTY)
+    return " ".join(found)
+
+
+def _of_text(mutators: Sequence[Callable[[str, random.Random], str]]) -> tuple[Mutator, ...]:
+    """Mutators of text as mutators of a file, which keeps its encoding."""
+    return tuple(_on_bytes(one) for one in mutators)
+
+
+def _on_bytes(one: Callable[[str, random.Random], str]) -> Mutator:
+    def changed(content: bytes, chance: random.Random) -> bytes:
+        wide = (
+            "utf-16" if content.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-16-le" if b"\0" in content else "utf-8"
+        )
+        return one(content.decode(wide), chance).encode(wide, "surrogatepass")
+
+    changed.__name__ = one.__name__
+    return changed
+
+
+def _on_json(one: Callable[[str, random.Random], str]) -> Mutator:
+    """A mutator of a YAML tree as one of JSON, which Python reads with NaN and infinities."""
+
+    def changed(content: bytes, chance: random.Random) -> bytes:
+        tree = json.loads(content.decode())
+        return json.dumps(parse_yaml(one(dump_yaml(tree), chance)).data, indent=2).encode("utf-8", "surrogatepass")
+
+    changed.__name__ = one.__name__
+    return changed
+
+
+FAILED = (InputError, LookupError, ValueError, OSError, struct.error, TypeError)
+"""Of a mutator that finds nothing to change."""
+_TOKENS = _of_text(TOKENS)
+KINDS: Mapping[str, Mapping[str, tuple[int, tuple[Mutator, ...]]]] = {
+    "yaml": {
+        "byte": (14, BYTES),
+        "token": (26, _TOKENS),
+        "tree": (40, _of_text(TREES)),
+        "path": (10, _of_text((paths,))),
+        "yaml": (10, _of_text(YAMLS)),
+    },
+    "json": {
+        "byte": (20, BYTES),
+        "token": (20, _TOKENS),
+        "tree": (50, tuple(map(_on_json, TREES))),
+        "path": (10, (_on_json(paths),)),
+    },
+    "table": {"byte": (20, BYTES), "token": (15, _TOKENS), "line": (10, _of_text((lines,))), "table": (55, TABLES)},
+    "text": {"byte": (25, BYTES), "token": (40, _TOKENS), "line": (35, _of_text((lines, nasty_words)))},
+    "image": {"byte": (40, BYTES), "image": (60, IMAGES)},
+    "data": {"byte": (40, BYTES), "data": (60, DATA_SETS)},
+    "binary": {"byte": (1, BYTES)},
+}
+"""Form of a file -> kind of change -> its weight and mutators."""

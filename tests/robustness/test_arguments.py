@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.robustness.cases import cut
-from tests.robustness.fuzz import limited, listing
+from tests.robustness.case import cut
+from tests.robustness.spoilt_run import limited, listing
 from tests.twin.commands import invoke
 from twin.design.__main__ import app as design
 from twin.lab import app as lab

@@ -13,7 +13,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.units import ANGLE, LENGTH, PER_LENGTH3, SCALE, format_quantity, parse_quantity
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.robustness.cases import cases
-from tests.robustness.fuzz import mutant, write_files
+from tests.robustness.spoilt_run import mutant, write_files
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
@@ -62,9 +62,9 @@ def test_configurations_of_spoilt_files_that_are_good(tmp_path) -> None:
         for number in range(400, 415):
             folder = tmp_path / f"{name}-{number}"
             folder.mkdir()
-            paths = write_files(table[name], folder, mutant(table[name], number).content)
+            given = write_files(table[name], folder, mutant(table[name], number).content)
             try:
-                text = read(paths[0]).to_yaml()
+                text = read(given).to_yaml()
             except InputError:
                 continue
             config = tmp_path / "config.yaml"

@@ -10,7 +10,6 @@ import random
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +17,14 @@ import numpy as np
 import pytest
 
 from optics.geometry.solid import solid_mesh
-from scenes.specs.load import CAMERAS, INSTRUMENTS, LIBRARY
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from tests.robustness.tree_edits import editable, holder, job_of, scaled, trees
 from twin.main_job.render_job import STAGES, render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 
-Key = tuple[str | int, ...]
-
 LIMIT = 0.01
 """Largest edit, relative; of a zero, relative to the values beside it."""
-
-OF_CAMERA = re.compile(r"(mirrors|image|field|entrance_pupil|field_bias|focal_length)\b")
-OF_INSTRUMENT = re.compile(
-    r"cameras/\w+/(look|position|pupil_offset)\b|central_prism/|monitor/(field|prism_|return_face|area_ccd/offset)"
-)
-QUANTITY = re.compile(r"([-+]?[\d.]+(?:e[-+]?\d+)?)( .*)?")
 
 QUICK, MANY, TO_THE_FRAMES = 12, 500, 10
 """Edits by default and of the slow test; every so many of these go on to the calibration and the first images."""
@@ -56,54 +46,6 @@ def test_library_names_are_those_edited() -> None:
         assert len(keys) > 45
 
 
-def trees(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Camera and instrument of the library as plain data; the camera's name is ./camera.yaml."""
-    instrument = parse_yaml((LIBRARY / INSTRUMENTS / f"{name}.yaml").read_text("utf-8")).data
-    (stem,) = {site["camera"] for site in instrument["cameras"].values()}
-    for site in instrument["cameras"].values():
-        site["camera"] = "./camera.yaml"
-    return parse_yaml((LIBRARY / CAMERAS / f"{stem}.yaml").read_text("utf-8")).data, instrument
-
-
-def _numbers(data: Any, key: Key = ()) -> Iterator[Key]:
-    for name, value in data.items() if isinstance(data, dict) else enumerate(data):
-        if isinstance(value, dict | list):
-            yield from _numbers(value, (*key, name))
-        elif isinstance(value, int | float) or QUANTITY.fullmatch(value):
-            yield (*key, name)
-
-
-def editable(camera: dict[str, Any], instrument: dict[str, Any]) -> list[tuple[str, Key]]:
-    """The numbers of both files that are edited, as file and key."""
-    wanted = (("camera", camera, OF_CAMERA), ("instrument", instrument, OF_INSTRUMENT))
-    return [(file, key) for file, tree, kind in wanted for key in _numbers(tree) if kind.match("/".join(map(str, key)))]
-
-
-def _holder(data: Any, key: Key) -> Any:
-    for part in key[:-1]:
-        data = data[part]
-    return data
-
-
-def scaled(data: Any, key: Key, change: float) -> None:
-    """Change a number, with its unit if it has one, by a part of itself; a zero by one of the largest beside it
-    or of 1.
-    """
-    holder = _holder(data, key)
-
-    def read(value: Any) -> tuple[float, str | None]:
-        if not isinstance(value, str):
-            return float(value), None
-        match = QUANTITY.fullmatch(value)
-        assert match is not None
-        return float(match[1]), match[2] or ""
-
-    value, unit = read(holder[key[-1]])
-    beside = [abs(read(other)[0]) for other in holder] if isinstance(holder, list) else [1.0]
-    new = value + change * (value or max(beside))
-    holder[key[-1]] = new if unit is None else f"{new!r}{unit}"
-
-
 def random_edit(number: int) -> tuple[str, dict[str, Any], dict[str, Any], str]:
     """The edit of that number, the same every time: instrument, both trees, and what was changed.
 
@@ -120,15 +62,6 @@ def random_edit(number: int) -> tuple[str, dict[str, Any], dict[str, Any], str]:
         scaled(camera if file == "camera" else instrument, key, changes[-1][2])
     text = ", ".join(f"{file} {'.'.join(map(str, key))} {change:+.3g}" for file, key, change in changes)
     return name, camera, instrument, text
-
-
-def job_of(folder: Path, camera: dict[str, Any], instrument: dict[str, Any]) -> Path:
-    """Write the files of a job."""
-    (folder / "camera.yaml").write_text(dump_yaml(camera), "utf-8")
-    (folder / "instrument.yaml").write_text(dump_yaml(instrument), "utf-8")
-    job = folder / "job.yaml"
-    job.write_text("instrument: ./instrument.yaml\n", "utf-8")
-    return job
 
 
 def run_until(job: Path, backend, last: str) -> None:
@@ -196,8 +129,8 @@ def test_named_edits(file, key, change, tmp_path, backend) -> None:
     tree = camera if file == "camera" else instrument
     keys = tuple(key.split("."))
     if isinstance(change, str):
-        assert _holder(tree, keys)[keys[-1]] != change
-        _holder(tree, keys)[keys[-1]] = change
+        assert holder(tree, keys)[keys[-1]] != change
+        holder(tree, keys)[keys[-1]] = change
     else:
         scaled(tree, keys, change)
     job = job_of(tmp_path, camera, instrument)

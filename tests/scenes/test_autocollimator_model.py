@@ -57,6 +57,19 @@ def test_the_specification_reads_back() -> None:
     assert hash(again) == hash(SPEC)
 
 
+@pytest.mark.parametrize(
+    ("part", "key", "value"), [("reticle", "pinhole", 200e-6), ("area_ccd", "pitch", 120e-6)], ids=["pinhole", "pitch"]
+)
+def test_ccds_that_cannot_follow_the_spots(part: str, key: str, value: float, backend: Backend) -> None:
+    collimator = SPEC.autocollimator
+    changed = getattr(collimator, part).model_copy(update={key: value})
+    spec = SPEC.model_copy(update={"autocollimator": collimator.model_copy(update={part: changed})})
+    with pytest.raises(InputError, match="cannot follow the spots") as caught:
+        AutocollimatorPath(build_bench(spec, ANGLES[0]), backend)
+    assert caught.value.key == ("autocollimator", part, key)
+    assert caught.value.allowed is not None
+
+
 @pytest.mark.parametrize("half_angle", ANGLES)
 def test_mirrors_are_square_to_their_autocollimators(half_angle: float) -> None:
     bench = build_bench(SPEC, half_angle)

@@ -13,7 +13,9 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
 from optics.geometry.surface_edge import Edge
+from optics.numerics import quadrature
 from optics.raytrace.assembly import Interaction
+from optics.waves.wavefront import fit_wavefront, orthonormal_parts
 from scenes.lens.__main__ import read_prescription
 from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
@@ -30,6 +32,7 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.field_maps import field_curves, through_focus
 
 PAGE = (ROOT / "docs/prescriptions.md").read_text("utf-8")
 CAMERA = re.search(r"```yaml\n(name: two_mirrors.*?)```", PAGE, re.S)[1]
@@ -81,13 +84,52 @@ def test_wavefronts_and_focus_are_of_the_light_that_comes_through(backend, bare)
     for moved in ("z: 300 mm", "z: 300.2 mm"):
         one, other = (CameraOptics.alone(camera_at(spec, moved), backend) for spec in (stopped, masked))
         small, large = one.wavefront((1.0, 0.0)), other.wavefront((1.0, 0.0))
-        # the rings of the whole stop see the edge between two of them
-        assert large.rms == pytest.approx(small.rms, rel=0.08)
+        # of the 10 000 rays over the whole stop a quarter comes through: their edge is right to 0.3 % of the rms
+        assert large.rms == pytest.approx(small.rms, rel=3e-3)
         beams = [FieldBeams.trace(o.model, backend, ((1.0, 0.0),), 12) for o in (one, other)]
         errors = [float(b.errors(FocalPlane.of(o.model.spec))[0]) for b, o in zip(beams, (one, other), strict=True)]
-        assert errors[1] == pytest.approx(errors[0], rel=0.08)
-        assert other.spot((1.0, 0.0)).rms == pytest.approx(one.spot((1.0, 0.0)).rms, rel=0.08)
+        assert errors[1] == pytest.approx(errors[0], rel=3e-3)
+        assert large.strehl == pytest.approx(small.strehl, abs=3e-3)
+        assert other.spot((1.0, 0.0)).rms == pytest.approx(one.spot((1.0, 0.0)).rms, rel=3e-3)
     assert CameraOptics.alone(masked, backend).wavefront((1.0, 0.0)).rms < 0.5 * bare.wavefront((1.0, 0.0)).rms
+
+
+def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> None:
+    """Wavefronts, map over the field, curves along the line and through focus; no part of it is above the whole."""
+    fields = ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.0))
+    waves = cut.wavefronts(fields, points=3)
+    rms = np.array([wave.rms for wave in waves])
+    # both ways trace the same rays, one to the focal plane and one to the image: rounding of metres of path
+    close = {"rtol": 1e-6, "atol": 1e-8}
+    np.testing.assert_allclose(FieldBeams.field_errors(cut.model, backend, fields, 5), rms, **close)
+    np.testing.assert_allclose(field_curves(cut, False, 3).error[[0, 2]], rms[:2], **close)
+    focus = through_focus(cut, backend, fields, False)
+    np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], rms, **close)
+    for wave in waves:
+        assert np.sum(wave.parts**2) + wave.residual**2 == pytest.approx(wave.rms**2, rel=1e-9)
+
+
+@pytest.mark.parametrize("hole", [0.5, 0.8])
+def test_terms_over_a_ring_are_those_of_mahajan(hole: float) -> None:
+    """Defocus and spherical aberration over an annulus: fitted Zernike terms are each larger than the whole."""
+    nodes = quadrature.disk(12, inner=hole)
+    # balanced for the ring, so that only its spherical term is left: r^4 - (1 + e^2) r^2
+    r2 = nodes.x**2 + nodes.y**2
+    wave = r2**2 - (1.0 + hole**2) * r2
+    wave = wave - np.sum(nodes.share * wave)
+    rms = np.sqrt(np.sum(nodes.share * wave**2))
+    parts = orthonormal_parts(nodes.x, nodes.y, nodes.weight, wave, 11)
+    assert parts[10] == pytest.approx(rms, rel=1e-9)
+    np.testing.assert_allclose(parts[:10], 0.0, atol=1e-9 * rms)
+    # Mahajan's: (1 - e^2)^2 / (6 sqrt 5)
+    assert rms == pytest.approx((1.0 - hole**2) ** 2 / (6.0 * np.sqrt(5.0)), rel=1e-9)
+    fitted = fit_wavefront(nodes.x, nodes.y, nodes.weight, wave, 11).coefficients
+    assert np.max(np.abs(fitted[[3, 10]])) > rms
+
+
+def test_parts_of_a_whole_pupil_are_its_coefficients(bare) -> None:
+    wave = bare.wavefront((1.0, 1.0))
+    np.testing.assert_allclose(wave.parts[3:], wave.coefficients[3:], rtol=0, atol=1e-9 * wave.rms)
 
 
 def camera_at(spec: CameraSpec, image: str) -> CameraSpec:

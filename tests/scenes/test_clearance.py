@@ -21,6 +21,7 @@ PAIR = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")
 PAIR = re.sub(r", tilt: \[[^]]*\]", "", PAIR)  # prisms square to the beam, for round numbers
 PAIR = re.sub(r" +#.*", "", PAIR)
 ONLY_180 = "prism_180: {material: fused silica, distance: 2.4 m, width: 60 mm"
+AT_FORWARD = "pupil_offset: [-220 mm, 0 mm]"
 ONLY_0 = "shift: 100 mm, width: 60 mm"
 
 
@@ -179,6 +180,11 @@ REFUSED = [
         12,
         ["monitor.prism_180.width: the prism is narrower than the beam: 30 mm for", "50 mm", "at least 50 mm"],
     ),
+    (
+        [(AT_FORWARD, AT_FORWARD.replace("220", "900"))],
+        4,
+        ["cameras.forward.pupil_offset: the middle of the beam", "M3"],
+    ),
     ([(ONLY_0, "shift: 100 mm, width: 40 mm")], 13, ["monitor.prism_0.width", "narrower", "40 mm"]),
     ([(ONLY_0, "shift: 50 mm, width: 60 mm")], 13, ["monitor.prism_0.shift", "prism_0", "at least 63 mm"]),
     (
@@ -231,6 +237,7 @@ def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> No
     assert f"own.yaml:{line}: " in result.stderr
     for word in words:
         assert word in result.stderr
+    assert "llowed: " in result.stderr  # a remedy, for a person and for a program
     assert "Traceback" not in result.stderr
     assert not (tmp_path / "run").exists()
 

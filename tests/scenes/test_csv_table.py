@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenes.yaml import csv_table
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import ANGLE, LENGTH
@@ -37,6 +38,21 @@ def test_units_order_comments_and_delimiters_do_not_matter(tmp_path: Path, delim
     assert list(two.lines) == [4, 6]
     assert "turn" in one
     assert "turn" not in _read(tmp_path, "point,x [m]\na,1\n")
+
+
+def test_rows_in_pieces_are_the_same_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is bounded by making numbers of some rows after the other; lines count through."""
+    rows = "".join(f"p{k},{k}.5\n" + "\n# more\n" * (k % 3 == 0) for k in range(10))
+    whole = _read(tmp_path, f"point,x [mm]\n{rows}")
+    for together in (1, 3, 11):
+        monkeypatch.setattr(csv_table, "_TOGETHER", together)
+        one = _read(tmp_path, f"point,x [mm]\n{rows}")
+        assert list(one["point"]) == list(whole["point"])
+        np.testing.assert_array_equal(one["x"], whole["x"])
+        np.testing.assert_array_equal(one.lines, whole.lines)
+    monkeypatch.setattr(csv_table, "_TOGETHER", 3)
+    with pytest.raises(InputError, match=r"table\.csv:20: x \[mm\]: not a number"):
+        _read(tmp_path, f"point,x [mm]\n{rows}q,much\n")
 
 
 @pytest.mark.parametrize(

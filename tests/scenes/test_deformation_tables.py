@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import meshio
+import meshlane
 import numpy as np
 import pytest
 
@@ -96,7 +96,7 @@ def test_nodes_in_another_frame(tmp_path, nodes, gf7_pair) -> None:
 def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -> None:
     place = tmp_path / f"m1.{ending}"
     cells = [("triangle", np.array([[0, 1, 24], [1, 25, 24]]))]
-    mesh = meshio.Mesh(1e3 * nodes[:, :3], cells, point_data={"U": 1e3 * nodes[:, 3:]})
+    mesh = meshlane.Mesh(1e3 * nodes[:, :3], cells, point_data={"U": 1e3 * nodes[:, 3:]})
     mesh.write(place, **({"file_format": "gmsh"} if ending == "msh" else {}))
     read = read_nodes(place, unit="mm")
     np.testing.assert_allclose(read.points, nodes[:, :3], rtol=1e-15)
@@ -110,7 +110,7 @@ def test_a_mesh_says_what_a_table_says(tmp_path, nodes, gf7_pair, ending: str) -
 def test_a_mesh_without_displacements_or_with_several(tmp_path, nodes) -> None:
     place = tmp_path / "m1.vtu"
     for data, problem in (({}, "no vectors"), ({"U": nodes[:, 3:], "v": nodes[:, 3:]}, "several vectors")):
-        meshio.Mesh(nodes[:, :3], [("vertex", np.arange(5)[:, None])], point_data=data).write(place)
+        meshlane.Mesh(nodes[:, :3], [("vertex", np.arange(5)[:, None])], point_data=data).write(place)
         with pytest.raises(InputError, match=problem):
             read_nodes(place, unit="m")
     for name in ("m1.bdf", "m1.inp", "m1.cdb"):
@@ -172,7 +172,7 @@ def test_files_that_are_not_there_or_not_tables(tmp_path, nodes) -> None:
         ("{table: m1.csv, terms: 67}", "terms"),
         ("{tabel: m1.csv}", "table"),
         (f"{{table: m1.csv, sha256: {'f' * 64}}}", "checksum"),
-        (".", "no such file"),
+        (".", "is a directory, not a regular file"),
     ]
     for text, problem in cases:
         with pytest.raises(InputError, match=problem):

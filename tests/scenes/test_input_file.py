@@ -1,5 +1,6 @@
 """Every reader of a file that a user names refuses the same with the same words, and says which kind it wanted."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import read_catalogue
 from scenes.lens.zemax_reader import read_zemax
+from scenes.specs.resolved import resolve
 from scenes.yaml.bsdf_file import read_bsdf
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError
@@ -42,9 +44,42 @@ def test_what_is_no_file(kind: str, tmp_path: Path) -> None:
     assert missing.suggestion == str(tmp_path / f"x{name}")
     (tmp_path / name).mkdir()
     assert f"is a directory, not a regular file; allowed: {what}" in str(refused(read, tmp_path / name))
-    assert f"is not a regular file; allowed: {what}" in str(refused(read, Path("/dev/zero")))
+    assert f"is a device, not a regular file; allowed: {what}" in str(refused(read, Path("/dev/zero")))
+    os.mkfifo(tmp_path / f"p{name}")  # to open it would block
+    assert f"is a pipe, not a regular file; allowed: {what}" in str(refused(read, tmp_path / f"p{name}"))
     assert "Not a directory" in str(refused(read, tmp_path / f"x{name}" / name))
     assert "cannot be read" in str(refused(read, tmp_path / "\0"))
+
+
+@pytest.mark.parametrize("name", ["/dev/zero", "pipe", "folder"])
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("instrument: {}.yaml", "instrument"),
+        ("instrument: gf7_pair\ncourse: {{table: {}}}", "course.table"),
+        (
+            "instrument: gf7_pair\nperturb: {{base/forward/M2: {{deformation: {{table: {}}}}}}}",
+            "perturb.base/forward/M2.deformation.table",
+        ),
+    ],
+    ids=["instrument", "course", "deformation"],
+)
+def test_what_a_file_names_is_no_file(text: str, key: str, name: str, tmp_path: Path) -> None:
+    """It is said what stands there, at the key, and nothing of it is read."""
+    place = tmp_path / "what.yaml"
+    if name == "/dev/zero":
+        place.symlink_to(name)
+    elif name == "pipe":
+        os.mkfifo(place)
+    else:
+        place.mkdir()
+    given = str(place.with_suffix("")) if ".yaml" in text else str(place)
+    job = tmp_path / "job.yaml"
+    job.write_text(text.format(given), "utf-8")
+    kind = {"/dev/zero": "a device", "pipe": "a pipe", "folder": "a directory"}[name]
+    error = refused(resolve, job)
+    assert f"{place} is {kind}, not a regular file" in str(error)
+    assert ".".join(map(str, error.key)) == key
 
 
 @pytest.mark.parametrize("kind", [kind for kind in READERS if kind != "csv"])

@@ -51,6 +51,11 @@ def test_the_examples_are_valid(file) -> None:
     study = validate(StudySpec, read_yaml(file))
     assert study.name == file.stem
     assert study.description
+    # what is called noise is the noise's own sigma, not the total one, in which it is a thousandth
+    said = [one.noise for one in study.responses.values() if one.noise is not None]
+    said += [one.key for name, one in study.responses.items() if name.endswith("_noise")]
+    assert all(str(key[-1]).endswith("_sigma_noise") for key in said)
+    assert all(one.noise is not None for one in study.responses.values() if one.sigma is not None)
 
 
 CHANGES = [
@@ -77,6 +82,13 @@ CHANGES = [
         "arcsec and um",
     ),
     ("sigma: [truth, d_f_um_sigma]", "sigma: [truth, d_f_mm_sigma]", "responses.r.sigma", "mm and um"),
+    ("sigma: [truth, d_f_um_sigma]", "noise: [truth, d_f_mm_sigma_noise]", "responses.r.noise", "mm and um"),
+    (
+        "sigma: [truth, d_f_um_sigma]}\n  s: {",
+        "noise: [truth, d_f_um_sigma_noise]}\n  r_sigma_noise: {",
+        "responses",
+        "'r_sigma_noise' would name two columns",
+    ),
     ("key: [job, x], ", "", "factors.a", "changes something"),
     ("key: [job, x], ", "scales: [{key: [job, q]}], ", "factors.a.range", "ratio"),
     ("keys: [[y, 1], [z]], values: [9, 16]", "scales: [{key: [z]}], values: [a, b]", "factors.b.values", "not numbers"),
@@ -105,6 +117,7 @@ def test_what_it_refuses(old: str, new: str, key: str, words: str) -> None:
     [
         (("focus", "fields", 0, "error_um"), "um"),
         (("recovered", "change_arcsec_sigma"), "arcsec"),
+        (("recovered", "change_arcsec_sigma_noise"), "arcsec"),
         (("focus", "shims_um", 2), "um"),
         (("monitor", "gradient_K_per_m"), "K/m"),
         (("turntable", "rejected"), ""),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import meshio
+import meshlane
 import numpy as np
 import pytest
 
@@ -110,6 +110,7 @@ def test_numbers_beside_a_table_are_added(silica, tmp_path) -> None:
     np.testing.assert_allclose(state[M1].rotate, expected[M1].rotate, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_order_frame_and_mesh_do_not_matter(silica, tmp_path) -> None:
     points = lattice(silica, M1, (9, 8, 4))
     values = 0.5 + points @ SLOPE + 3.0 * points[:, 0] ** 2
@@ -124,7 +125,7 @@ def test_order_frame_and_mesh_do_not_matter(silica, tmp_path) -> None:
     # another triangulation may cut the lattice's cubes along other diagonals
     assert three.faces[M1].motion.figure[4] == pytest.approx(one.faces[M1].motion.figure[4], rel=1e-2)
     cells = [("vertex", np.arange(len(points))[:, None])]
-    meshio.Mesh(1e3 * points, cells, point_data={"NT11": values + 20.0}).write(tmp_path / "heat.vtu")
+    meshlane.Mesh(1e3 * points, cells, point_data={"NT11": values + 20.0}).write(tmp_path / "heat.vtu")
     four = heated_bodies(job(tmp_path, M1, "{table: heat.vtu, unit: mm, values: degC}"), silica)[M1]
     assert four.faces[M1].motion.figure[4] == pytest.approx(one.faces[M1].motion.figure[4], rel=1e-6)
     assert four.linear.change == pytest.approx(one.linear.change, abs=1e-10)
@@ -278,7 +279,7 @@ def test_what_is_wrong_with_a_table_is_told_by_its_line(tmp_path, heads, row, li
 def test_keys_that_do_not_fit(tmp_path, silica) -> None:
     points = lattice(silica, M1, (5, 5, 3))
     write(tmp_path / "heat.csv", points, quadratic(points))
-    mesh = meshio.Mesh(
+    mesh = meshlane.Mesh(
         points, [("vertex", np.arange(5)[:, None])], point_data={"a": 280.0 + points[:, 0], "b": points[:, 1]}
     )
     mesh.write(tmp_path / "heat.vtu")

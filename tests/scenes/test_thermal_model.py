@@ -8,8 +8,8 @@ import pytest
 
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.tree import Motion, compose
-from optics.materials.glass import glass
-from optics.materials.material import material
+from optics.materials.glass import GLASSES, glass
+from optics.materials.material import MATERIALS, material
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature, carried_motion
@@ -19,7 +19,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TERMS, TemperatureError, ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import check_nodes
-from scenes.specs.load import load_camera, load_instrument, load_job
+from scenes.specs.load import LIBRARY, load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -354,7 +354,7 @@ def test_composition_adds_figures_and_indices(model, gf7_pair) -> None:
 
 
 def test_absolute_zero_is_looked_for_in_the_far_corners(model) -> None:
-    model.check({PRISM: Temperature(-293.0)})
+    model.check({PRISM: Temperature(-119.0)})
     with pytest.raises(TemperatureError, match=f"{PRISM} would be at -6.85 K") as caught:
         model.check({PRISM: Temperature(-300.0)})
     assert caught.value.origin == PRISM
@@ -364,6 +364,9 @@ def test_absolute_zero_is_looked_for_in_the_far_corners(model) -> None:
     with pytest.raises(TemperatureError, match="absolute zero") as caught:
         model.check({PRISM: steep})
     assert caught.value.origin == PRISM
+    # nor is it where fused silica is known
+    with pytest.raises(TemperatureError, match="fused silica is not known"):
+        model.check({PRISM: Temperature(-100.0, (100.0, 0.0, 0.0))})
 
 
 def test_an_inherited_temperature_is_blamed_on_its_origin(model) -> None:
@@ -442,6 +445,75 @@ def test_a_figure_belongs_to_the_footprint_that_the_beam_meets(gf7_pair) -> None
     allowing = {path for path, info in gf7_pair.nodes.items() if "figure" in info.allows}
     assert {f"{PRISM}/window/entry", f"{PRISM}/window/exit", f"{PRISM}/mirror", "base/forward/M1"} <= allowing
     assert f"{PRISM}/window" not in allowing  # two footprints far apart: nothing stands on the window as a whole
+
+
+@pytest.mark.parametrize(
+    ("node", "heat", "told"),
+    [
+        ("base/forward/M1", "-293 K", "would be at 0.15 K, where the expansion of Zerodur is not known"),
+        ("base/forward/M1", "{change: 60 K, gradient: [0 K/m, -80 K/m, 0 K/m]}", "of Zerodur"),
+        (
+            "base/forward/focal_plane",
+            "-25 K",
+            "focal_plane would be at 268.15 K, where the expansion of SiC",
+        ),
+        ("base", "85 K", "where the expansion of"),
+        (PRISM, "+125 K", "fused silica is not known"),
+    ],
+)
+def test_heat_beyond_what_is_known_of_materials_is_told_with_the_line(backend, tmp_path, node, heat, told) -> None:
+    """0.15 K was accepted."""
+    job = load_job(written(tmp_path, HEAD + f"  {node}: {{temperature: {heat}}}"))
+    experiment = MonitorExperiment(resolve_job(job), backend)
+    with pytest.raises(InputError) as caught:
+        experiment.state(job)
+    assert (caught.value.line, caught.value.key) == (3, ("perturb", node, "temperature"))
+    text = " ".join(str(caught.value).split())
+    assert told in text
+    assert "or another material for it in the instrument" in text
+    assert "degC) on all of base" in text
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "told"), [(20.0, 130.0, "293.15 K to 403.15 K"), (-273.0, 20.0, "0.15 K to 293.15 K")]
+)
+def test_a_table_of_heat_beyond_what_is_known_is_told_with_the_line(backend, tmp_path, low, high, told) -> None:
+    rows = [
+        f"{x},{y},{z},{low if x < 0 else high}" for x in (-300, -9, 9, 300) for y in (-500, -100) for z in (-20, 20)
+    ]
+    (tmp_path / "nodes.csv").write_text("\n".join(["x [mm],y [mm],z [mm],T [degC]", *rows]) + "\n")
+    path = tmp_path / "job.yaml"
+    path.write_text(HEAD + "  base/forward/M1: {temperature: {table: nodes.csv}}\n")
+    resolved = resolve(path)
+    with pytest.raises(InputError, match="does not describe the temperature of base/forward/M1") as caught:
+        MonitorExperiment(resolved, backend).state(resolved.job)
+    assert (caught.value.line, caught.value.key) == (3, ("perturb", "base/forward/M1", "temperature", "table"))
+    assert f"its nodes are at {told}, where Zerodur is not known" in str(caught.value)
+
+
+def test_an_instrument_at_home_where_materials_are_not_known_is_refused(backend, tmp_path) -> None:
+    text = (LIBRARY / "instruments/gf7_pair.yaml").read_text() + "temperature: 0.15 K\n"
+    (tmp_path / "cold.yaml").write_text(text)
+    path = tmp_path / "job.yaml"
+    path.write_text("instrument: cold.yaml\n")
+    with pytest.raises(InputError, match=r"the expansion of \S+ \(materials\.\S+\) is known from") as caught:
+        MonitorExperiment(resolve_job(load_job(path)), backend)
+    assert caught.value.key == ("temperature",)
+    assert caught.value.line == len(text.splitlines())
+    text = " ".join(str(caught.value).split())
+    assert "found '0.15 K', allowed: 273.15 K to 323.15 K (0 to 50 degC) for all of its materials" in text
+
+
+def test_every_material_is_known_about_room_temperature_and_nowhere_near_zero() -> None:
+    for stuff in MATERIALS.values():
+        assert stuff.known.holds(278.15, 308.15)
+        assert not stuff.known.holds(100.0, 293.15)
+        assert not stuff.known.holds(293.15, 500.0)
+        assert stuff.known.source
+    for kind in GLASSES.values():
+        assert kind.thermal is None or kind.thermal.known.holds(173.15, 413.15)
+    with pytest.raises(ValueError, match=r"N-BK7: its index is known from 173\.15 K to 413\.15 K \(-100 to 140 degC\)"):
+        GLASSES["N-BK7"].index(650e-9, 150.0)
 
 
 def test_too_cold_is_told_with_the_line(backend, tmp_path) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from scenes.yaml import yaml_file
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import LARGEST_BYTES, dump_yaml, parse_yaml, read_yaml
 
@@ -156,3 +157,23 @@ def test_awkward_text_survives_a_round_trip(value: str) -> None:
 def test_numbers_survive_a_round_trip(value: object) -> None:
     found = parse_yaml(dump_yaml({"x": value})).data["x"]
     assert repr(found) == repr(value)
+
+
+def test_too_many_values_are_refused_where_they_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not by the bytes: short values take as long as long ones."""
+    monkeypatch.setattr(yaml_file, "MOST_VALUES", 12)
+    assert parse_yaml("a: 1\nb: [1, 2, 3, 4, 5, 6, 7]\n").data["b"][-1] == 7  # a mapping, 2 keys, 1, a list, 7 values
+    with pytest.raises(InputError, match=r":2: b\[7\]: too many keys and values; allowed: at most 12") as caught:
+        parse_yaml("a: 1\nb: [1, 2, 3, 4, 5, 6, 7, 8]\n", "x.yaml")
+    assert caught.value.key == ("b", 7)
+
+
+@pytest.mark.parametrize(
+    "text", [r'unit: "a\0b"', r'unit: "\x1b[2J"', r'unit: "\ud800"', r'"un\0it": um', r'unit: ["\uffff"]']
+)
+def test_texts_that_no_file_can_hold(text: str) -> None:
+    """They would end in HDF5, Matplotlib or the encoder, after all that is computed."""
+    with pytest.raises(InputError, match=r"a control character, or half a character, in a text") as caught:
+        parse_yaml(f"name: x\n{text}\n", "study.yaml")
+    assert (caught.value.file, caught.value.line) == ("study.yaml", 2)
+    assert parse_yaml('note: "a\\tb\\nc µ ″"').data == {"note": "a\tb\nc µ ″"}

@@ -33,7 +33,7 @@ FLAGS = [
 class Command:
     """``python -m twin.live`` in a process of its own."""
 
-    def __init__(self, what: str, *options: str, **environment: str) -> None:
+    def __init__(self, what: str, *options: str, cwd: Path | None = None, **environment: str) -> None:
         env = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "twin.live", what, *options],
@@ -41,7 +41,7 @@ class Command:
             stderr=subprocess.STDOUT,
             text=True,
             env=env,
-            cwd=Path(__file__).parents[2],
+            cwd=cwd or Path(__file__).parents[2],
         )
         self.said = ""
         assert self.process.stdout is not None
@@ -59,7 +59,14 @@ class Command:
         return sum(int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in pids) * os.sysconf("SC_PAGE_SIZE")
 
     def _children(self, pid: int) -> list[int]:
-        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+        # of every thread: the process that computes is started again from another one than at first
+        lists = [place.read_text() for place in Path(f"/proc/{pid}/task").glob("*/children")]
+        return [int(child) for text in lists for child in text.split()]
+
+    def computer(self) -> int:
+        """The process that computes: the one that holds the most memory."""
+        held = {pid: int(Path(f"/proc/{pid}/statm").read_text().split()[1]) for pid in self._children(self.process.pid)}
+        return max(held, key=held.__getitem__)
 
     def end(self) -> int:
         """Ctrl-C; the exit code."""
@@ -68,9 +75,9 @@ class Command:
 
 
 @contextmanager
-def running(what: str, *options: str, **environment: str) -> Iterator[Command]:
-    """The command until the block ends."""
-    command = Command(what, *options, **environment)
+def running(what: str, *options: str, cwd: Path | None = None, **environment: str) -> Iterator[Command]:
+    """The command until the block ends; in this checkout if not told where."""
+    command = Command(what, *options, cwd=cwd, **environment)
     try:
         yield command
     finally:

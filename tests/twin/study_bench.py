@@ -38,6 +38,18 @@ def write_study(folder: Path, *changes: tuple[str, str], text: str = STUDY) -> P
     return path
 
 
+OWN_TO_A_COMMAND = ("study.json", "manifest.json")
+"""Files of a study that name times and numbers of workers; its chunks do, too."""
+
+
+def same_bytes(folder: Path) -> dict[str, bytes]:
+    """Files of a finished study that are the same whoever did it, at once or in parts, and their contents."""
+    names = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if path.is_file()}
+    own = {name for name in names if name in OWN_TO_A_COMMAND or name.startswith("chunks/")}
+    assert {"study.nc", "study.csv", "statistics.json", "report.html", "config.yaml"} <= names.keys() - own
+    return {name: names[name].read_bytes() for name in names.keys() - own}
+
+
 def start(*arguments: object) -> subprocess.Popen:
     """The command as a user starts it."""
     command = [sys.executable, "-m", "twin.study", *(str(argument) for argument in arguments)]

@@ -42,7 +42,7 @@ def dataset(study: StudySpec, values: dict[str, Any], failed: np.ndarray | None 
     runs = len(next(iter(values.values())))
     failed = np.zeros(runs, bool) if failed is None else failed
     for name, column in values.items():
-        unit = study.responses[name.removesuffix("_sigma")].units
+        unit = study.responses[name.removesuffix("_noise").removesuffix("_sigma")].units
         data[name] = ("run", np.where(failed, np.nan, column), {"units": unit})
     data["failed"] = ("run", failed.astype(np.int8))
     data["message"] = ("run", np.where(failed, "no ray arrives", "").astype(object))

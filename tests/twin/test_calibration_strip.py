@@ -96,6 +96,7 @@ def test_slow_errors_are_taken_out_as_the_covariances_say() -> None:
     assert ratio == pytest.approx(0.52, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_what_a_user_gets_is_better_on_average_than_without_ties(elsewhere: bool) -> None:
     """By covariances, at the example's 2 arcsec: calibrated with ties and adjusted, against calibrated on control alone

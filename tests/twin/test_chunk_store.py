@@ -25,7 +25,7 @@ def plan(tmp_path_factory) -> Plan:
 def block_result(plan: Plan, block: int) -> BlockResult:
     runs = np.array(plan.block(block), float)
     values = np.stack([runs, -runs], axis=1)
-    return BlockResult(values, 0.1 * values, ("",) * len(runs), 0.5)
+    return BlockResult(values, 0.1 * values, 0.01 * values, ("",) * len(runs), 0.5, ("",) * len(runs))
 
 
 @pytest.fixture
@@ -129,7 +129,9 @@ def packed(**changes: object) -> bytes:
     parts = {
         "values": np.stack([runs, runs], 1),
         "sigmas": np.stack([runs, runs], 1),
+        "noises": np.stack([runs, runs], 1),
         "messages": np.frombuffer(json.dumps([""] * 25).encode(), np.uint8),
+        "doubts": np.frombuffer(json.dumps([""] * 25).encode(), np.uint8),
         "seconds": np.float64(0.5),
         "blocks": np.array([0, 1]),
     } | changes
@@ -151,6 +153,7 @@ DOCTORED = {
     "a run too many": packed(values=np.zeros((26, 2))),
     "a response too few": packed(values=np.zeros((25, 1))),
     "one dimension": packed(sigmas=np.zeros(50)),
+    "no noise": packed(noises=None),
     "whole numbers": packed(values=np.zeros((25, 2), np.int64)),
     "texts": packed(values=np.full((25, 2), "x")),
     "objects": packed(values=np.array([[{}, {}]] * 25, dtype=object)),
@@ -158,6 +161,7 @@ DOCTORED = {
     "messages that are a text": packed(**messages("x" * 25)),
     "messages that are numbers": packed(**messages([0] * 25)),
     "too few messages": packed(**messages([""])),
+    "too few doubts": packed(doubts=np.frombuffer(json.dumps([""]).encode(), np.uint8)),
     "messages that are no JSON": packed(messages=np.zeros(7, np.uint8)),
     "several times": packed(seconds=np.zeros(3)),
     "no time": packed(seconds=np.float64("nan")),

@@ -180,5 +180,18 @@ def test_a_damaged_file_is_named(runs: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(runs / "a", copy)
     (copy / "truth.json").write_text("{")
-    with pytest.raises(InputError, match=r"truth\.json: cannot be read"):
+    with pytest.raises(InputError, match=r"truth\.json:1: not JSON"):
         read_run(copy)
+
+
+def test_numbers_at_the_end_of_the_range_are_compared_without_a_warning() -> None:
+    from twin.compare.run_differences import _array_difference
+
+    with np.errstate(all="raise"):
+        far = _array_difference("a.nc", "x", np.array([1e200, 0.0]), np.array([-1e200, 0.0]), 1e-9)
+        beyond = _array_difference("a.nc", "x", np.array([1e308]), np.array([-1e308]), 1e-9)
+    assert far is not None
+    assert beyond is not None
+    assert far.largest == 2e200
+    assert far.rms == pytest.approx(2e200 / np.sqrt(2.0))
+    assert np.isinf(beyond.largest)

@@ -213,7 +213,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
     resolved, experiment = resolve(folder / "config.yaml"), prepared
     states = series_states(experiment, resolved.job)
     done: list[int] = []
-    monkeypatch.setattr("twin.monitor.time_series.CHUNK", 2)
+    monkeypatch.setattr("twin.monitor.monitor_memory.CHUNK", 2)
     pieces = run_series(experiment, resolved, states, done.append)
     assert done == [0, 2, 3]
     whole = json.loads((folder / "course.json").read_text())
@@ -248,6 +248,7 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
         "ground",
         "disturbances",
         "between",
+        "sigma_holds",
     }
     assert set(found) == about | contents
     assert (found["times_s"], found["detail"]) == ([0.0, 720.0, 1800.0], 1)

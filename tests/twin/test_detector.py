@@ -13,12 +13,18 @@ from scipy import stats
 
 from scenes.specs.camera import BandSpec
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.load import LIBRARY
+from scenes.specs.job import JobSpec
+from scenes.specs.load import LIBRARY, load_detector
+from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
+from twin.main_job.render_job import render_job
 from twin.render import app
+from twin.sensors import area_detector, poisson_numbers
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
+from twin.sensors.grey_steps import coarse_warnings, told_of_steps
 from twin.sensors.line_ccd import LineCcd
+from twin.sensors.noise_terms import FixedOffsets, ReadNoise
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -127,6 +133,22 @@ def test_same_seed_same_bits_whatever_the_threads_and_the_company():
     assert np.mean(one != other) > 0.9
     assert np.mean(one[:, :, 0] != one[:, :, 1]) > 0.9
     assert np.array_equal(sensor.fixed_pattern((2, 9, 9), 4).gain, sensor.fixed_pattern((2, 9, 9), 4).gain)
+
+
+@pytest.mark.parametrize(
+    ("full_well", "noise"), [(30_000.5, ()), (2e5, (FixedOffsets(2.0),)), (2e5, (ReadNoise(3.0),))]
+)
+def test_many_frames_in_pieces_have_the_same_bits(full_well, noise, monkeypatch):
+    """Memory is bounded by drawing the read noise of some frames after the other, from the same stream."""
+    ccd = detector(full_well_e=full_well, noise=noise)
+    photons = np.geomspace(1.0, 4e5, 240).reshape(1, 12, 20)  # below, in and beyond the tables of Poisson numbers
+    pattern = ccd.fixed_pattern((1, 12, 20), 3)
+    whole = ccd.expose(photons, pattern, 7, 0.01, 5)
+    assert ccd.frames_at_once(7, 240) == 7
+    monkeypatch.setattr(area_detector, "_FRAMES_PIXELS", 500)
+    monkeypatch.setattr(poisson_numbers, "_ROOM", 500)
+    assert ccd.frames_at_once(7, 240) == (2 if not noise or isinstance(noise[0], FixedOffsets) else 7)
+    np.testing.assert_array_equal(ccd.expose(photons, pattern, 7, 0.01, 5), whole)
 
 
 def test_images_are_independent():
@@ -262,3 +284,17 @@ def test_a_line_ccd_knows_its_exposure():
     full = DetectorSpec.model_validate({"name": "any", **SHEET, "dark_current_e_per_s": 1.01 * room / 11.2e-3})
     with pytest.raises(InputError, match="dark current alone saturates"):
         LineCcd.from_specs(spec, full)
+
+
+def test_coarse_grey_values_are_warned_of(backend):
+    """By the data sheet alone: every one of the library is fine, 8 bits of the monitor's CCD are not."""
+    for path in sorted((LIBRARY / "detectors").glob("*.yaml")):
+        assert told_of_steps(EmvaDetector.from_sheet(load_detector(path.stem), 0.01).noise_model(0.01), "it") == ()
+    fine = resolve_job(JobSpec(instrument="gf7_pair"))
+    assert coarse_warnings(fine) == ()
+    few_bits = {"system_gain_dn_per_e": 0.0025, "bit_depth": 8, "offset_dn": 3.0}
+    coarse = fine.model_copy(update={"detector": fine.detector.model_copy(update=few_bits)})
+    (text,) = coarse_warnings(coarse)
+    assert "area CCD monitor_ccd has coarse grey values: noise of 0.092 DN" in text
+    assert text in render_job(coarse, backend).warnings
+    assert coarse_warnings(fine.detector) == ()

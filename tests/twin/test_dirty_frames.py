@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.spots.frame_screening import screen_frames
+from analysis.spots.frame_screening import noise_ratio, screen_frames
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.spots.static_defects import examine, lone_pixels
@@ -219,16 +219,45 @@ def test_frames_of_another_noise_than_stated_are_told(bench):
     drawn = draw(template, detector, (), 4)
     stated = replace(noise, dark_noise_e=0.6 * noise.dark_noise_e)
     own, other = (float(one.temporal_variance_dn2(one.dark_level_dn, 1)) for one in (noise, stated))
-    found = screen_frames(drawn.before, stated).noise_ratio
-    # differences beyond 4 stated sigmas, 2.5 true ones, are cut off, 4 %; rings have shot noise, which is stated right
+    found = noise_ratio(drawn.before, stated)
+    # rings have shot noise, which is stated right
     assert found == pytest.approx(np.sqrt(own / other), rel=0.1)
-    assert screen_frames(drawn.before, replace(noise, dark_noise_e=2.0 * noise.dark_noise_e)).noise_ratio < 0.6
+    assert noise_ratio(drawn.before, replace(noise, dark_noise_e=2.0 * noise.dark_noise_e)) < 0.6
     for frames in (drawn.before, drawn.before[:2], drawn.before[:3, 30:66, 30:66], drawn.before[:1]):
-        assert screen_frames(frames, noise).noise_ratio is None
+        assert noise_ratio(frames, noise) is None
     for kind in KINDS:
         dirty = draw(template, detector, (kind,), 1000)
-        assert screen_frames(dirty.before, noise).noise_ratio is None
-        assert screen_frames(dirty.after, noise).noise_ratio is None
+        assert noise_ratio(dirty.before, noise) is None
+        assert noise_ratio(dirty.after, noise) is None
+
+
+@pytest.mark.parametrize("learnt", [False, True])
+def test_four_times_the_noise_is_noise(bench, learnt):
+    """It was refused as frames that are unlike each other, or was told as a spot of another shape: defocus. No frame,
+    no pixel and no shape is to blame, and sigma is that of the frames' own noise.
+    """
+    template, detector, noise = bench
+    noisy = replace(detector, dark_noise_e=4.0 * noise.dark_noise_e)
+    total, widened = 0.0, []
+    with one_blas_thread():
+        for seed in range(4):
+            drawn = draw(template, noisy, (), seed)
+            work = measurement(drawn, template, noise, shape=None if learnt else template)
+            assert work.search() == []
+            assert work.measure() == []
+            assert not work.plain
+            for spot in (work.result().before, work.result().after[0]):
+                # of all noise, of which that of the light and the converter is as stated
+                assert 3.4 < spot.noise_ratio < 4.0
+                assert spot.fits
+                assert not {finding.kind for finding in spot.findings} & {"cosmic rays", "spoilt frames", "bad pixels"}
+            error = (work.positions[1].position - work.positions[0].position)[0] - drawn.shift
+            total += float(error @ np.linalg.solve(work.shift_covariance(1)[0], error))
+            widened.append(work.shift_covariance(1)[0, 0, 0])
+    assert total < chi2.isf(1e-6, 8)
+    clean = measurement(draw(template, detector, (), 0), template, noise, shape=None if learnt else template)
+    assert clean.search() == clean.measure() == []
+    assert min(widened) > 1.5 * clean.shift_covariance(1)[0, 0, 0]
 
 
 @pytest.mark.slow

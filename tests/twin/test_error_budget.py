@@ -58,6 +58,7 @@ def test_images_show_what_the_exact_trace_says(budget):
     assert np.abs(seen[1:]).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LINES)
 def test_every_line_is_near_the_printed_one(lines, name):
     """Within 20 % (the inputs were chosen for that, to two digits) and the Monte Carlo's own 3 sigma."""
@@ -122,6 +123,7 @@ def test_all_causes_together_give_table_5(budget):
     assert 2.0 < single["d_gamma_rad"][0] / corrected["d_gamma_rad"][0] < 2.1
 
 
+@pytest.mark.slow
 def test_the_growth_of_a_focal_plane_is_a_true_change_and_no_error(backend, budget):
     """A line CCD that grows with its focal plane sees larger angles in its pixels, by as much as the spots move."""
     true, read = budget.grown_focal_planes(0.55)

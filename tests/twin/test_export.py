@@ -82,6 +82,7 @@ def test_a_sensor_model_sees_what_the_rigorous_sensor_sees(flight, name, effects
     assert all(max(e.sample_px, e.line_px) < allowed for e in scanner.errors if e.height_m == height)
 
 
+@pytest.mark.slow
 def test_what_refraction_does_elsewhere_is_told(flight) -> None:
     sensor = _sensor(flight, "forward", LightEffects())
     scanner, model = _isd(sensor)
@@ -163,6 +164,7 @@ def test_polynomials_say_how_far_jitter_is_from_them(flight) -> None:
     assert 0.05 < max(rpc.rms_px) < 0.5
 
 
+@pytest.mark.slow
 def test_the_lines_of_a_mirror_camera() -> None:
     path = SCENES / ORBIT / "angle_gf7.yaml"
     setup = resolve_angle(path)

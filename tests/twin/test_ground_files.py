@@ -100,8 +100,7 @@ def test_covariances_stand_along_the_axes_that_are_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["tif", "gtx"])
 def test_heights_above_a_geoid(tmp_path: Path, ending: str) -> None:
-    """Bilinear between whole degrees, by the formula; the date line is crossed. It is kept in single precision: 4e-6 m.
-    """
+    """Bilinear between whole degrees, by the formula; across the date line. Single precision: 4e-6 m."""
     values = (0.1 * np.arange(181.0)[:, None] - 20.0 * np.cos(np.radians(np.arange(360.0) - 180.0))[None]).astype("f4")
     how = {"driver": "GTX" if ending == "gtx" else "GTiff", "width": 360, "height": 181, "count": 1, "dtype": "float32"}
     with rasterio.open(
@@ -196,7 +195,6 @@ WRONG_GCP = [
     ("1 40 116 10 1 1 1 image.tif 3 x 1 1\n", "not a number"),
     ("1 40 116 10 1 1 1\n1 41 116 10 1 1 1\n", "there twice"),
     ("1 116 40 10 1 1 1\n", "no longitude and latitude"),
-    ("# WKT: PROJCS[]\n1 40 116 10 1 1 1\n", "a header with a projection"),
     ("1 40 116 1e5 1 1 1\n", "no place on the ground"),
 ]
 
@@ -339,3 +337,23 @@ def test_a_damaged_map_is_an_error_or_a_map(tmp_path: Path) -> None:
         (tmp_path / "bad.tif").write_bytes(bytes(content))
         with contextlib.suppress(InputError):
             open_raster(tmp_path / "bad.tif").read()
+
+
+def test_the_header_of_a_gcp_file_is_its_system(tmp_path: Path) -> None:
+    """`# WKT:` as the Ames Stereo Pipeline writes it: latitude, longitude, height above its datum."""
+    import pyproj
+
+    row = "5, 40, 116, 100, 1, 2, 3, image1.tif, 124.5, 19.7, 0.3, 0.4\n"
+    (tmp_path / "plain.gcp").write_text(row)
+    (tmp_path / "g.gcp").write_text(f"# WKT: {pyproj.CRS('EPSG:4326').to_wkt('WKT1_GDAL')}\n# id lat lon ...\n{row}")
+    plain = read(tmp_path, file="plain.gcp", crs="EPSG:4979").points
+    for more in ({}, {"crs": "EPSG:4326"}):
+        assert read(tmp_path, file="g.gcp", **more).points.itrs == pytest.approx(plain.itrs, abs=1e-6)
+    with pytest.raises(InputError, match="said differently by the file"):
+        read(tmp_path, file="g.gcp", crs="EPSG:4267")
+    (tmp_path / "g.gcp").write_text(f"# WKT: {pyproj.CRS('EPSG:32650').to_wkt('WKT1_GDAL')}\n{row}")
+    with pytest.raises(InputError, match="a header with a projection"):
+        read(tmp_path, file="g.gcp")
+    (tmp_path / "g.gcp").write_text(f"# WKT: PROJCS[]\n{row}")
+    with pytest.raises(InputError, match="cannot be read"):
+        read(tmp_path, file="g.gcp")

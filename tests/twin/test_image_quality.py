@@ -301,6 +301,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_a_job_and_a_study_with_image_quality(folder, backend) -> None:
     written = json.loads((folder / "run" / "quality.json").read_text())
     after, before = (part["cameras"]["one"] for part in (written, written["before"]))

@@ -123,6 +123,7 @@ def agrees_with_rebuilt_layouts(bench: LayoutBench, number: LayoutNumber) -> Non
         assert error <= 1e-5 * abs(value) + noise, (number.name, key)
 
 
+@pytest.mark.slow
 def test_a_slope_against_layouts_that_are_built_anew(bench: LayoutBench) -> None:
     agrees_with_rebuilt_layouts(bench, LayoutNumber((FIRST,), 0, "pupil_x"))
 
@@ -165,6 +166,7 @@ def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBe
     assert not lost.values
 
 
+@pytest.mark.slow
 def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
     told = bench.try_beam(replace(FIRST, photons=1e8)).refused
     assert told.startswith("its spots are too bright")

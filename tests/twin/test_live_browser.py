@@ -417,9 +417,16 @@ def test_the_computing_process_is_started_again(browser):
         page = Page(browser, command.address)
         page.ready()
         page.unfold("base/forward", M2)
-        for child in command._children(command.process.pid):
-            os.kill(child, signal.SIGKILL)
+        computer = command.computer()
+        os.kill(computer, signal.SIGSTOP)
+        said = "document.getElementById('problem')"
+        page.until(f"!{said}.hidden && {said}.textContent.includes('kill -CONT {computer}')", 2.0)
+        os.kill(computer, signal.SIGCONT)
+        page.until(f"{said}.hidden && document.getElementById('status').textContent === 'connected'", 2.0)
+        os.kill(computer, signal.SIGKILL)
+        page.until(f"!{said}.hidden && {said}.textContent.includes('SIGKILL')", 2.0)
         page.number(DESPACE).fill("2")
+        page.until(f"{said}.hidden", 60.0)
         page.until("liveTwin.last.truth && Math.abs(liveTwin.last.truth.cameras.forward.d_f_um) > 1", 40.0)
         page.close()
         assert command.end() == 0

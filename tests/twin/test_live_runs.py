@@ -127,6 +127,7 @@ def bench_experiment(pair: InstrumentTwin, folder: Path) -> Any:
     return InstrumentTwin.of(resolve(folder / "job.yaml"), like=pair).experiment
 
 
+@pytest.mark.slow
 def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
     """The time that is shown, all to the bit; and any other time as the run has it, and as its saved job repeats it."""
     run = render_job(resolve(written(tmp_path, COURSE)), backend, experiment=bench_experiment(pair, tmp_path))
@@ -167,6 +168,7 @@ def test_a_page_takes_so_many_frames_and_says_so(pair, tmp_path):
     assert read_source(str(written(tmp_path, JOB.replace("frames: 2", f"frames: {MOST_FRAMES}")))).notes == ()
 
 
+@pytest.mark.slow
 def test_a_seed_of_63_bits_is_known_by_its_last_ones(pair, backend, tmp_path):
     """A number in JSON holds 53; the noise is that of all, and the saved job has all."""
     seed = 2**62 + 2**55 + 12345

@@ -3,102 +3,33 @@
 from __future__ import annotations
 
 import asyncio
-import http.client
 import json
 import random
 import socket
 import threading
 import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 
 pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
-client_of = pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
+pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from twin.live.clients import BAD_MESSAGES, BURST, MOST_CLIENTS, Client, Desk, Goodbye  # noqa: E402
-from twin.live.guard import COOKIE, TOKEN, BadToken, Guard, new_token  # noqa: E402
-from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, Opened, packed, read_message  # noqa: E402
-from twin.live.server import PARTS, LiveServer, listen  # noqa: E402
-
-SECRET = "a-secret-of-enough-letters"
-
-
-class StandIn:
-    """Answers with the state's number, after a while, and remembers what it was asked."""
-
-    def __init__(self, seconds: float = 0.0, bytes_each: int = 8) -> None:
-        self.opened = Opened({"instrument": "stand-in", "channels": []}, b"glb")
-        self.seconds, self.bytes_each = seconds, bytes_each
-        self.asked: list[tuple[str, Any]] = []
-
-    async def ask(self, kind: str, question: Any) -> Any:
-        self.asked.append((kind, question))
-        await asyncio.sleep(self.seconds)
-        if kind == "state":
-            return packed({"type": "state", "n": question[0].n, "pad": "x" * self.bytes_each}, {})
-        return json.dumps({"type": kind})
-
-
-@contextmanager
-def serving(computer: StandIn, stay: bool = True):
-    """A server on a free port: its port and itself."""
-    listening = listen("127.0.0.1", 0)
-    port = listening.getsockname()[1]
-    server = LiveServer(computer, Guard.of(SECRET, "127.0.0.1", port), stay)  # type: ignore[arg-type]
-    thread = threading.Thread(target=server.run, args=(listening,), daemon=True)
-    thread.start()
-    for _ in range(200):
-        if server._uvicorn is not None and server._uvicorn.started:
-            break
-        time.sleep(0.02)
-    try:
-        yield port, server
-    finally:
-        server._stop()
-        thread.join(5)
-        assert not thread.is_alive()
+from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
+from twin.live.clients import BAD_MESSAGES, BURST, MOST_CLIENTS, Client, Desk, Goodbye
+from twin.live.computer import CannotStart, ComputerLost
+from twin.live.guard import TOKEN, BadToken, Guard, new_token
+from twin.live.messages import LARGEST_MESSAGE, AskedState, BadMessage, BlindState, read_message
+from twin.live.server import PARTS, LiveServer, listen
 
 
 @pytest.fixture(scope="module")
 def running():
     with serving(StandIn()) as (port, server):
         yield port, server
-
-
-def ask(
-    port: int, path: str = "/", cookie: str | None = SECRET, method: str = "GET", **headers: str
-) -> tuple[int, dict[str, str], bytes]:
-    line = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
-    own = {"Host": f"127.0.0.1:{port}", **headers}
-    if cookie is not None:
-        own["Cookie"] = f"{COOKIE}={cookie}"
-    line.request(method, path, headers=own)
-    answer = line.getresponse()
-    out = answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
-    line.close()
-    return out
-
-
-def connect(port: int, cookie: str | None = SECRET, origin: str | None = "own", host: str | None = None):
-    headers = {} if cookie is None else {"Cookie": f"{COOKIE}={cookie}"}
-    own = f"http://127.0.0.1:{port}" if origin == "own" else origin
-    name = f"127.0.0.1:{port}" if host is None else host
-    line = socket.create_connection(("127.0.0.1", port), timeout=5)
-    return client_of.connect(
-        f"ws://{name}/live", sock=line, additional_headers=headers, origin=own, max_size=2**24, close_timeout=1
-    )
-
-
-def state(n: int, **other: Any) -> str:
-    return json.dumps({"type": "state", "n": n, **other})
-
-
-def numbered(message: bytes) -> int:
-    return json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])["n"]
 
 
 def alive(port: int) -> bool:
@@ -441,21 +372,6 @@ def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
             seen = numbered(slow.recv(5))
 
 
-def test_a_page_that_never_reads_is_dropped(monkeypatch):
-    from twin.live import clients
-
-    monkeypatch.setattr(clients, "PATIENCE", 0.5)
-    with serving(StandIn(bytes_each=30_000_000)) as (port, server), connect(port) as slow:
-        slow.recv(5)
-        slow.send(state(1))
-        for _ in range(100):
-            if not server.desk.clients:
-                break
-            time.sleep(0.05)
-        assert not server.desk.clients
-        assert ask(port, "/session")[0] == 200
-
-
 def test_a_recording_is_bounded_and_has_no_hidden_states():
     client = Client()
     client.take(json.dumps({"type": "record", "on": True}))
@@ -485,21 +401,98 @@ def test_what_is_hidden_is_chosen_here_and_stays_until_it_is_revealed():
     assert not isinstance(client.state, BlindState)
 
 
-def test_a_lost_computer_is_told_and_the_desk_goes_on():
-    from twin.live.computer import ComputerLost
+class Fragile(StandIn):
+    """Ends over state 1, as often as it is told."""
 
-    class Fragile(StandIn):
-        async def ask(self, kind: str, question: Any) -> Any:
-            if question[0].n == 1:
-                raise ComputerLost("the process that computes ended (-9)")
-            return await super().ask(kind, question)
+    def __init__(self, times: int) -> None:
+        super().__init__()
+        self.times = times
 
-    with serving(Fragile()) as (port, _), connect(port) as ws:
+    async def ask(self, kind: str, question: Any) -> Any:
+        if question[0].n == 1 and self.times:
+            self.times -= 1
+            raise ComputerLost("the process that computes ended (killed by SIGKILL)")
+        return await super().ask(kind, question)
+
+
+def told(ws) -> dict[str, Any]:
+    return json.loads(ws.recv(5))
+
+
+def test_a_lost_computer_is_told_to_every_page_and_what_was_asked_for_is_answered():
+    computer = Fragile(1)
+    with serving(computer) as (port, _), connect(port) as ws, connect(port) as other:
+        for one in (ws, other):
+            one.recv(5)
+        ws.send(state(1))
+        for one in (ws, other):
+            lost = told(one)
+            assert (lost["type"], lost["state"]) == ("computing", "ended")
+            assert "killed by SIGKILL" in lost["problem"]
+            assert told(one) == {"type": "computing", "state": "runs", "problem": ""}
+        assert numbered(ws.recv(5)) == 1
+    assert computer.started == 1
+
+
+def test_what_ends_it_twice_is_left_out():
+    computer = Fragile(5)
+    with serving(computer) as (port, _), connect(port) as ws:
         ws.recv(5)
         ws.send(state(1))
-        assert json.loads(ws.recv(5))["type"] == "lost"
+        assert [told(ws).get("state") for _ in range(3)] == ["ended", "runs", "ended"]
+        refused = told(ws)
+        assert (refused["type"], "twice" in refused["problem"]) == ("refused", True)
+        assert told(ws)["state"] == "runs"
         ws.send(state(2))
         assert numbered(ws.recv(5)) == 2
+    assert computer.started == 2
+
+
+def test_a_computer_that_ends_while_nobody_asks_is_told_and_started_again():
+    computer = StandIn()
+    with serving(computer) as (port, _), connect(port) as ws:
+        ws.recv(5)
+        began = time.monotonic()
+        computer.condition = "ended"
+        assert told(ws)["state"] == "ended"
+        assert time.monotonic() - began < 2.0
+        assert told(ws)["state"] == "runs"
+
+
+def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
+    from twin.live import clients
+
+    monkeypatch.setattr(clients, "STOPPED", 1.0)
+    computer = StandIn()
+    with serving(computer) as (port, _), connect(port) as ws:
+        ws.recv(5)
+        began = time.monotonic()
+        computer.condition = "stopped"
+        problem = told(ws)["problem"]
+        assert time.monotonic() - began < 2.0
+        assert "kill -CONT 4321" in problem
+        with connect(port) as late:  # who comes later is told as well
+            late.recv(5)
+            assert told(late)["problem"] == problem
+        computer.condition = "runs"
+        assert told(ws) == {"type": "computing", "state": "runs", "problem": ""}
+        computer.condition = "stopped"
+        assert [told(ws)["state"] for _ in range(3)] == ["stopped", "ended", "runs"]
+    assert computer.started == 1
+
+
+def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason():
+    class Gone(StandIn):
+        async def start_again(self) -> None:
+            raise CannotStart("job.yaml: no such file")
+
+    listening = listen("127.0.0.1", 0)
+    port = listening.getsockname()[1]
+    computer = Gone()
+    server = LiveServer(computer, Guard.of(SECRET, "127.0.0.1", port), True)  # type: ignore[arg-type]
+    threading.Timer(0.5, computer.kill).start()
+    with pytest.raises(CannotStart, match="no such file"):
+        server.run(listening)
 
 
 def test_the_server_ends_when_the_last_page_is_closed(monkeypatch):

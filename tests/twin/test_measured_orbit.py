@@ -666,6 +666,7 @@ def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> 
     assert two.resection.angle_covariance(pairs) == pytest.approx(spread, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None:
     """Traced lines; and measurements, which are files."""
     traced = run(
@@ -681,6 +682,7 @@ def test_angles_that_files_cannot_hold_are_not_exported(files, tmp_path) -> None
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
     """A pass with an SP3 in GPS time and an AEM in UTC gives what tables of the same numbers give, but for a millimetre
     of the SP3's last digit and 1e-9 of the AEM's quaternions.

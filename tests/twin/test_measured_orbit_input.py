@@ -1,10 +1,8 @@
 """Files of measurements with something wrong in them: refused with file, line, column and remedy, never misread."""
 
-import random
 import re
 import shutil
 
-import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
@@ -258,42 +256,3 @@ def test_the_command_ends_with_2_and_writes_nothing(folder) -> None:
     assert "ground.csv:3: role: no such role" in " ".join(result.stderr.split())
     assert not out.exists()
     assert not data.exists()
-
-
-@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
-def test_random_changes_are_read_or_refused(folder, count) -> None:
-    """Files with bytes taken away, doubled or changed: read, or an InputError; nothing else, and no warning."""
-    source = random.Random(count)
-    names = [f"Beijing/{t}.csv" for t in TABLES] + ["data.yaml", "calibrate.yaml", "camera.yaml"]
-    refused = 0
-    for _ in range(count):
-        file = folder / source.choice(names)
-        content = file.read_bytes()
-        spoilt = bytearray(content)
-        for _ in range(source.randint(1, 3)):
-            at = source.randrange(len(spoilt))
-            kind = source.randrange(3)
-            if kind == 0:
-                del spoilt[at : at + source.randint(1, 40)]
-            elif kind == 1:
-                spoilt[at:at] = spoilt[at : at + source.randint(1, 40)]
-            else:
-                spoilt[at] = source.randrange(256)
-        file.write_bytes(bytes(spoilt))
-        try:
-            with np.errstate(all="raise"):
-                _read(folder)
-        except InputError as error:
-            refused += bool(error.file)
-        finally:
-            file.write_bytes(content)
-    assert refused > count / 3
-
-
-def _read(folder) -> None:
-    """All that comes before the adjustment."""
-    from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
-    from twin.orbit.measured.measurement_tables import read_measurements
-
-    setup = resolve_measured_calibration(folder / "calibrate.yaml")
-    read_measurements(setup.data, setup.camera)

@@ -13,9 +13,11 @@ from scipy.optimize import brentq
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.raytrace.aim import aim
+from optics.waves.diffraction import image
 from scenes.specs.channel import BASE
-from twin.monitor import monitor_path
-from twin.monitor.monitor_path import SPOT_RANGES, MonitorPath
+from twin.monitor import monitor_beams
+from twin.monitor.image_sampling import SPOT_RANGES
+from twin.monitor.monitor_path import MonitorPath
 
 ROOT = Path(__file__).resolve().parents[2]
 ACCURACY = 1e-6  # of the peak: what the nodes are chosen for
@@ -47,9 +49,9 @@ def setup(request, experiment):
 def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     path = setup.path
     inner, outer = (off_middle(path, 1.0 + SPOT_RANGES[number] + side * 2e-5) for side in (-1, 1))
-    chosen = path.class_of(path.coarse_trace([inner, outer]).place)
+    chosen = path.class_of(path.coarse_trace([inner, outer]))
     assert chosen.tolist() == [number, number + 1]
-    assert path.classes[number].nodes.count < 0.85 * path.classes[number + 1].nodes.count
+    assert path.class_beams(number).nodes.count < 0.85 * path.class_beams(number + 1).nodes.count
     fine = MonitorPath(path.instrument, path.backend, quadrature.disk(30, 120))
     want = fine.expected_photons([inner, outer], single=False)
     peak = want.max(axis=(-2, -1), keepdims=True)
@@ -60,10 +62,8 @@ def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     # one and the same state in both classes: no step where they meet
     steps = [
         path.light_per_pixel[:, None, None]
-        * path.response.apply(
-            monitor_path.image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0)))
-        )
-        for one in path.classes[number : number + 2]
+        * path.response.apply(image(one.fields([inner]), *(path.grid(axis, path.response.reach) for axis in (1, 0))))
+        for one in (path.class_beams(number), path.class_beams(number + 1))
     ]
     assert np.max(np.abs(steps[0] - steps[1])[:, None] / peak[0][:, None]) < ACCURACY
 
@@ -73,7 +73,7 @@ def test_too_few_nodes_would_be_seen(setup) -> None:
     path = setup.path
     state = off_middle(path, 1.0 + 0.95 * SPOT_RANGES[-1])
     want = path.expected_photons([state], single=False)
-    few = MonitorPath(path.instrument, path.backend, path.classes[0].nodes).expected_photons([state], single=False)
+    few = MonitorPath(path.instrument, path.backend, path.class_beams(0).nodes).expected_photons([state], single=False)
     assert np.max(np.abs(few - want)) > 3 * ACCURACY * want.max()
 
 
@@ -81,17 +81,18 @@ def test_a_state_has_its_class_in_any_company(setup) -> None:
     path = setup.path
     states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
     together = path.expected_photons(states)
-    assert path.class_of(path.coarse_trace(states).place).tolist() == [0, 1, 2, 0]
-    for state, image in zip(states, together, strict=True):
+    assert path.class_of(path.coarse_trace(states)).tolist() == [0, 1, 2, 0]
+    for state, photons in zip(states, together, strict=True):
         alone = path.expected_photons([state])[0]
         # the compiler may contract other products; then sums in single precision round elsewhere
-        assert np.max(np.abs(alone - image)) < SINGLE * image.max()
+        assert np.max(np.abs(alone - photons)) < SINGLE * photons.max()
 
 
 def test_margin_counts_as_distance(setup) -> None:
     place = np.zeros((4, 1, 2))
     half = 0.5 * setup.path.shape[0]
-    found = [int(setup.path.class_of(place, margin)[0]) for margin in (0, int(0.4 * half), int(0.7 * half))]
+    classes = setup.path.node_classes
+    found = [int(classes.class_of(place, margin)[0]) for margin in (0, int(0.4 * half), int(0.7 * half))]
     assert found == [0, 1, 2]
 
 
@@ -107,15 +108,15 @@ def test_predicted_rays_meet_the_aimed_ones(setup, monkeypatch) -> None:
         calls.append(arguments)
         return aim(*arguments)
 
-    monkeypatch.setattr(monitor_path, "aim", counted)
+    monkeypatch.setattr(monitor_beams, "aim", counted)
     predicted = path.rays(states, known)
     assert not calls
     aimed = path.rays(states, replace(known, turn=np.zeros_like(known.turn)))
     assert len(calls) == 1
     # a nanometre off its node on the face, a ray is off by that part of the aperture in direction
-    limit = 2.0 * monitor_path.AIM_TOLERANCE / path.face_radius.min() * path.numerical_aperture
+    limit = 2.0 * monitor_beams.AIM_TOLERANCE / path.face_radius.min() * path.numerical_aperture
     assert np.max(np.abs(predicted.direction - aimed.direction)) < limit
-    assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor_path.AIM_TOLERANCE
+    assert np.max(np.abs(predicted.position - aimed.position)) < 2.0 * monitor_beams.AIM_TOLERANCE
 
 
 SCRIPT = """

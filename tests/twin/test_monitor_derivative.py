@@ -58,6 +58,7 @@ def test_centroid_of_the_image_moves_as_the_rays_do(path):
         assert np.abs(moved[m] - rays[m]).max() < 0.03 * scale + 1e-9
 
 
+@pytest.mark.slow
 def test_a_trace_in_sections_is_the_same(path, monkeypatch):
     """Where one kernel ends and the next begins changes no ray, and derivatives by rounding only."""
     whole, some = {}, MOTIONS[:6]

@@ -42,6 +42,7 @@ def assert_chi_square(values, sigma, expected):
     assert low < total < high, (total / len(values), low / len(values), high / len(values))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("camera", ["forward", "backward"])
 @pytest.mark.parametrize("parameter", range(4))
 def test_scatter_of_parameters_agrees_with_sigma(runs, camera, parameter):
@@ -56,6 +57,7 @@ def test_scatter_of_parameters_agrees_with_sigma(runs, camera, parameter):
     assert_chi_square(values, sigma, (gain @ shift)[parameter])
 
 
+@pytest.mark.slow
 def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
     _, _, recovered, *_ = runs
     values = np.array([r.angle["model"].change_rad[0] for r in recovered])

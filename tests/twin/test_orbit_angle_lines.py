@@ -135,6 +135,7 @@ def test_off_axis_angles_come_back(effects: LightEffects) -> None:
             assert estimate.along.values[k] == pytest.approx(expected, abs=0.01 * ARCSEC)
 
 
+@pytest.mark.slow
 def test_scatter_of_off_axis_angles() -> None:
     """Chi-square of 200 passes to either side at 1e-4, twelve statements but for one: the dihedral angle of the nearly
     parallel lines, which is mostly their turn about the look, is some 25 sigmas from the fold and still normal."""

@@ -1,12 +1,14 @@
 """Points measured in a user's images: the simulation's images and maps, through files alone."""
 
 import json
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
 import tifffile
 
 import twin.orbit.__main__ as command
@@ -165,3 +167,18 @@ def test_what_does_not_fit_is_refused(files, change: dict[str, Any], told: str |
         return
     with pytest.raises(InputError, match=told):
         matched(folder, {**data, **change})
+
+
+def test_heights_that_no_ground_has_are_refused(files, tmp_path: Path) -> None:
+    """One of them, as a flipped bit makes it, would put the ground beyond the Earth."""
+    folder, data = files
+    dem = tmp_path / "dem.tiff"
+    shutil.copy(folder / "dem.tiff", dem)
+    with rasterio.open(dem, "r+") as file:
+        values = file.read(1)
+        values[3, 4] = 1e30
+        file.write(values, 1)
+    with pytest.raises(
+        InputError, match=r"dem.tiff: no heights of ground; found .* to 1e\+30 m, allowed: up to 20000 m"
+    ):
+        matched(folder, {**data, "dem": {"file": str(dem)}})

@@ -108,6 +108,7 @@ EXACT = 1e-9
 """Rad, 0.2 mas or 0.5 mm on the ground: products of two of 10 arcsec (2e-9), and 1e-9 of the line itself."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", MOTIONS)
 def test_true_parameters_reproduce_the_traced_line(case: str, quiet, backend, gf7_pair) -> None:
     """Signs and order of the turns, by the trace. A whole camera's turn is in the four parameters entirely. A line that
@@ -211,6 +212,7 @@ def test_longer_intervals_are_worse_and_the_shortest_is_every_time(quiet) -> Non
     assert errors[1] < 0.25 * np.abs(quiet.cases["none"].camera).max()
 
 
+@pytest.mark.slow
 def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     """Repeats with everything drawn anew, and every time's own measurement, each against its own sigma, for all share
     the reference's noise: false alarm 1e-6 each."""
@@ -254,6 +256,7 @@ def test_causes_add_up(noisy) -> None:
 # Stated disturbances
 
 
+@pytest.mark.slow
 def test_without_disturbances_there_is_nothing_to_smooth(noisy, stated) -> None:
     assert (noisy.flight.estimator, stated.flight.estimator) == ("model", "posterior")
     assert "smoothed" not in noisy.cases

@@ -229,6 +229,7 @@ def ready(done, monkeypatch):
     monkeypatch.setattr(twin.pictures.picture, "write_pictures", small)
 
 
+@pytest.mark.slow
 def test_the_command_writes_them(ready, tmp_path):
     result = CliRunner().invoke(
         command.app, [str(EXAMPLE), "--out", str(tmp_path / "run"), "--frames", "1", "--picture"]

@@ -251,10 +251,8 @@ def test_an_aem_that_is_wrong(tmp_path: Path, old: str, new: str, told: str) -> 
 
 
 SP3 = [
-    ("#d", "#a", "another version"),
     ("%c M  cc GPS", "%c M  cc XYZ", "time scale that cannot be read"),
     ("%c", "%x", "no line %c|time scale"),
-    ("EOF", "", "ends early"),
     ("ORBIT IGS20", "ORBIT J200Q", "frame that cannot be read"),
     ("*  2011  3  5  3  4 20", "*  2011  3  5  3  x 20", "not an epoch"),
     ("*  2011  3  5  3  4 20", "*  2011  3 35  3  4 20", "not a date and time"),

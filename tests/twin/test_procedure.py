@@ -247,3 +247,29 @@ def test_base_of_studies(backend: Backend, tmp_path: Path) -> None:
     assert first["level"] == numbers(measure(base.resolve(path), backend, 3, lambda *_: None))
     assert second["level"]["seed"] == 4
     assert third == Failure("the memory of the level is full")
+
+
+def test_a_report_that_cannot_be_made_costs_no_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are written, with a note where the report would be; exit code and manifest say so."""
+    monkeypatch.setattr(reference_frames, "FRAMES", FrozenMap({**reference_frames.FRAMES, "level": {}}))
+
+    def fail(run: object) -> Report:
+        raise RuntimeError("no such\nfont")
+
+    app = typer.Typer()
+
+    @app.callback()
+    def main() -> None:
+        """Instruments of one's own."""
+
+    add_test(app, "own.bench", "level", LEVEL.resolve, lambda: (LEVEL, fail), "Read a level.")
+    path, out = tmp_path / "level.yaml", tmp_path / "run"
+    path.write_text(FILE, "utf-8")
+    done = invoke(app, "level", path, "--out", out)
+    assert done.exit_code == 1
+    assert "Traceback" in done.stderr
+    assert f"error: the report could not be made; all else is in {out}" in " ".join(done.stderr.split())
+    assert len(json.loads((out / "level.json").read_text("utf-8"))["readings_arcsec"]) == 5
+    told = "the report could not be made: RuntimeError: no such font"
+    assert told in json.loads((out / "manifest.json").read_text("utf-8"))["warnings"]
+    assert told in (out / "report.html").read_text("utf-8")

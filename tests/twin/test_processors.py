@@ -22,7 +22,7 @@ from optics.numerics import array_math, quadrature
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
 from twin.main_job.monitor_reading import stated
-from twin.monitor.monitor_path import MAP_TERMS
+from twin.monitor.monitor_beams import MAP_TERMS
 
 KERNELS = {
     "one": {"OPENBLAS_CORETYPE": "Haswell"},

@@ -194,6 +194,7 @@ def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: s
     assert edge.mtf[-1] < 0.35
 
 
+@pytest.mark.slow
 def test_what_stands_before_the_lens_takes_light_and_contrast() -> None:
     """A bar across the middle of the pupil: its area is known, and so is its transfer function along its length."""
     payload = load_three_line_camera("th1")
@@ -291,6 +292,7 @@ def test_true_points_are_the_inverse() -> None:
         assert height == pytest.approx(patch.terrain.height(east, north), abs=1e-4)
 
 
+@pytest.mark.slow
 def test_control_shows_the_same_ground() -> None:
     """The nadir image, taken to the orthophoto's grid by the true geometry, is like the orthophoto: half of the texture
     is fields, of which 15% differ, the light differs as well, and the image is coarser."""

@@ -2,14 +2,19 @@
 
 import json
 import shutil
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 from astropy.io import fits
+from PIL import Image
 from typer.testing import CliRunner
 
+from analysis.images.recording_time import recorded
+from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames_setup import resolve_measurement
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
@@ -17,6 +22,8 @@ from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.recover.__main__ import app
+from twin.recover.frame_origin import order_warnings
+from twin.recover.measured_frames import ChannelFrames, StateFrames
 from twin.recover.recover_report import recover_numbers, recover_report
 from twin.recover.recover_run import run_recover
 from twin.render import app as render_app
@@ -92,14 +99,14 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
         key = f"{channel.camera}_{channel.side}"
         before, after = (tifffile.imread(images / f"{key}_{when}.tiff") for when in ("before", "after"))
         tifffile.imwrite(tmp_path / f"{key}_b.tif", before[:, 10:86, 8:90], photometric="minisblack")
-        for name, frames in (("a0", after[:5]), ("a1", before), ("a2", after)):
+        for name, frames in (("a0", after[:4]), ("a1", before), ("a2", after[4:])):
             tifffile.imwrite(tmp_path / f"{key}_{name}.tif", frames[:, 6:92, 4:92], photometric="minisblack")
         files = ", ".join(f"{key}_{name}.tif" for name in ("a0", "a1", "a2"))
         text += f"  {channel.key}: {{before: {key}_b.tif, after: [{files}], offset: [10, 8], offset_after: [6, 4]}}\n"
     found = measured(tmp_path, text, backend, run)
     assert found.times == (0.0, 600.0, 1200.0)
     whole = run.recovery
-    for k, frames in ((0, 5), (2, 9)):
+    for k, frames in ((0, 4), (2, 5)):
         r = found.readings[k].recovery
         # the frames are the same or some of them: what differs is at most the noise of one measurement
         np.testing.assert_array_less(np.abs(r.after - whole.after), 4.0 * whole.sigma_after)
@@ -213,6 +220,7 @@ def burnt(frames):
         (lambda f: f[:, :20], "frames of 20 x 96 pixels", "24 rows and columns or more"),
         (lambda f: np.pad(f, ((0, 0), (0, 9), (0, 0))), "do not lie on the CCD of 96 x 96 pixels", "with its offset"),
         (lambda f: np.stack([f, f, f], -1), "colours", "raw frames of a CCD"),
+        (lambda f: np.where(f == f.max(), 1e30, f), "grey values up to 1e+30", "at most 4.29497e+09"),
     ],
 )
 def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tmp_path, change, problem, remedy):
@@ -224,6 +232,93 @@ def test_frames_that_cannot_be_used_are_refused_by_name(run, images, backend, tm
     assert remedy in told
     assert "backward_right_after.tiff" in told
     assert "measurement.yaml:3: frames.backward/right.after" in told
+
+
+def test_copies_are_refused_with_the_frames_that_they_are_of(run, images, backend, tmp_path):
+    """The frames before as those after, in a file of another type, too, gave 0 +- sigma without a word; so does a frame
+    that stands twice in one state, whose noise would count as two.
+    """
+    before = tifffile.imread(images / "backward_right_before.tiff")
+    folder = tmp_path / "images"
+    shutil.copytree(images, folder)
+    (folder / "backward_right_after.tiff").unlink()
+    fits.PrimaryHDU(before[3:].astype(np.float32)).writeto(folder / "backward_right_after.fits")
+    with pytest.raises(InputError) as error:
+        measured(tmp_path, HEAD + "frames: images\n", backend, run)
+    assert len(error.value.issues) == 1
+    told = str(error.value)
+    assert "measurement.yaml:3: frames.backward/right.after: frame 1 of backward/right in" in told
+    assert "backward_right_after.fits is frame 4 of" in told
+    assert "backward_right_before.tiff, to the last pixel" in told
+    assert "recorded one by one" in told
+    spoilt(tmp_path / "twice", images, "forward_left_before.tiff", lambda f: np.concatenate([f, f[4:5]]))
+    with pytest.raises(InputError, match=r"frame 10 of forward/left in \S+ is frame 5 of"):
+        measured(tmp_path / "twice", HEAD + "frames: images\n", backend, run)
+
+
+def states(tmp_path, dates, **more):
+    """One channel, its states before and after with files of these dates; nothing in them is measured."""
+    found = []
+    for k, date in enumerate(dates):
+        unit = fits.PrimaryHDU(np.zeros((2, 24, 24), np.uint16))
+        unit.header.update({"DATE-OBS": date, **(more if "T" not in date else {})})
+        path = tmp_path / f"{k}.fits"
+        unit.writeto(path, overwrite=True)
+        found.append(StateFrames((str(path),), unit.data, (0, 0), ("frames",), (recorded(path),)))
+    noise = NoiseModel(0.16, 12.0, 0.0, 100.0, 0.0, 0.0, 16000.0)
+    return ChannelFrames("forward/left", (24, 24), found[0], tuple(found[1:]), None, None, None, noise, noise)
+
+
+@pytest.mark.parametrize(
+    ("dates", "told"),
+    [
+        (["2026-03-01T10:00:00", "2026-03-01T10:30:00.5"], ""),
+        (["2026-03-02T00:10:00", "2026-03-01T23:50:00"], "before and after seem to be exchanged (forward/left)"),
+        (["2026-03-02", "2026-03-01"], ""),  # the day alone
+        (["2026-03-01T10:00:00", "2026-03-01T10:30:00", "2026-03-01T11:00:00"], ""),
+        (["2026-03-01T10:00:00", "2026-03-01T11:00:00", "2026-03-01T10:30:00"], "another order than `times` says"),
+        (["2026-03-01T12:00:00", "2026-03-01T10:00:00", "2026-03-01T11:00:00"], "exchanged"),
+        (["2026-03-01T10:30:00", "2026-03-01T10:00:00", "2026-03-01T11:00:00"], ""),  # a nominal state between others
+    ],
+)
+def test_another_order_is_told_where_the_files_say_when_they_were_recorded(tmp_path, dates, told):
+    times = None if len(dates) == 2 else (0.0, 1800.0)
+    found = order_warnings([states(tmp_path, dates)], times)
+    assert len(found) == bool(told)
+    assert told in "".join(found)
+
+
+def test_one_file_without_a_time_says_nothing(tmp_path):
+    channel = states(tmp_path, ["2026-03-02T00:10:00", "2026-03-01T23:50:00"])
+    silent = replace(channel.before, origin=(*channel.before.origin, (None, "")))
+    assert order_warnings([replace(channel, before=silent)], None) == ()
+    # two keywords of older files
+    dated = states(tmp_path, ["2026-03-02", "2026-03-01"], **{"TIME-OBS": "08:00:00"})
+    assert len(order_warnings([dated], None)) == 1
+
+
+def test_files_of_the_main_job_say_which_they_are(run, images, backend, tmp_path):
+    """In their note; as they are there is nothing to be said."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for number, path in enumerate(sorted(images.glob("*.tiff"))):
+        when = path.stem.rpartition("_")[2]
+        other = path.stem.replace("before", "X").replace("after", "before").replace("X", "after")
+        facts = FrameFacts(note="nominal" if when == "before" else "perturbed")
+        (folder / f"{other}.tiff").write_bytes(tiff(tifffile.imread(path), facts))
+        assert recorded(folder / f"{other}.tiff") == (None, facts.note), number
+    found = measured(tmp_path, HEAD + "frames: images\n", backend, run)
+    assert sum("before and after seem to be exchanged" in text for text in found.warnings) == 1
+
+
+def test_a_tiff_says_when_it_was_recorded_in_exif(tmp_path):
+    """As cameras write it; the time at which a file was written says nothing."""
+    path = tmp_path / "frame.tif"
+    image = Image.fromarray(np.full((24, 24), 7, np.uint16))
+    image.save(path, tiffinfo={306: "2026:03:01 10:00:00"})
+    assert recorded(path) == (None, "")
+    image.save(path, tiffinfo={34665: {36867: "2026:03:01 10:00:07", 37521: "25"}})
+    assert recorded(path)[0] == datetime(2026, 3, 1, 10, 0, 7, 250000, tzinfo=UTC)
 
 
 def call(*words):

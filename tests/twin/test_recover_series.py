@@ -159,6 +159,7 @@ def test_only_time_differences_matter(course, backend):
     np.testing.assert_allclose(found.smoothed.times - 36000.0, course.series.smoothed.times, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_corrected_frames_are_smoothed_as_well(course, backend):
     """A cosmic ray in one frame of one time takes all channels on the other way: the same readings but for it."""
     frames = tifffile.imread(course.folder / "forward_left_1.tiff")
@@ -177,6 +178,7 @@ def test_corrected_frames_are_smoothed_as_well(course, backend):
     assert sigmas_away(raw, course.series, "smoothed") > 3.0
 
 
+@pytest.mark.slow
 def test_the_worst_time_is_told_wherever_it_is(course, backend):
     """The frames of the second time are those of a spot that nothing stated could have moved so."""
     frames = tifffile.imread(course.folder / "forward_left_1.tiff")
@@ -191,6 +193,7 @@ def test_the_worst_time_is_told_wherever_it_is(course, backend):
     assert "how it goes on in time" in told
 
 
+@pytest.mark.slow
 def test_a_single_time_and_one_without_statements_are_not_smoothed(course, backend):
     alone = course.measured(backend, course.text(TIMES[:1]))
     assert alone.smoothed is None

@@ -25,7 +25,7 @@ import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
 from tests.twin.commands import files, invoke
-from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, drawings
+from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, _tried, drawings, without_failed
 from twin.main_job.render_job import render_job
 
 run = partial(invoke, command.app)
@@ -125,6 +125,40 @@ def ready(repeated, monkeypatch):
     monkeypatch.setattr(twin.main_job.render_command, "render_report", lambda *_: "")
 
 
+def no_font(*_):
+    raise RuntimeError("no such font <x>")
+
+
+def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
+    made = {"motions": "<svg>1</svg>", "side": _tried(no_font), SUMMARY: _tried(no_font), SCENE: _tried(bytes)}
+    drawn, missing = without_failed(made)
+    assert missing == tuple(
+        f"{what} could not be drawn: RuntimeError: no such font <x>"
+        for what in ("the figure 'side'", "the file summary.png")
+    )
+    assert (drawn["motions"], drawn[SCENE], SUMMARY in drawn) == ("<svg>1</svg>", b"", False)
+    assert drawn["side"].startswith("<svg")
+    assert "no such font &lt;x&gt;</text>" in drawn["side"]
+
+
+@pytest.mark.slow
+def test_what_cannot_be_drawn_costs_nothing_else(repeated, tmp_path, monkeypatch):
+    """A figure has a note in its place, a file is left out; exit code and manifest say so."""
+    kept = repeated[3][0]
+    for name in ("_summary", "_motions"):
+        monkeypatch.setattr(f"twin.main_job.render_drawings.{name}", no_font)
+    monkeypatch.setattr(twin.main_job.render_command, "render_job", lambda *arguments, **options: kept)
+    done = run(EXAMPLE, "--out", tmp_path / "run", "--frames", FRAMES, "--quiet")
+    assert done.exit_code == 1
+    told = ["the figure 'motions'", "the file summary.png"]
+    told = [f"{what} could not be drawn: RuntimeError: no such font <x>" for what in told]
+    assert all(text in " ".join(done.stderr.split()) for text in told)
+    assert files(tmp_path / "run") == FILES - {"summary.png"}
+    manifest = json.loads((tmp_path / "run" / "manifest.json").read_text())
+    assert set(told) <= set(manifest["warnings"])
+    assert "no such font &lt;x&gt;</text>" in (tmp_path / "run" / "report.html").read_text("utf-8")
+
+
 # --- a run that works -------------------------------------------------------------------------------------------------
 
 
@@ -175,8 +209,11 @@ def test_keys_of_recovered(first):
         for side in SIDES:
             assert set(recovered["spots"][camera][side]) == set(STATES)
             for spot in recovered["spots"][camera][side].values():
-                assert set(spot) == {"row", "column", "sigma_row", "sigma_column"}
+                squares = {f"{part}_chi_square{end}" for part in ("reduced", "core") for end in ("", "_sigma_noise")}
+                fit = {*squares, "sigma_widened"}
+                assert set(spot) == {"row", "column", "sigma_row", "sigma_column", *fit}
                 assert 0 < spot["row"] < 95
+                assert spot["sigma_widened"] == 1.0
     assert set(recovered["intersection_angle"]) == set(ESTIMATORS)
     for values in recovered["intersection_angle"].values():
         assert set(values) == {f"change_arcsec{ending}" for ending in endings}
@@ -191,6 +228,15 @@ def test_keys_of_recovered(first):
         [],
     )
     assert stated["chi_square"] < stated["limit"]
+    assert recovered["sigma_holds"]
+    assert recovered["doubts"] == []
+    for found in recovered["retraced"].values():
+        assert not found["relinearised"]
+        assert found["off_in_sigma"] < 0.1
+    for camera in CAMERAS:
+        assert set(recovered["from_statement"][camera]) == set(PARAMETERS)
+        # of the posterior's variance the noise of the images is next to nothing
+        assert all(0.99 < share <= 1.0 for share in recovered["from_statement"][camera].values())
 
 
 def test_images_are_the_frames(first):
@@ -279,6 +325,7 @@ def test_the_table_is_readable_in_a_narrow_terminal(repeated):
     assert "σ: noise and the stated disturbances launch; the shifts agree with them (chi-square" in other.stdout
 
 
+@pytest.mark.slow
 def test_a_wide_terminal_also_has_the_noise_and_a_job_without_disturbances_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     shown = run(EXAMPLE, "--out", tmp_path / "wide", "--frames", FRAMES).stdout
@@ -506,7 +553,7 @@ def test_an_interrupt_leaves_nothing(number, code, tmp_path):
         out, errors = process.communicate(timeout=60)
     finally:
         process.kill()
-    assert process.returncode == code
+    assert process.returncode == code, errors
     assert out == ""
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []

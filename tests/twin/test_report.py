@@ -15,6 +15,7 @@ import pytest
 
 from analysis.monitor.estimators import ESTIMATORS
 from scenes.specs.resolved import resolve
+from tests.twin.policed_page import breaches
 from twin.main_job.crosstalk_content import is_wrong
 from twin.main_job.render_job import STAGES, render_job
 from twin.main_job.render_report import render_report
@@ -131,6 +132,7 @@ def test_needs_nothing_else(page, parsed):
     for namespace in NAMESPACES:
         text = text.replace(f'"{namespace}"', "")
     assert not re.search(r"https?:|//www|@import|file:/", text)
+    assert breaches(page) == []
     assert not {"link", "iframe", "object"} & {tag for tag, _ in parsed.tags}
     images = [attrs for tag, attrs in parsed.tags if tag in ("img", "image")]
     assert len(images) >= 16

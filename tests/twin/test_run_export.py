@@ -408,8 +408,8 @@ def test_a_file_that_was_changed_since_is_told(run, tmp_path) -> None:
         (lambda run: shutil.rmtree(run), (), "no such folder"),
         (lambda run: (run / "manifest.json").unlink(), (), "not a run folder"),
         (lambda run: (run / "truth.json").unlink(), (), "truth.json: file of the run is missing"),
-        (lambda run: (run / "truth.json").write_text('{"cameras": '), (), "cannot be read as a file of a run"),
-        (lambda run: (run / "truth.json").write_bytes(b"\xff\xfe"), (), "cannot be read as a file of a run"),
+        (lambda run: (run / "truth.json").write_text('{"cameras": '), (), "truth.json:1: not JSON"),
+        (lambda run: (run / "truth.json").write_bytes(b"\xff\xfe"), (), "truth.json:1: not UTF-8 text"),
         (lambda run: (run / "artefacts/points.csv").write_text("a,b\n1\n"), (), "rows of several lengths"),
         (
             lambda run: (run / "images/forward_left_after.tiff").write_bytes(b"II*\0"),

@@ -17,9 +17,9 @@ import pytest
 import xarray as xr
 
 from tests.twin.study_bench import ROOT
-from twin.run import run_folder
+from twin.run import durable, run_folder
 from twin.run.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
-from twin.run.unfinished import LOCK, OLD, PARTIAL, Unfinished
+from twin.run.unfinished import LOCK, OLD, PARTIAL, Unfinished, scratch
 from twin.run.versions import versions
 
 
@@ -47,11 +47,32 @@ def test_a_manifest_says_what_it_knows_in_its_own_order(tmp_path):
         run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0, warnings=["mind"], only=None, seed=3, test="level")
     manifest = json.loads((target / MANIFEST).read_text("utf-8"))
     assert list(manifest) == [
-        *("program", "test", "versions", "seed", "only", "started_unix_s", "wall_time_s", "warnings", "sha256")
+        *("program", "test", "versions", "provenance", "seed", "only", "started_unix_s", "wall_time_s", "warnings"),
+        *("sha256", "digest"),
     ]
     assert (manifest["only"], manifest["seed"], manifest["wall_time_s"]) == (None, 3, 2.0)
     assert set(manifest["sha256"]) == {"a/b.txt"}
     assert is_run_folder(target)
+
+
+def test_files_that_are_not_as_written_are_found(tmp_path):
+    target = tmp_path / "run"
+    with RunFolder(target) as folder:
+        for name in ("same.txt", "changed.txt", "gone.txt", "link.txt", "folder.txt"):
+            folder.write_text(name, name)
+        run_folder.write_manifest(folder, "twin.test", 1.5e9, 2.0)
+    assert run_folder.altered(target, run_folder.read_manifest(target)) == []
+    (target / "changed.txt").write_text("changed.tXt")
+    for name in ("gone.txt", "link.txt", "folder.txt"):
+        (target / name).unlink()
+    (target / "other.txt").write_text("link.txt")
+    (target / "link.txt").symlink_to("other.txt")
+    (target / "folder.txt").mkdir()
+    wrong = run_folder.altered(target, run_folder.read_manifest(target))
+    assert wrong == ["changed.txt", "folder.txt", "gone.txt", "link.txt"]
+    told = json.loads((target / MANIFEST).read_text("utf-8"))
+    assert told["digest"] == run_folder.seal(told)
+    assert told["digest"] != run_folder.seal(told | {"wall_time_s": 2.5})
 
 
 def test_a_manifest_refuses_what_it_does_not_know(tmp_path):
@@ -225,6 +246,22 @@ def test_force_keeps_what_the_run_did_not_write(tmp_path, put):
     assert (target / "a/b.txt").read_text() == "first"
 
 
+def test_a_file_that_was_edited_is_its_editors(tmp_path):
+    """It has the name of a file of the run, and other contents; also when it is edited during the run."""
+    target = a_run(tmp_path / "run")
+    with RunFolder(target, force=True) as folder:
+        folder.write_text("a/b.txt", "second")
+        write_manifest(folder)
+        (target / "a/b.txt").write_text("mine")
+    assert (target / "a/b.txt").read_text() == "second"
+    assert (target / "a/b.txt.kept").read_text() == "mine"
+    (target / "a/b.txt.kept").unlink()
+    (target / "a/b.txt").write_text("mine again")
+    with pytest.raises(RunFolderError, match=r"did not write: a/b.txt \(changed since\); .*--out"):
+        RunFolder(target, force=True)
+    assert (target / "a/b.txt").read_text() == "mine again"
+
+
 def test_force_names_a_few_of_many_files(tmp_path):
     target = a_run(tmp_path / "run")
     for k in range(9):
@@ -395,6 +432,57 @@ def test_a_run_that_was_being_replaced_is_put_back(tmp_path):
     with pytest.raises(RunFolderError, match="exists"):
         a_run(target, "second")
     assert (target / "a/b.txt").read_text() == "first"
+    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+
+
+LEFT = """
+import os, signal
+from twin.run.unfinished import scratch
+with scratch("twin-own") as folder:
+    (folder / "sub").mkdir()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_scratch_of_a_killed_process_goes_and_that_of_others_stays(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    subprocess.run([sys.executable, "-c", LEFT], cwd=ROOT, timeout=60)
+    left = everything(tmp_path)
+    assert len(left) == 3
+    theirs = tmp_path / "twin-own-mine.lock"  # that of another user, and a trap
+    (tmp_path / "precious").write_text("mine")
+    theirs.symlink_to(tmp_path / "precious")
+    (tmp_path / "twin-own-mine").mkdir()
+    with scratch("twin-own") as first:
+        assert stat.S_IMODE(first.stat().st_mode) == 0o700
+        with scratch("twin-own") as second:
+            assert first.exists()
+            assert second != first
+        monkeypatch.setattr(os, "getuid", lambda: 12345)
+        with scratch("twin-own"):
+            assert first.exists()
+    assert everything(tmp_path) == {theirs.name, "precious", "twin-own-mine"}
+
+
+def test_a_run_that_has_changed_places_with_the_old_one(tmp_path):
+    """Killed just after that: what stands under the new one's hidden name is the old one, with what was put there."""
+    target = a_run(tmp_path / "run")
+    act = "from twin.run import run_folder as r; (folder.target / 'late.txt').write_text('mine'); "
+    act += "r.write_manifest(folder, 'twin.test', 1.0, 1.0); r.put_in_place.__globals__['exchange']("
+    kill_a_run(target, act + "folder.path, folder.target)")
+    assert everything(target) == {"half.txt", MANIFEST}
+    a_run(tmp_path / "other")
+    assert everything(target) == {"half.txt", MANIFEST, "late.txt"}
+    assert {path.name for path in tmp_path.iterdir()} == {"run", "other"}
+
+
+def test_folders_that_cannot_change_places_in_one_step(tmp_path, monkeypatch):
+    """On a file system that does not know it: by way of a third name."""
+    monkeypatch.setattr(durable, "exchange", lambda first, second: False)
+    target = a_run(tmp_path / "run")
+    a_run(target, "second", force=True)
+    assert (target / "a/b.txt").read_text() == "second"
     assert {path.name for path in tmp_path.iterdir()} == {"run"}
 
 

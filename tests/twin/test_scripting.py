@@ -143,6 +143,7 @@ def test_more_frames_never_hurt(pair: twin.InstrumentTwin, shot: twin.Shot) -> N
     assert np.all(many.sigma < few.sigma)
 
 
+@pytest.mark.slow
 def test_another_statement_makes_other_sigmas_of_the_same_instrument(
     pair: twin.InstrumentTwin, shot: twin.Shot
 ) -> None:
@@ -347,6 +348,7 @@ def test_a_row_with_one_unit_is_a_list() -> None:
     assert one == other
 
 
+@pytest.mark.slow
 def test_a_test_of_the_orbit_is_what_the_command_gives(tmp_path: Path) -> None:
     out = tmp_path / "run"
     own = twin.perform("orbit angle", "angle", seed=7, passes=20)
@@ -385,6 +387,7 @@ def test_a_camera_is_in_the_state_of_its_instrument(pair: twin.InstrumentTwin) -
         pair.camera("forwards")
 
 
+@pytest.mark.slow
 def test_mtf_of_targets_is_a_table(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
     """30 um of M2 cost 9 to 16 % of the MTF; readings keep within 5 sigma of the true ones (12 of them: 1e-5)."""
     assert shot.mtf.empty

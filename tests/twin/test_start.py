@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from tests.twin.study_bench import ROOT
-from twin.study.runs.cluster import _children_deaf_to_ctrl_c, _ending_later
+from twin.run.ending_signals import ending_later
+from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
 """What takes long to import and no file is checked with. (pint is asked for units that are not suggested.)"""
@@ -108,7 +109,7 @@ def test_a_signal_waits_for_the_end_of_what_cannot_be_broken_off() -> None:
     done = []
 
     def work() -> None:
-        with _ending_later():
+        with ending_later():
             signal.raise_signal(signal.SIGINT)
             done.append(True)
 

@@ -86,6 +86,7 @@ def test_the_spread_keeps_the_light(experiment):
     assert np.unravel_index(np.argmax(spots[0]), spots[0].shape) == (REACH, REACH)
 
 
+@pytest.mark.slow
 def test_the_job_adds_it_to_the_images(tmp_path):
     job = tmp_path / "job.yaml"
     job.write_text(f"instrument: gf7_pair\nrender: {{frames: 2, stray: {{paths: {PATHS}}}}}\n")
@@ -96,6 +97,10 @@ def test_the_job_adds_it_to_the_images(tmp_path):
     assert all(0.02 < o["share"] < 0.1 and o["used"] > 0.0 for o in stray["obstructions"])
     found = stray["after"]
     assert found["paths_per_source"] == PATHS
+    for source in found["sources"].values():
+        for one in source["families"]:
+            # of few paths alike the share is known to about one over the root of their number
+            assert 0.5 < one["relative_to_nominal_sigma"] / one["relative_to_nominal"] * np.sqrt(one["paths"]) < 10.0
     assert set(found["sources"]) == {"forward/left", "forward/right", "backward/left", "backward/right"}
     with xr.open_dataset(tmp_path / "run" / "irradiance.nc") as images:
         stray, photons = images["stray_photons"].values, images["photons"].values

@@ -17,6 +17,7 @@ from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
+import psutil
 import pytest
 import xarray as xr
 from distributed.core import rpc
@@ -24,13 +25,14 @@ from distributed.security import Security
 
 import twin.study.__main__ as command
 from tests.twin.commands import files, invoke
-from tests.twin.study_bench import ROOT, children, chunks, start, wait_for, write_study
+from tests.twin.study_bench import ROOT, children, chunks, same_bytes, start, wait_for, write_study
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK
 from twin.study.runs.setup import resolve_study
+from twin.study.study_command import StudyRun
 
 run = partial(invoke, command.app)
 
@@ -130,6 +132,18 @@ def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_p
         np.testing.assert_array_equal(result.sigmas[:, 0], data["df_sigma"].values)
 
 
+def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch, tmp_path) -> None:
+    """Everything is written and shown; the file is to blame, at its key."""
+    folder, path, numbers = done
+    plan = Plan.of(resolve_study(path))
+    fault = plan.setup.error("states too much", ("responses", "df", "sigma"), "the noise alone")
+    made = StudyRun(numbers, "Seen.", folder, plan, (), fault)
+    monkeypatch.setattr(command, "run_study", lambda *_: made)
+    result = run(path, "--out", tmp_path / "run")
+    assert (result.exit_code, "df" in result.stdout, "Seen." in result.stdout) == (2, True, True)
+    assert re.search(r"study.yaml:8: responses.df.sigma: states too much; allowed: the noise alone", result.stderr)
+
+
 def test_nobody_else_can_talk_to_the_workers(workers) -> None:
     """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
     facts = workers.client.scheduler_info(n_workers=-1)
@@ -143,12 +157,20 @@ def test_nobody_else_can_talk_to_the_workers(workers) -> None:
             plain = address.replace("tls://", "tcp://") if security is None else address
             with pytest.raises((OSError, TimeoutError)):
                 asyncio.run(greet(plain, security))
-    # what Dask serves by HTTP has a port of its own, with nothing on it
-    ports = [facts["services"].get("dashboard", 0), *(w["services"]["dashboard"] for w in facts["workers"].values())]
-    for port in filter(None, ports):
+    # what Dask serves by HTTP has a port of its own, with nothing on it; and there is no other
+    ports = [facts["services"]["dashboard"], *(w["services"]["dashboard"] for w in facts["workers"].values())]
+    assert listening() == {("127.0.0.1", port) for port in (*(int(a.rpartition(":")[2]) for a in addresses), *ports)}
+    for port in ports:
         for page in ("", "health", "info/main/workers.html", "metrics", "json/identity.json"):
             with pytest.raises(HTTPError, match="404"):
                 urlopen(f"http://127.0.0.1:{port}/{page}", timeout=10)
+
+
+def listening() -> set[tuple[str, int]]:
+    """Where this process and those below it can be reached from outside of them."""
+    own = psutil.Process()
+    found = [c for process in (own, *own.children(recursive=True)) for c in process.net_connections()]
+    return {tuple(c.laddr) for c in found if c.status == psutil.CONN_LISTEN}
 
 
 async def greet(address: str, security: Security | None) -> object:
@@ -160,7 +182,7 @@ async def greet(address: str, security: Security | None) -> object:
 def test_a_corrupt_chunk_is_computed_again(done) -> None:
     """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
     folder, path, _ = done
-    before = (folder / "study.nc").read_bytes()
+    before = same_bytes(folder)
     chunk = sorted((folder / "chunks").glob("*.npz"))[1]
     content = bytearray(chunk.read_bytes())
     content[len(content) // 2] ^= 1
@@ -175,17 +197,17 @@ def test_a_corrupt_chunk_is_computed_again(done) -> None:
     assert "are there already" in result.stderr
     assert chunk.with_name(f"{chunk.name}.corrupt").exists()
     assert not list((folder / "chunks").glob("*.partial"))
-    assert (folder / "study.nc").read_bytes() == before
+    assert same_bytes(folder) == before
 
 
 def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     folder, path, _ = done
-    before = (folder / "study.nc").read_bytes()
+    before = same_bytes(folder)
     begun = time.monotonic()
     result = run(path, "--out", folder, "--resume", "--json")
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["runs_computed"] == 0
-    assert (folder / "study.nc").read_bytes() == before
+    assert same_bytes(folder) == before
     assert time.monotonic() - begun < 30.0
 
 
@@ -262,6 +284,20 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     assert "tcp://" in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("address", "told"),
+    [
+        *((address, "not an address") for address in ("nowhere", "tls://", "tcp://host", "tcp://host:99999999")),
+        ("tls://127.0.0.1:1", "TLS needs certificates; name them to Dask by DASK_DISTRIBUTED__COMM__TLS__CA_FILE"),
+    ],
+)
+def test_a_scheduler_that_cannot_be_reached_by_what_is_given(tmp_path, address, told) -> None:
+    result = run(write_study(tmp_path / "in"), "--out", tmp_path / "run", "--scheduler", address)
+    assert result.exit_code == 2
+    assert told in " ".join(result.stderr.split())
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("later", [0.0, 0.5, 1.5])
 def test_ctrl_c_while_workers_start_is_one_sentence(tmp_path, later) -> None:
@@ -276,7 +312,8 @@ def test_ctrl_c_while_workers_start_is_one_sentence(tmp_path, later) -> None:
         process.kill()
     assert process.returncode == 130, errors
     assert output == ""
-    assert re.fullmatch(r"error: interrupted; what is done is kept, .*--resume\n", errors), errors
+    assert errors == "error: interrupted; nothing was kept\n"
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
@@ -297,7 +334,7 @@ def test_a_signal_keeps_what_is_done(tmp_path, number, code) -> None:
     finally:
         process.kill()
     assert process.returncode == code, errors
-    assert "--resume" in errors
+    assert re.search(r"what is done is kept, go on with: .*--resume", errors), errors
     assert "Traceback" not in errors, errors
     assert chunks(tmp_path / "run") >= 1
     assert not (tmp_path / "run" / "study.nc").exists()
@@ -359,7 +396,7 @@ def test_a_real_scheduler_with_two_workers(done, tmp_path, protocol) -> None:
                 command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False
             )
             assert study.returncode == 0, study.stderr
-            assert (tmp_path / "run" / "study.nc").read_bytes() == (folder / "study.nc").read_bytes()
+            assert same_bytes(tmp_path / "run") == same_bytes(folder)
         finally:
             for process in (*two, scheduler):
                 process.terminate()

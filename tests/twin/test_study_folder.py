@@ -1,7 +1,6 @@
 """The folder of a study: whose it is, what --force may remove from it, and which program may go on with it."""
 
 import json
-import os
 import re
 import signal
 import subprocess
@@ -10,16 +9,18 @@ from pathlib import Path
 
 import pytest
 
+import twin.run.durable
 import twin.run.versions
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
-from twin.run.run_folder import Numbered, RunFolder, RunFolderError
+from twin.run.durable import exchange
+from twin.run.run_folder import Numbered, RunFolder, RunFolderError, is_run_folder, unlisted, write_manifest
 from twin.run.versions import source_digest, sources
 from twin.study.runs.setup import StudySetup, resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.runs.task import OtherProgramError, Task, evaluate
 
-OWN = {".lock", "config.yaml", "study_state.json", "chunks/index.txt", "chunks/00000.npz"}
+OWN = {".lock", ".written", "config.yaml", "study_state.json", "chunks/index.txt", "chunks/00000.npz"}
 """Files of ``work``."""
 
 
@@ -41,6 +42,22 @@ def work(path: Path | Numbered, setup: StudySetup, **options: bool) -> Path:
         (chunks / "index.txt").write_text("a line\n")
         (chunks / "00000.npz").write_text("a chunk")
     return folder.path
+
+
+def finish(path: Path, setup: StudySetup, report: str = "found", **options: bool) -> Path:
+    """A study that gets to its end."""
+    with StudyFolder(path, setup, **options) as folder:
+        (folder.path / "chunks").mkdir(exist_ok=True)
+        (folder.path / "chunks" / "index.txt").write_text("a line\n")
+        folder.begin_results()
+        folder.write_all({"report.html": report.encode(), "artefacts/a.csv": b"1,2"})
+        write_manifest(folder, "twin.study", 1.5e9, 1.0)
+    return path
+
+
+def is_whole(path: Path, report: str) -> bool:
+    """Whether a finished study stands there with all its files as they were written."""
+    return is_run_folder(path) and unlisted(path) == [] and (path / "report.html").read_text() == report
 
 
 def test_sources_are_all_that_can_compute() -> None:
@@ -123,9 +140,116 @@ def test_force_replaces_an_unfinished_study(setup, tmp_path) -> None:
     path = work(tmp_path / "run", setup)
     (path / "chunks" / "00001.npz.corrupt").touch()
     (path / "chunks" / ".00002.npz.partial").touch()
-    (path / "study.nc").touch()
+    finish(path, setup, force=True)
+    assert files(path) == OWN - {".written", "chunks/00000.npz"} | {"manifest.json", "report.html", "artefacts/a.csv"}
+    assert [place.name for place in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_what_is_replaced_stands_until_the_new_study_is_complete(setup, tmp_path, monkeypatch, exchange) -> None:
+    """Broken off after its first chunk, as by a full disk or a signal; then gone on with."""
+    if not exchange:  # a file system that does not know it
+        monkeypatch.setattr(twin.run.durable, "exchange", lambda first, second: False)
+    path = finish(tmp_path / "run", setup, "old")
     work(path, setup, force=True)
-    assert files(path) == OWN
+    assert is_whole(path, "old")
+    assert files(tmp_path / ".run.next") == OWN | {".succeeds"}
+    with pytest.raises(RunFolderError, match=r"run exists, and what was begun .*\.run\.next; .*--resume.*--force"):
+        work(path, setup)
+    work(path, setup, resume=True)
+    assert is_whole(path, "old")
+    finish(path, setup, "new", resume=True)
+    assert is_whole(path, "new")
+    assert [place.name for place in tmp_path.iterdir()] == ["run"]
+
+
+def test_force_drops_what_was_begun_to_replace_a_run(setup, tmp_path) -> None:
+    path = finish(tmp_path / "run", setup, "old")
+    work(path, setup, force=True)
+    (tmp_path / ".run.next" / "chunks" / "00007.npz").touch()
+    work(path, setup, force=True)
+    assert files(tmp_path / ".run.next") == OWN | {".succeeds"}
+    (tmp_path / ".run.next" / "notes.txt").write_text("mine")
+    with pytest.raises(RunFolderError, match=r"\.run\.next also holds .*notes.txt"):
+        work(path, setup, force=True)
+    assert is_whole(path, "old")
+
+
+def test_a_run_that_came_meanwhile_is_not_replaced(setup, tmp_path) -> None:
+    """--force was said of another one."""
+    path = finish(tmp_path / "run", setup, "old")
+    work(path, setup, force=True)
+    with RunFolder(path, force=True) as folder:
+        folder.write_text("render.txt", "newer")
+        write_manifest(folder, "twin.render", 1.6e9, 1.0)
+    with pytest.raises(RunFolderError, match="another run than the one that"):
+        finish(path, setup, "new", resume=True)
+    assert (path / "render.txt").read_text() == "newer"
+    assert (tmp_path / ".run.next" / "chunks" / "00000.npz").exists()
+
+
+class Killed(BaseException):
+    """In place of SIGKILL: nothing is cleared up."""
+
+
+@pytest.mark.parametrize("at", ["put_in_place", "remove_run"])
+def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> None:
+    """Just before both change places, and just after: a whole study stands there, and --resume comes to the end."""
+    path = finish(tmp_path / "run", setup, "old")
+
+    def kill(*_: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(f"twin.study.runs.study_folder.{at}", kill)
+        with pytest.raises(Killed):
+            finish(path, setup, "new", force=True)
+    assert is_whole(path, "old" if at == "put_in_place" else "new")
+    finish(path, setup, "newer", resume=True)
+    assert is_whole(path, "newer")
+    assert [place.name for place in tmp_path.iterdir()] == ["run"]
+
+
+def test_killed_between_the_change_of_places_and_the_next_name(setup, tmp_path) -> None:
+    path = finish(tmp_path / "run", setup, "old")
+    work(path, setup, force=True)
+    with StudyFolder(path, setup, resume=True) as folder:
+        write_manifest(folder, "twin.study", 1.5e9, 1.0)
+        assert exchange(path, folder.path)
+        folder._working = False
+    assert is_run_folder(tmp_path / ".run.next")
+    finish(path, setup, "new", resume=True)
+    assert is_whole(path, "new")
+    assert [place.name for place in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.mark.parametrize("folder", [RunFolder, StudyFolder])
+def test_a_report_that_was_edited_is_its_editors(setup, tmp_path, folder) -> None:
+    """It has the name of a file of the study, and other contents."""
+    path = finish(tmp_path / "run", setup)
+    (path / "report.html").write_text("found, and my notes")
+    with pytest.raises(RunFolderError, match=r"did not write: report\.html \(changed since\); "):
+        RunFolder(path, force=True) if folder is RunFolder else work(path, setup, force=True)
+    with pytest.raises(RunFolderError, match=r"changed since: report\.html; --resume writes them anew"):
+        work(path, setup, resume=True)
+    assert (path / "report.html").read_text() == "found, and my notes"
+
+
+def test_what_a_broken_off_end_has_written_is_the_studys(setup, tmp_path) -> None:
+    """Killed between the report and the manifest, also of a study that had been finished."""
+    path = finish(tmp_path / "run", setup)
+    with StudyFolder(path, setup, resume=True) as folder:
+        folder.begin_results()
+        folder.write("study.csv", b"1,2")
+    assert unlisted(path) == []
+    (path / "study.csv").write_text("mine")
+    (path / "report.html").write_text("mine")
+    assert unlisted(path) == ["report.html", "study.csv"]
+    with (path / ".written").open("a") as account:
+        account.write("half a li")
+    with StudyFolder(path, setup, resume=True) as folder:
+        folder.write("study.csv", b"3,4")
+    assert unlisted(path) == ["report.html"]
 
 
 @pytest.mark.parametrize("put", ["notes.txt", "chunks/notes.txt", "study.txt", ".notes", "chunks/1.npz.bak"])
@@ -139,12 +263,18 @@ def test_force_keeps_what_the_study_did_not_write(setup, tmp_path, put) -> None:
     assert (path / put).read_text() == "mine"
 
 
-def test_files_put_there_during_the_study_are_kept(setup, tmp_path) -> None:
-    path = work(tmp_path / "run", setup)
-    with StudyFolder(path, setup, force=True):
-        # nothing is done: the old study comes back
+@pytest.mark.parametrize("complete", [False, True])
+def test_files_put_there_during_the_study_are_kept(setup, tmp_path, complete) -> None:
+    path = finish(tmp_path / "run", setup)
+    with StudyFolder(path, setup, force=True) as folder:
         (path / "notes.txt").write_text("mine")
-    assert files(path) == {*OWN, "notes.txt"}
+        (path / "report.html").write_text("edited")
+        if complete:
+            folder.write("report.html", b"new")
+            write_manifest(folder, "twin.study", 1.5e9, 1.0)
+    assert (path / "notes.txt").read_text() == "mine"
+    assert (path / ("report.html.kept" if complete else "report.html")).read_text() == "edited"
+    assert (path / "artefacts").exists() != complete
     assert [place.name for place in tmp_path.iterdir()] == ["run"]
 
 
@@ -175,6 +305,30 @@ def test_studies_that_start_together_get_a_number_each(setup, tmp_path) -> None:
     assert (second.path / "study.csv").read_text() == "1"
 
 
+SIGMA = "[recovered, cameras, forward, model, d_f_um_sigma]"
+DF = f"  df: {{key: [recovered, cameras, forward, model, d_f_um], sigma: {SIGMA}}}\n"
+TRUE = "  true_df: {key: [truth, cameras, forward, d_f_um]}\n"
+
+
+def test_words_may_be_others_when_a_study_is_gone_on_with(setup, tmp_path) -> None:
+    """Names, units and what the report shows change no run."""
+    path = work(tmp_path / "run", setup)
+    more = ("name: study", "name: renamed\ndescription: all of it\nreport: {sobol: true}\nlimits: {runs: 999}")
+    unit = (TRUE, "  is: {key: [truth, cameras, forward, d_f_um], unit: mm}\n")
+    words = resolve_study(write_study(tmp_path / "words", more, unit))
+    assert words.content == setup.content
+    work(path, words, resume=True)
+
+
+@pytest.mark.parametrize("change", [(f"{DF}{TRUE}", f"{TRUE}{DF}"), ("seed: 3", "seed: 4"), (f", sigma: {SIGMA}", "")])
+def test_what_makes_other_numbers_may_not(setup, tmp_path, change) -> None:
+    """Also responses in another order: a chunk keeps them by their places."""
+    path = work(tmp_path / "run", setup)
+    other = resolve_study(write_study(tmp_path / "other", change))
+    with pytest.raises(RunFolderError, match="holds another study"):
+        work(path, other, resume=True)
+
+
 KILLED = """
 import os, signal, sys
 from pathlib import Path
@@ -186,18 +340,12 @@ with StudyFolder(Path(sys.argv[1]), resolve_study(sys.argv[2]), force=True):
 
 
 def test_a_study_that_a_killed_command_was_replacing_is_not_lost(setup, tmp_path) -> None:
-    """It stays aside while the new one is not finished, and goes when it is."""
-    path = work(tmp_path / "run", setup)
+    path = finish(tmp_path / "run", setup, "old")
     file = write_study(tmp_path / "in")
     done = subprocess.run([sys.executable, "-c", KILLED, str(path), str(file)], cwd=ROOT, timeout=120)
     assert done.returncode == -signal.SIGKILL
-    aside = next(tmp_path.glob(".run.*.old"))
-    assert (aside / "chunks" / "00000.npz").exists()
-    work(path, setup, resume=True)
-    assert aside.exists()
-    times = {"started_unix_s": 1.5e9, "wall_time_s": 1.0}
-    manifest = {"program": "twin.study", "versions": twin.run.versions.versions(), **times, "sha256": {}}
-    (path / "manifest.json").write_text(json.dumps(manifest))
-    work(tmp_path / "other", setup)
-    assert {place.name for place in tmp_path.iterdir()} == {"run", "other", "in"}
-    assert os.path.exists(path / "chunks" / "00000.npz")
+    assert is_whole(path, "old")
+    assert (tmp_path / ".run.next").exists()
+    finish(path, setup, "new", resume=True)
+    assert is_whole(path, "new")
+    assert {place.name for place in tmp_path.iterdir()} == {"run", "in"}

@@ -69,6 +69,7 @@ def numbers(written):
     return json.loads((written[0] / "gradient.json").read_text("utf-8"))
 
 
+@pytest.mark.slow
 def test_all_motions_of_the_alignment_study_agree_with_differences(backend):
     setup = without(resolve_study(EXAMPLES / "study_alignment.yaml"), "quality")
     found = study_gradient(setup, backend)
@@ -80,6 +81,7 @@ def test_all_motions_of_the_alignment_study_agree_with_differences(backend):
     assert np.all(np.abs(found.change[:8]).max(axis=0) > 1e-4)
 
 
+@pytest.mark.slow
 def test_motions_are_exact_and_all_else_is_marked(numbers):
     method, ad = np.array(numbers["method"]), np.array(numbers["ad"], float)
     names = numbers["factors"]
@@ -94,6 +96,7 @@ def test_motions_are_exact_and_all_else_is_marked(numbers):
     assert numbers["units"][traced[0]][names.index("m2z")] == "px/um"
 
 
+@pytest.mark.slow
 def test_an_error_is_what_is_recovered_minus_what_is_true(numbers):
     rows = {name: np.array(numbers["ad"][k], float) for k, name in enumerate(numbers["responses"])}
     k = numbers["factors"].index("m2z")
@@ -108,6 +111,7 @@ def test_a_factor_of_two_places_moves_both_cameras(numbers):
     assert np.abs(spots[4:]).max() > 0.01
 
 
+@pytest.mark.slow
 def test_what_needs_images_is_by_the_whole_job(small, backend):
     setup = resolve_study(small)
     spread = setup.study.responses["df"].model_copy(
@@ -151,6 +155,7 @@ def test_readings_by_posterior_are_differentiated(tmp_path, backend):
     assert found.best[10, 1] > 0.0
 
 
+@pytest.mark.slow
 def test_what_is_stated_of_one_body_alone_has_a_gradient(tmp_path, backend):
     """Without noise three motions explain eight coordinates or they do not; no matrix of theirs has an inverse."""
     path = write_study(tmp_path, text=OF_STATED.replace("mirror_mounts", "one"))
@@ -163,6 +168,7 @@ def test_what_is_stated_of_one_body_alone_has_a_gradient(tmp_path, backend):
     assert found.worst < AGREEMENT
 
 
+@pytest.mark.slow
 def test_images_say_the_same(small, backend, numbers):
     """The whole job, images and noise included, through steps that move spots by some 0.5 px.
 
@@ -214,6 +220,7 @@ def test_options_of_runs_are_refused(small, option):
     assert f"{option[0]} has no meaning" in result.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from tests.twin.study_bench import ROOT, alive, children, chunks, start, wait_for, write_study
+from tests.twin.study_bench import ROOT, alive, children, chunks, same_bytes, start, wait_for, write_study
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import local_workers
 from twin.study.runs.engine import Engine, IncompleteError
@@ -33,11 +33,11 @@ def run_to_end(*arguments: object) -> None:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """File of a study, and the bytes of its study.nc when nobody disturbs it."""
+    """File of a study, and its bytes when nobody disturbs it."""
     folder = tmp_path_factory.mktemp("undisturbed")
     path = write_study(folder, ("runs: 100", f"runs: {RUNS}"))
     run_to_end(path, "--out", folder / "run", "--workers", 2, "--quiet")
-    return path, (folder / "run" / "study.nc").read_bytes()
+    return path, same_bytes(folder / "run")
 
 
 def kill_at_random(path, folder, rng, kills: int) -> dict[str, int]:
@@ -75,10 +75,10 @@ def kill_at_random(path, folder, rng, kills: int) -> dict[str, int]:
     return hit
 
 
-def check_result(path, folder, expected: bytes) -> None:
+def check_result(path, folder, expected: dict[str, bytes]) -> None:
     resume = ["--resume"] if folder.exists() else []
     run_to_end(path, "--out", folder, "--workers", 2, "--quiet", *resume)
-    assert (folder / "study.nc").read_bytes() == expected
+    assert same_bytes(folder) == expected
     with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
         np.testing.assert_array_equal(data["run"].values, np.arange(RUNS))
         assert not data["failed"].values.any()
@@ -100,7 +100,7 @@ def test_a_worker_that_is_killed_is_replaced(undisturbed, tmp_path) -> None:
     finally:
         process.kill()
     assert process.returncode == 0, errors
-    assert (folder / "study.nc").read_bytes() == expected
+    assert same_bytes(folder) == expected
 
 
 def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:

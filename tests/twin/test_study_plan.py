@@ -1,5 +1,6 @@
 """The table of runs: designs against their definitions, places in the base, seeds, files of tables."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.stats import kstest, norm, truncnorm
 
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import STUDY, write_study
+from twin.study.runs import setup
 from twin.study.runs.config_tree import leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK
@@ -216,3 +218,71 @@ def test_a_design_that_does_not_exist_draws_no_points() -> None:
     """It was drawn as monte_carlo."""
     with pytest.raises(KeyError, match="halton"):
         unit_cube("halton", 4, 2, 0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1",
+        " 2.5 ",
+        "-3e-4",
+        "+.5",
+        "1_000",
+        "true",
+        "null",
+        "",
+        "2 um",
+        "-1.5 arcsec",
+        "1 um/m",
+        "- 1",
+        "-",
+        "--- a",
+        "a: b",
+        "# c",
+        "'quoted'",
+        '"1"',
+        "[1, 2]",
+        "{a: 1}",
+        "*a",
+        "&a",
+        "!t",
+        "? x",
+        "x, y",
+        ".inf",
+        "nan",
+        "0x10",
+        "N-BK7",
+        "a\tb",
+        "a  b",
+        "1e400",
+    ],
+)
+def test_a_cell_is_what_yaml_reads(text: str) -> None:
+    """The short way, which most cells take, and the parser give the same."""
+    short, setup._PLAIN = setup._PLAIN, re.compile(r"(?!)")
+    try:
+        want = setup._cell(text)
+    finally:
+        setup._PLAIN = short
+    got = setup._cell(text)
+    assert (type(got), got) == (type(want), want)
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        ("a,b\n" + "1 um,2\n" * 50, "at most 40 with 1 of its columns"),
+        ("a,b\n1 um\n", r"row 2 of the table .* has 1 cells, the first 2"),
+        ("a,b\n\n", "names, then a row or more"),
+        ("", "names, then a row or more"),
+        ("c,b\n1 um,2\n", "no such column"),
+    ],
+)
+def test_tables_that_are_none_for_a_study(table: str, told: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(setup, "MOST_CELLS", 40)
+    (tmp_path / "t.csv").write_text(table)
+    path = write_study(tmp_path, (NORMAL, "table: {file: t.csv, column: a}"))
+    with pytest.raises(InputError, match=told) as caught:
+        resolve_study(path)
+    assert caught.value.key[:3] == ("factors", "m2z", "table")
+    assert caught.value.allowed is not None

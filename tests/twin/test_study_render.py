@@ -170,6 +170,12 @@ def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> No
     )
     with pytest.raises(InputError, match=r"responses\.df\.minus\[1\].*cameras"):
         check_responses(resolve_study(wrong), sample)
+    wrong = write_study(tmp_path / "c", ("sigma: [rec", "noise: [rec"))
+    alone = r"found recovered\.cameras\.forward\.model\.d_f_um_sigma, .*d_f_um_sigma_noise"
+    with pytest.raises(InputError, match=rf"study.yaml:8: responses\.df\.noise: not the noise alone.*{alone}"):
+        check_responses(resolve_study(wrong), sample)
+    right = write_study(tmp_path / "d", ("sigma: [rec", "noise: [rec"), ("d_f_um_sigma]", "d_f_um_sigma_noise]"))
+    check_responses(resolve_study(right), sample)
 
 
 def test_other_keys_than_motions(study, backend) -> None:
@@ -183,6 +189,7 @@ def test_other_keys_than_motions(study, backend) -> None:
     assert np.isfinite(sigma).all()
 
 
+@pytest.mark.slow
 def test_what_is_stated_to_move_may_be_varied(tmp_path, backend, monkeypatch) -> None:
     """One number on all axes: readings of `posterior` and total sigmas of all estimators are those of a job that says
     it by hand; noise is not touched.

@@ -7,9 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
 from twin.run.report import one_sentence
-from twin.study.report.study_report import write_study_report
+from twin.study.report import study_sections
+from twin.study.report.study_report import report_files
 from twin.study.report.study_runs import StudyRuns
 
 TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
@@ -17,11 +19,14 @@ TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
 
 def page(folder, study, values, failed=None) -> str:
     """The report's text, after checking what every report must fulfil."""
-    write_study_report(dataset(study, values, failed), study, folder)
+    for name, content in report_files(dataset(study, values, failed), study).contents.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(content)
     text = (folder / "report.html").read_text("utf-8")
     # one file: nothing is fetched from elsewhere
     assert not re.search(r"""(src|href)=["'](https?:|//)""", text)
     assert "<script" not in text
+    assert breaches(text) == []
     for name in re.findall(r'href="(artefacts/[^"]+|statistics.json)"', text):
         assert (folder / name).stat().st_size > 0, name
     verdict = json.loads((folder / "statistics.json").read_text("utf-8"))["verdict"]
@@ -156,3 +161,36 @@ def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
     found = json.loads((tmp_path / "statistics.json").read_text("utf-8"))["responses"]["y"]["sobol"]["factors"]
     spread = np.var([0.0, 1.0, 2.0, 3.0, 5.0])
     assert found["a + b"]["first"]["value"] == pytest.approx(spread / (spread + 1.0 / 12.0), abs=1e-9)
+
+
+THREE = "{a: {key: [job, a], values: [1, 2, 3]}, c: {key: [job, c], values: ['$x_{', '100 $', 'a$b$']}}"
+
+
+def test_dollars_are_no_formulas() -> None:
+    """Of units and of values that are texts; matplotlib would read what stands between two of them as a formula."""
+    study = study_of(THREE, "{kind: grid}", r'{y: {key: [t, y], unit: "$\\foo$"}, z: {key: [t, z], unit: US$}}')
+    x = columns(study)
+    made = report_files(dataset(study, {"y": x["a"] + 0.1 * np.arange(9), "z": np.arange(9) ** 2.0}), study)
+    assert made.undrawn == ()
+    assert len(made.contents["artefacts/histograms.svg"]) > 1000
+
+
+def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("no such font")
+
+    study = study_of(THREE, "{kind: grid}", TWO)
+    x = columns(study)
+    data = dataset(study, {"y": x["a"] + 0.1 * np.arange(9), "z": np.arange(9) ** 2.0})
+    whole = report_files(data, study)
+    monkeypatch.setattr(study_sections, "histogram_figure", fail)
+    made = report_files(data, study)
+    told = "the figure 'Histograms' could not be drawn: no such font"
+    assert made.undrawn == (told,)
+    assert made.contents["artefacts/histograms.txt"].decode() == f"{told}\n"
+    others = {name for name in whole.contents if name not in ("report.html", "artefacts/histograms.svg")}
+    assert "statistics.json" in others
+    assert all(made.contents[name] == whole.contents[name] for name in others)
+    page_text = html.unescape(made.contents["report.html"].decode())
+    assert told in page_text  # among the warnings
+    assert f"T{told[1:]}." in page_text  # where it would stand

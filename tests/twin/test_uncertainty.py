@@ -22,9 +22,11 @@ from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.uncertainty import __main__ as command
+from twin.uncertainty import uncertainty_run
 from twin.uncertainty.coverage import FALSE, run_states
 from twin.uncertainty.monitor_limits import BEST, expected_covariance, find_limits
-from twin.uncertainty.uncertainty_report import limits_section
+from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
+from twin.uncertainty.uncertainty_report import limits_section, uncertainty_report
 
 INSTRUMENTS = ("gf7_pair", "monitor_pair")
 FRAMES = 9
@@ -87,6 +89,7 @@ def check_states(instrument, disturbances, count):
     return found
 
 
+@pytest.mark.slow
 def test_sigmas_hold_in_a_few_states():
     found = check_states("gf7_pair", "orbit", 40)
     assert set(found.errors) >= {"paper_single", "derived", "model", "posterior"}
@@ -94,6 +97,39 @@ def test_sigmas_hold_in_a_few_states():
     _, limits = bench("gf7_pair", "orbit")
     noise = np.sqrt(limits.splits[BEST].noise)
     assert np.all(found.rms(BEST) > 20.0 * noise)
+
+
+def test_what_rests_on_the_stated_numbers(monkeypatch):
+    """2 nm of coma of each mirror, that nobody measured: of the height's sigma they are three quarters of the
+    elasticity, and twice as large they make it 1.8 times as large. Warnings of the instrument are the run's.
+    """
+    experiment, found = bench("gf7_pair", "orbit")
+    monkeypatch.setattr(uncertainty_run, "MonitorExperiment", lambda *given: experiment)
+    monkeypatch.setattr(uncertainty_run, "find_limits", lambda *given, **more: found)
+    monkeypatch.setattr(uncertainty_run, "blur_warnings", lambda *given: ("blurred",))
+    run = uncertainty_run.run_uncertainty(experiment.resolved, load_backend())
+    assert run.warnings == ("blurred",)
+    assert uncertainty_report(run).warnings[0] == "blurred"
+    numbers = uncertainty_numbers(run)
+    assert numbers["warnings"] == ["blurred"]
+    height = numbers["quantities"]["ground"]["height_m"]
+    sigma, first = height["after"][BEST]["sigma"], height["elasticities"][0]
+    assert (first["number"], first["stated"], first["unit"], first["bodies"]) == (
+        "mirror_figure figure Z7",
+        2.0,
+        "nm",
+        6,
+    )
+    assert first["elasticity"] == pytest.approx(0.756, abs=0.01)
+    # sigma with the part of one number doubled: its square grows by three times the elasticity
+    assert first["doubled"] == pytest.approx(sigma * np.sqrt(1.0 + 3.0 * first["elasticity"]))
+    assert height["from_statement"] > 0.999
+    tail = height["student_t"]
+    assert tail["held_68"] > sigma
+    assert tail["held_997"] > 4.0 * sigma
+    assert 0.01 < tail["beyond_3_sigma"] < 0.1
+    texts = uncertainty_report(run).sections[1]
+    assert "mirror figure figure Z7, 2" in texts.text[0]
 
 
 @pytest.mark.slow
@@ -110,6 +146,7 @@ def test_sigmas_of_more_beams_hold_in_images(instrument):
     check_states(instrument, "orbit", 300)
 
 
+@pytest.mark.slow
 def test_states_whose_spots_leave_their_ccd_are_left_out_and_counted():
     """As often as the linear model says, within binomial limits."""
     experiment, limits = bench("monitor_pair", SHAKEN)
@@ -121,6 +158,7 @@ def test_states_whose_spots_leave_their_ccd_are_left_out_and_counted():
     assert len(found.chi_square) == found.measured == len(found.truth)
 
 
+@pytest.mark.slow
 def test_states_do_not_depend_on_how_many_are_drawn_at_once(monkeypatch):
     experiment, limits = bench("gf7_pair", "orbit")
     whole = run_states(experiment, limits.quantities, 6, 1, seed=3)

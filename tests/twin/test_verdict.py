@@ -354,6 +354,7 @@ def test_a_body_of_which_nothing_is_stated_is_named_as_such(job) -> None:
     assert ", of which nothing is stated, would explain them best" in warning
 
 
+@pytest.mark.slow
 def test_a_course_is_held_against_what_is_stated_at_every_time(job) -> None:
     """One time of three is far out, not the one that is shown."""
     motion = "[[0 arcsec, 0 arcsec, 0 arcsec], [0 arcsec, 0 arcsec, 2 arcsec], [0 arcsec, 0 arcsec, 300 arcsec]]"
@@ -372,6 +373,7 @@ def test_a_course_is_held_against_what_is_stated_at_every_time(job) -> None:
     assert not any("contradict" in text for text in judge(still).warnings)
 
 
+@pytest.mark.slow
 def test_frames_are_advised_where_they_help(job) -> None:
     """Only the noise gets less: with what is stated small against it frames help, as without a statement; else not."""
     others = "camera_mounts, moisture, mirror_mounts, focal_plane_mounts, prism_mounts, central_prism_mount, heat"
@@ -381,3 +383,22 @@ def test_frames_are_advised_where_they_help(job) -> None:
     perturb = "{base/forward/M1: {figure: {Z5: 4 nm}}}"
     assert "frames do not change that" not in judge(job(perturb, small)).verdict
     assert "frames would show it" not in judge(job(perturb, LAUNCH)).verdict
+
+
+def test_a_job_that_moves_what_it_does_not_state_says_so(job) -> None:
+    """A facet that turns is read as a turn of the camera, and four spot coordinates cannot contradict four numbers."""
+    run = job("{base/central_prism/forward_left: {rotate: [1 arcsec, 0 arcsec, 0 arcsec]}}")
+    (warning,) = [text for text in judge(run).warnings if "the job moves" in text]
+    assert "base/central_prism/forward_left rotate x (1 arcsec, not stated), and nothing is stated to move" in warning
+    assert "of forward" in warning
+    assert "of backward" not in warning
+
+
+def test_a_job_within_its_statement_is_not_warned_of(job) -> None:
+    """As little as one that moves more than is stated and is read rightly all the same."""
+    for perturb in (
+        "{base/forward/M2: {shift: [0 um, 0 um, 1 um]}}",
+        "{base/forward/focal_plane: {rotate: [0 arcsec, 0 arcsec, 30 arcsec], pivot: rear_node}}",
+    ):
+        run = job(perturb, "\ndisturbances: launch")
+        assert not [text for text in judge(run).warnings if "the job moves" in text]

@@ -45,7 +45,7 @@ run = partial(invoke, command.app)
 ROOT = Path(__file__).resolve().parents[2]
 KEYS = [
     "id", "also", "paper", "equation", "statement", "printed", "implied", "measured", "sigma", "unit", "tolerance",
-    "because", "power", "tells", "against", "theory", "inputs", "verdict", "how", "seconds",
+    "comparison", "because", "power", "tells", "against", "theory", "inputs", "verdict", "how", "seconds",
 ]  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -229,13 +229,38 @@ def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
 
 @pytest.mark.parametrize(
     ("comparison", "low", "high"),
-    [("at most", CONFIRMED, REFUTED), ("at least", REFUTED, CONFIRMED), ("equal", REFUTED, REFUTED)],
+    [("at most", CONFIRMED, REFUTED), ("at least", REFUTED, CONFIRMED), ("two-sided", REFUTED, REFUTED)],
 )
 def test_claims_of_a_limit(comparison, low, high):
     claim = check(comparison=comparison)
     assert claim.evaluate(0.5, None, "").verdict == low
     assert claim.evaluate(1.5, None, "").verdict == high
     assert claim.evaluate(1.05, None, "").verdict == claim.evaluate(0.95, None, "").verdict == CONFIRMED
+
+
+@pytest.mark.parametrize(("comparison", "said"), [("two-sided", ""), ("at most", "less"), ("at least", "more")])
+def test_a_row_says_which_sides_of_its_claim_it_compares(comparison, said, fake, tmp_path):
+    """Terminal, list, JSON, page and summary."""
+
+    def one(context: Context):
+        yield context.check("001.eq5").evaluate(1.0, 0.01, "Read.")
+        yield context.check("001.eq8").not_checkable("No number is printed.")
+
+    silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
+    fake(CheckGroup("001.formulas", "", 1.0, (check("001.eq5", comparison=comparison), silent), one))
+    assert json.loads(run("--list", "--json").stdout)["checks"][0]["comparison"] == comparison
+    found = run("--out", tmp_path / "run")
+    (line,) = (line for line in found.stdout.splitlines() if "001.eq5" in line)
+    assert comparison in line
+    row = json.loads((tmp_path / "run/validation.json").read_text("utf-8"))["checks"][0]
+    assert row["comparison"] == comparison
+    assert ("One-sided" in row["how"]) == bool(said)
+    assert f"whatever is {said} agrees" in row["how"] or not said
+    summary = (tmp_path / "run/summary/README.md").read_text("utf-8")
+    first, second = (line.split(" | ") for line in summary.splitlines() if line.startswith("| `"))
+    assert (first[3], second[3]) == (comparison, "")
+    page = (tmp_path / "run/validation.html").read_text("utf-8")
+    assert page.count(f'<span class="sigma">{comparison}</span>') == 1
 
 
 def test_a_number_that_is_not_printed_needs_one_that_is_implied():
@@ -341,12 +366,12 @@ def test_the_verdict_of_agreement_is_that_of_the_rows_basis():
 @pytest.mark.parametrize(
     ("comparison", "power", "low", "high"),
     [
-        ("equal", 1.0, 0.8, 1.2),
-        ("equal", 2.0, 0.8**0.5, 1.2**0.5),
-        ("equal", -1.0, 1 / 1.2, 1 / 0.8),
+        ("two-sided", 1.0, 0.8, 1.2),
+        ("two-sided", 2.0, 0.8**0.5, 1.2**0.5),
+        ("two-sided", -1.0, 1 / 1.2, 1 / 0.8),
         ("at most", 1.0, None, 1.2),
         ("at least", 1.0, 0.8, None),
-        ("equal", 0.0, None, None),
+        ("two-sided", 0.0, None, None),
     ],
 )
 def test_how_far_a_chosen_input_can_move_before_the_row_fails(comparison, power, low, high):
@@ -505,13 +530,13 @@ def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
     page = (tmp_path / "run/summary/README.md").read_text("utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| `")]
     assert [row.split("`")[1] for row in rows] == [*GOOD.ids, "001.eq5", "001.eq8", "001.eq9"]
-    assert all(row.replace("\\|", "").count("|") == 9 for row in rows)
+    assert all(row.replace("\\|", "").count("|") == 10 for row in rows)
     assert "2.0000 ± 0.0010 arcsec" in rows[2]
     assert "- `001.eq5` (Table 3), confirmed with correction: A factor 2 is missing. That gives 2." in page
     assert "- `001.eq8` (Table 3), not checkable: No number is printed." in page
     # implied value, tolerance with its reason, power with its share of the claim, and what is told from what
     told = "0.1 arcsec: a reason | 0.16 arcsec, 16 % | half, 0.5 arcsec away"
-    assert f"| [1] | 1.000 ± 0.020 arcsec | {told} | reproduced |" in rows[4]
+    assert f"| [1] | two-sided | 1.000 ± 0.020 arcsec | {told} | reproduced |" in rows[4]
     assert "- `001.eq9`: light 8 mW, holds from 6.9 to 9.5 mW" in page
     for figure in re.findall(r"\]\(([^)]+)\)", page):
         assert (tmp_path / "run/summary" / figure).is_file()

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 
 from twin.validation import registry
-from twin.validation.checks.check import PAPERS
+from twin.validation.checks.check import PAPERS, REFUTED
 from twin.validation.checks.group import matches
+from twin.validation.runner import run_checks
 
 SUMMARY = Path(__file__).resolve().parents[2] / "docs" / "validation" / "README.md"
 IDS = {
@@ -46,3 +47,10 @@ def test_the_summary_in_the_docs_is_of_these_checks():
             cells = line.strip("| ").split(" | ")
             rows[cells[0].split("`")[1]] = cells[-1]
     assert rows == {check.id: check.expected for check in CHECKS.values()}
+
+
+def test_contradictions_within_a_paper_have_one_verdict(backend):
+    """Where text and table of one paper give different numbers the text is refuted, in 001 as in 004."""
+    rows = run_checks(registry.select(registry.GROUPS, "001.table2.claimed,004.table2.reduction"), backend, 1).results
+    assert [row.verdict for row in rows] == 4 * [REFUTED]
+    assert all("contradict each other" in row.how for row in rows)

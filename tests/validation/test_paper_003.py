@@ -2,13 +2,24 @@
 tables say, and, marked slow, all of them.
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from optics.numerics.backend import load_backend
 from tests.validation.undrawn import undrawn
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.validation import registry
-from twin.validation.checks.check import AGREED, CORRECTED, FAILED, NOT_CHECKABLE, UNDECIDED
+from twin.validation.checks.check import (
+    AGREED,
+    CONSISTENT,
+    CORRECTED,
+    FAILED,
+    NOT_CHECKABLE,
+    REFUTED,
+    UNDECIDED,
+)
 from twin.validation.paper_003 import fields, flights, model
 from twin.validation.registry import Selection, select
 from twin.validation.runner import run_checks
@@ -65,6 +76,21 @@ def test_exact_checks_and_the_open_combination():
     assert "forward x +1 mm" in results["003.model.rank"].how
     again = found(ids[:1]).results[0]
     assert again.measured == results["003.model"].measured
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, CONSISTENT), (0.5, REFUTED), (2.5, REFUTED)])
+def test_yaw_is_told_from_a_wrong_sigma(factor, verdict, monkeypatch):
+    """Half of the sigma that the adjustment states, and two and a half of it."""
+
+    def stated(campaign, one):
+        found = calibrated_alone(campaign, one)
+        return SimpleNamespace(sigma={n: factor * s for n, s in found.sigma.items()}, bias=found.bias)
+
+    monkeypatch.setattr(model, "calibrated_alone", stated)
+    (result,) = found(["003.model.bias.yaw"]).results
+    assert result.verdict == verdict, result.how
+    assert result.how.startswith("35 fields")
 
 
 @pytest.mark.slow

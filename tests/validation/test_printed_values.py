@@ -61,7 +61,7 @@ def test_the_papers_files() -> None:
     printed = {check.id: check.printed for group in GROUPS for check in group.checks}
     assert printed["001.table4.together"] == load_printed("001").number("table4.spot_arcsec") == 0.145
     assert printed["004.table1.B3"] == load_printed("004").numbers("table1.mtf_nyquist")["B3"] == 0.37
-    assert printed["000.table1.beta"] == load_printed("000").numbers("table1.difference_arcsec")["beta"] == 1.53
+    assert printed["000.table1.beta_own"] == load_printed("000").numbers("table1.difference_arcsec")["beta"] == 1.53
     points = load_printed("004").whole("distortion.points")
     assert {len(load_printed("004").column(f"table2.{name}_um")) for name in ("raw", "compensated")} == {points} == {55}
     for rows in ("mirror_1_arcsec", "mirror_2_arcsec"):

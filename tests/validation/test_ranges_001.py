@@ -73,6 +73,7 @@ def test_the_edge_of_the_window_is_where_the_centroid_refuses(bench, wide):
         bench.positions([outside])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameter", "row", "verdict"),
     [("d_beta", "001.eq2.range", CONFIRMED), ("d_alpha", "001.eq3.range", CORRECTED)],
@@ -90,6 +91,7 @@ def test_the_range_of_a_formula_turns_with_a_wrong_factor(bench, wide, backend, 
     assert judged() == REFUTED
 
 
+@pytest.mark.slow
 def test_only_a_plane_face_returns_what_the_formulas_take(backend):
     with undrawn():
         results = run_checks(select([GROUP], "001.returns"), backend, 1, fast=True).results

@@ -72,7 +72,7 @@ def main(
         from twin.camera.camera_report import camera_report
         from twin.camera.camera_run import camera_data, camera_numbers, run_camera
         from twin.run.netcdf_file import netcdf
-        from twin.run.page import RunFacts, reproduce, write_test
+        from twin.run.page import RunFacts, write_test
 
         run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
         # what a refocused camera's file lacked has been done; how good it is now its verdict says
@@ -81,7 +81,8 @@ def main(
         numbers = {**camera_numbers(run), "verdict": shown.verdict}
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
         name = session.backend.name
-        again = reproduce(PROGRAM, "config.yaml", what or "", "--refocus" if refocus else "", f"--backend {name}")
+        options = (*((what,) if what else ()), *(("--refocus",) if refocus else ()))
+        again = (PROGRAM, "config.yaml", *options, "--backend", name)
         facts = RunFacts(setup.to_yaml(), str(file), name, None, session.started, session.seconds, PROGRAM, "", again)
         write_test(KIND, numbers, shown, facts, session.folder)
         return Result(described(KIND, numbers), lambda console: print_report(shown, console))

@@ -1,8 +1,8 @@
 """Wavefront, spot and MTF of one camera in one state, at places of its field.
 
 A **field** is a pair (along the line, along the track) of shares of the camera's half angles of view, each from -1 to
-1: (1, 0) is the direction that the unperturbed camera images to the left end (+Y') of its line CCD. It turns with the
-camera, so that a look angle or a motion of the whole camera changes nothing of its image quality.
+1: (1, 0) is the end of the unperturbed camera's field on the side of the left end (+Y') of its line CCD. It turns with
+the camera, so that a look angle or a motion of the whole camera changes nothing of its image quality.
 
 Wavefront errors count from the sphere about the image of the chief ray, with the radius of the nominal exit pupil;
 positive where the wavefront is ahead. Piston and tilt, which move an image and do not blur it, are taken out over the
@@ -20,17 +20,19 @@ import numpy as np
 import xarray as xr
 
 from optics.geometry import zernike
+from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
-from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
 from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import fit_wavefront, path_to_sphere
+from optics.waves.wavefront import fit_wavefront, orthonormal_parts, path_to_sphere
 from scenes.models.camera_assembly import ROOT, camera_alone
 from scenes.models.camera_model import CameraModel, derive_camera, field_direction
+from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
@@ -53,10 +55,6 @@ MAP_POINTS = 65
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
 
-EVEN = 10_000
-"""Rays spread evenly over the stop that tell what edges of surfaces take of a beam: good to 0.1 % of it."""
-_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
-
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
@@ -71,12 +69,16 @@ class Wavefront:
         x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
             line, y along the track.
         map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike terms in Noll's order, waves rms, (TERMS,); their names are ``optics.geometry.zernike``'s.
-        rms: waves, exact for smooth wavefronts.
+        coefficients: Zernike terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light that
+            comes through; their names are ``optics.geometry.zernike``'s.
+        parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
+            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Their
+            squares and that of ``residual`` sum to that of ``rms``.
+        rms: waves, exact for smooth wavefronts; where edges cut the beam right to 0.2 %.
         peak_to_valley: waves, over the map and the edge.
         residual: rms that the Zernike terms leave, waves.
         strehl: Strehl ratio, from the mean phasor over the stop.
-        vignetted: share of the stop's area whose light other apertures stop.
+        vignetted: share of the stop's area whose light other apertures and bodies stop.
         place: of the chief ray on the line CCD, (along the line, along the track), metres.
     """
 
@@ -86,6 +88,7 @@ class Wavefront:
     y: np.ndarray
     map: np.ndarray
     coefficients: np.ndarray
+    parts: np.ndarray
     rms: float
     peak_to_valley: float
     residual: float
@@ -228,7 +231,7 @@ class CameraOptics:
             name: of the camera there.
             backend: where to trace.
             state: for example ``MonitorExperiment.state(job)``: motions and what heat does.
-            obstruction: whether what prisms and other bodies take of the beam is missing in the MTF.
+            obstruction: whether what prisms and other bodies take of the beam is missing in it.
 
         Raises:
             KeyError: no camera of that name.
@@ -257,6 +260,17 @@ class CameraOptics:
     def nyquist(self) -> float:
         """Nyquist frequency of the line CCD's pixels, cycles/m."""
         return float(0.5 / self.model.spec.line.pitch)
+
+    @cached_property
+    def cut(self) -> Cut | None:
+        """What bodies of the instrument take of beams as designed; None where none stands in any of those of FIELDS."""
+        if not np.any(area(self.path.shadow_pieces({}, self._designed(np.array(FIELDS)))) > SMALLEST):
+            return None
+        return lambda fields, points: covered(self.path.shadow_pieces({}, self._designed(fields)), points, SMALLEST)
+
+    def _designed(self, fields: np.ndarray) -> np.ndarray:
+        """``directions`` of the camera as designed."""
+        return replace(self, state=FrozenMap()).directions(fields)
 
     def directions(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
         """Directions of the light of fields (F, 2), world, (F, 3).
@@ -288,7 +302,7 @@ class CameraOptics:
         self, fields: Sequence[Field] | np.ndarray, points: int = MAP_POINTS, terms: int = TERMS
     ) -> tuple[Wavefront, ...]:
         """Wavefront errors at fields (F, 2); ``points`` of the map on each axis. Raises as ``rays``."""
-        nodes = quadrature.disk(RINGS)
+        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         axis = np.linspace(-1.0, 1.0, points)
         x, y = np.meshgrid(axis, axis)
         inside = np.hypot(x, y) <= 1.0
@@ -302,7 +316,6 @@ class CameraOptics:
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
-        cut = self._cut(fields)
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
             lit = rays.valid[k]
             weight = nodes.weight * lit[own]
@@ -311,10 +324,8 @@ class CameraOptics:
             fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
-            rms = float(fit.rms)
-            if cut is not None:
-                # over a part of the disk the terms share tilt among them; what is level there was taken out above
-                rms = float(np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
+            # over a part of the disk the terms share tilt among them; what is level there was taken out above
+            rms = float(fit.rms if np.all(lit) else np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
             phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
             out.append(
                 Wavefront(
@@ -324,24 +335,16 @@ class CameraOptics:
                     y=axis,
                     map=table,
                     coefficients=fit.coefficients,
+                    parts=orthonormal_parts(nodes.x, nodes.y, weight, flat[own], terms),
                     rms=rms,
                     peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
                     residual=float(fit.residual_rms),
                     strehl=float(np.abs(phasor) ** 2),
-                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)) if cut is None else float(cut[k]),
+                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)),
                     place=self._place(rays, k),
                 )
             )
         return tuple(out)
-
-    def _cut(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray | None:
-        """Share of the stop's area whose light edges stop at fields (F, 2), (F,); None where no surface has any."""
-        if not self.model.edges:
-            return None
-        k = np.arange(EVEN)
-        r, turn = np.sqrt((k + 0.5) / EVEN), _GOLDEN * k
-        even = np.stack([r * np.cos(turn), r * np.sin(turn)], axis=-1)
-        return np.asarray(1.0 - np.mean(self.rays(fields, even).valid, axis=-1))
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
         """Wavefront error at one field, as ``wavefronts``."""
@@ -349,7 +352,7 @@ class CameraOptics:
 
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
         """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
-        nodes = quadrature.disk(RINGS)
+        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
         rings = [
             INSIDE * r / SPOT_RINGS * np.stack([np.cos(a), np.sin(a)], axis=-1)
             for r in range(1, SPOT_RINGS + 1)

@@ -174,6 +174,8 @@ def _wavefronts(run: CameraRun) -> Section:
     for j in range(4, _TOLD_TERMS + 1):
         rows.append([f"Z{j} {zernike.name(j)}", *(float(w.coefficients[j - 1]) for w in run.waves)])
     caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt taken out."
+    if run.optics.model.edges:
+        caption += " Fitted to the light that edges leave, where terms are not independent: one may exceed the rms."
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."

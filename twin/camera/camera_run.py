@@ -122,8 +122,8 @@ class CameraRun:
         """Kinds of aberration at the worst field and their rms, waves, the largest first."""
         wave = self.optics.wavefront(self.worst[1], points=3)
         kinds: dict[str, float] = {}
-        for j, coefficient in enumerate(wave.coefficients[3:], start=4):
-            kinds[kind_of(j)] = kinds.get(kind_of(j), 0.0) + float(coefficient) ** 2
+        for j, part in enumerate(wave.parts[3:], start=4):
+            kinds[kind_of(j)] = kinds.get(kind_of(j), 0.0) + float(part) ** 2
         found = sorted(((kind, float(np.sqrt(square))) for kind, square in kinds.items()), key=lambda k: -k[1])
         return tuple(found)
 
@@ -163,8 +163,8 @@ def run_camera(
         optics = CameraOptics.within(instrument, setup.mounted, backend)
         quality = image_quality(instrument, backend, [{}], QUALITY_FIELDS).cameras[setup.mounted]
     field = field_grid(ERROR_GRID)
-    beams = FieldBeams.trace(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5)
-    errors = beams.errors(FocalPlane.of(camera)).reshape(field.shape[:2])
+    errors = FieldBeams.field_errors(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5, optics.cut)
+    errors = errors.reshape(field.shape[:2])
     # a pupil that edges cut has no smooth function, so no MTF
     sharp = float(errors.max()) < MOST_WAVES and not optics.model.edges
     advance("wavefronts", 0, 1)

@@ -201,7 +201,7 @@ def through_focus(optics: CameraOptics, backend: Backend, fields: tuple[Field, .
     """Move the detector through focus."""
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
-    beams = FieldBeams.trace(optics.model, backend, fields, 6)
+    beams = FieldBeams.trace(optics.model, backend, fields, 6, optics.cut)
     own, best = FocalPlane.of(spec), beams.best_plane()
     downstream = float(np.sign(np.mean(beams.direction[..., 2])))
     away = downstream * (best.z - own.z)

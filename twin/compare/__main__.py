@@ -66,8 +66,8 @@ def main(
         found = {**numbers(comparison), "verdict": report.verdict}
         limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
         config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
-        again = " ".join(["python -m", PROGRAM, *map(str, runs), *limits, "--out again"])
-        facts = RunFacts(dump_yaml(config), "", "", None, session.started, session.seconds, PROGRAM, "", again=again)
+        again, times = (PROGRAM, *map(str, runs), *limits), (session.started, session.seconds)
+        facts = RunFacts(dump_yaml(config), "", "", None, *times, PROGRAM, "", again, given=tuple(runs))
         write_test(KIND, found, report, facts, session.folder)
         code = 0 if comparison.same else DIFFERENT
         return Result(described(KIND, found), lambda console: print_report(report, console), code=code)

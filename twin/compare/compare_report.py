@@ -132,10 +132,11 @@ def _changes(found: Differences, names: tuple[str, str], k: int) -> SvgFigure | 
         axes.set_xlabel("change in sigma, logarithmic beyond 10")
         axes.margins(y=0.02)
         plain_axes(axes)
+        drawn = to_svg(figure)
     caption = f"{names[1]} minus {names[0]}, over the sigma of the difference of independent measurements."
     if len(known) > len(chosen):
         caption += f" The {len(chosen)} largest of {len(known)}."
-    return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, to_svg(figure))
+    return SvgFigure(f"changes-{k}", "Results that have a sigma", caption, drawn)
 
 
 def _pictures(

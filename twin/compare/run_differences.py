@@ -6,7 +6,6 @@ netCDF and TIFF files hold arrays. What names a time, a duration or a version is
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +17,17 @@ import tifffile
 import xarray as xr
 
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.json_file import read_json
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.run_folder import MANIFEST, Manifest, read_manifest
 
 Leaf = float | int | str | bool | None
 LEFT_OUT = frozenset(
-    ("seconds", "worker_seconds", "runs_computed", "states_per_second", "wall_time_s", "fingerprint", "sha256")
+    (
+        *("seconds", "worker_seconds", "runs_computed", "states_per_second", "wall_time_s", "started_unix_s"),
+        *("fingerprint", "sha256", "versions"),
+    )
 )
 """Keys of results that say how the run was done, not what it gave."""
 TOLD = frozenset(("verdict", "warnings"))
@@ -171,34 +174,37 @@ def read_run(folder: Path) -> RunResults:
     for name in manifest.sha256:
         if name.rpartition(".")[2] not in PLAIN or "/" in name:
             continue
-        try:
-            data = json.loads((folder / name).read_text("utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(Issue(f"cannot be read: {error}", str(folder / name))) from None
+        data = read_json(folder / name)
         results = {key: value for key, value in data.items() if key not in TOLD} if isinstance(data, Mapping) else data
-        for key, value in _leaves(results):
+        for key, value in leaves(results):
             if isinstance(value, np.ndarray):
                 series[name, key] = value
             else:
                 numbers[name, key] = value
     config = folder / "config.yaml"
-    inputs = dict(_leaves(read_yaml(config).data, series=False)) if "config.yaml" in manifest.sha256 else {}
+    inputs = dict(leaves(read_yaml(config).data, series=False)) if "config.yaml" in manifest.sha256 else {}
     return RunResults(folder, manifest, inputs, numbers, series)
 
 
-def _leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
-    """Keys and values of nested data."""
+def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str, Any]]:
+    """Keys and values of nested data, without those of `LEFT_OUT`.
+
+    Args:
+        data: mappings and lists.
+        key: of it; keys of what is in it follow.
+        series: whether long lists of numbers are given whole, as arrays.
+    """
     if isinstance(data, Mapping):
         for name, value in data.items():
             if name not in LEFT_OUT and name not in ("schema", "reference_frames"):
-                yield from _leaves(value, f"{key}.{name}" if key else str(name), series)
+                yield from leaves(value, f"{key}.{name}" if key else str(name), series)
     elif isinstance(data, list):
         if series and len(data) > SERIES and (array := _as_array(data)) is not None:
             yield key, array
             return
         names = _entry_names(data)
         for k, value in enumerate(data):
-            yield from _leaves(value, f"{key}[{names[k]}]", series)
+            yield from leaves(value, f"{key}[{names[k]}]", series)
     else:
         yield key, data
 
@@ -248,7 +254,7 @@ def differences(reference: RunResults, other: RunResults, rtol: float, sigmas: f
         if sigmas is not None and is_sigma(place[1]):
             continue
         here, there = (run.numbers.get(place, _MISSING) for run in (reference, other))
-        sigma = _sigma(reference.numbers, other.numbers, place)
+        sigma = sigma_of(reference.numbers, other.numbers, place)
         if not _same_number(here, there, rtol, sigma, sigmas):
             numbers.append(NumberDifference(*place, _shown(here), _shown(there), sigma))
     pairs: list[tuple[str, str, np.ndarray | None, np.ndarray | None]] = [
@@ -313,10 +319,15 @@ def is_sigma(key: str) -> bool:
     return last == "sigma" or last.endswith(("_sigma", "_sigma_noise")) or last.startswith(("sigma_", "left_"))
 
 
-def _sigma(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
-    """Of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both runs, else
-    ``x_sigma``, ``sigma_x`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs of the same
-    motions, and does not scatter between them.
+def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
+    """Sigma of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both
+    runs, else ``x_sigma``, ``sigma_x`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
+    of the same motions, and does not scatter between them.
+
+    Args:
+        reference: (file, key) -> value of one run.
+        other: of the other.
+        place: file and key of the numbers.
     """
     file, key = place
     head, dot, last = key.rpartition(".")
@@ -341,13 +352,16 @@ def _array_difference(
     one, two = here.astype(np.float64), there.astype(np.float64)
     both = np.isfinite(one) & np.isfinite(two)
     odd = (np.isnan(one) != np.isnan(two)) | (~both & ~np.isnan(one) & (one != two))
-    delta = np.where(both, two - one, 0.0) if both.any() else np.zeros_like(one)
+    delta = np.zeros_like(one)
+    with np.errstate(over="ignore"):  # numbers at the end of the range differ by infinity
+        np.subtract(two, one, out=delta, where=both)
     peak = float(np.max(np.abs(one), where=np.isfinite(one), initial=0.0))
     largest = float(np.max(np.abs(delta), initial=0.0))
     if largest <= rtol * peak and not odd.any():
         return None
     share = float(np.mean((delta != 0.0) | odd))
-    rms = float(np.sqrt(np.mean(delta**2)))
+    scale = largest if 1e150 < largest < np.inf else 1.0  # whose squares are beyond the range
+    rms = scale * float(np.sqrt(np.mean((delta / scale) ** 2)))
     return ArrayDifference(file, name, here.shape, there.shape, largest, rms, peak, share)
 
 
@@ -361,8 +375,11 @@ def _arrays(run: RunResults, file: str) -> dict[str, np.ndarray]:
             return {"": np.asarray(tifffile.imread(path))}
         with xr.open_dataset(path, engine="h5netcdf") as data:
             return {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
-    except (OSError, ValueError, tifffile.TiffFileError) as error:
-        raise InputError(Issue(f"cannot be read: {error}", str(path))) from None
+    # the libraries fail on spoilt files in ways that cannot be foreseen
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        problem = f"cannot be read as a {'TIFF' if file.endswith('.tiff') else 'netCDF'} file: {reason}"
+        raise InputError(Issue(problem, str(path), allowed="the file as the run wrote it")) from None
 
 
 def images_of(run: RunResults, difference: ArrayDifference) -> np.ndarray | None:

@@ -75,13 +75,15 @@ def main() -> None:
 def camera(
     file: File,
     out: Out = None,
+    seed: Seed = None,
     backend: BackendName = "llvm",
     force: Force = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
-    the field is made least, with the focal length, the envelope and free beams as constraints.
+    the field is made least, with the focal length, the envelope, the anamorphism and free beams as constraints.
+    It is done from several starts (``starts:``), and said whether they agree.
 
     Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
 
@@ -90,7 +92,7 @@ def camera(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    run_test(PROGRAM, "camera", file, resolve_design, _design, Options(out, None, backend, force, as_json, quiet))
+    run_test(PROGRAM, "camera", file, resolve_design, _design, Options(out, seed, backend, force, as_json, quiet))
 
 
 @app.command("monitor")
@@ -119,12 +121,11 @@ def monitor(
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
     journal = Path(f"{out if out is not None else Path('runs') / file.stem}.search")
-    if not resume:
-        journal.unlink(missing_ok=True)
     count = cores() if workers is None else workers
-    load = partial(_monitor, count, journal)
+    load = partial(_monitor, count, journal, resume)
     options = Options(out, seed, backend, force, as_json, quiet)
     run_test(PROGRAM, "monitor", file, resolve_monitor_design, load, options)
+    journal.unlink(missing_ok=True)  # what came of it stands in the run folder
 
 
 def _design() -> Test[Any]:
@@ -134,10 +135,12 @@ def _design() -> Test[Any]:
     return DESIGN, design_report
 
 
-def _monitor(workers: int, journal: Path) -> Test[Any]:
+def _monitor(workers: int, journal: Path, resume: bool) -> Test[Any]:
     from twin.design.monitor_design import MONITOR_DESIGN, run_monitor_design
     from twin.design.monitor_report import monitor_design_report
 
+    if not resume:
+        journal.unlink(missing_ok=True)
     run = partial(run_monitor_design, workers=workers, journal=journal)
     return replace(MONITOR_DESIGN, run=run), monitor_design_report
 

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from optics.design.design_rays import trace_beams
 from optics.design.design_variables import Prescription
 from optics.design.merit_function import Evaluation
-from optics.design.optimiser import Design
+from optics.design.optimiser import Design, rms_error
+from optics.design.starts import Attempt
 from scenes.models.camera_design import prescription_of
-from twin.design.design_run import DesignRun, verdict
+from twin.design.design_run import DesignRun, agreement, verdict
 from twin.run.artefact import CameraFile, SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
@@ -26,6 +27,7 @@ def design_report(run: DesignRun) -> Report:
     worst = float(after.errors.max())
     told = one_sentence(
         *verdict(run).split(". "),
+        agreement(run),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
         f"({before.errors.max():.4f} in {setup.camera.name})",
         f"its extent along the axis is {1e3 * after.envelope:.1f} mm ({1e3 * before.envelope:.1f} mm): see "
@@ -55,6 +57,14 @@ def design_report(run: DesignRun) -> Report:
             for v in found.variables
         ],
     )
+    starts = Table(
+        "starts",
+        "What came of every start",
+        "Rms over the field and worst field, waves. The best of them is the camera above.",
+        ("start", "envelope", "waves rms", "worst field", "Jacobians", "ended"),
+        [_start_row(n, attempt) for n, attempt in enumerate(run.searched.attempts)],
+        (None, None, 4, 4, 0, None),
+    )
     names = ("scene", *found.prescription.names)
     passages = Table(
         "clearances",
@@ -81,13 +91,30 @@ def design_report(run: DesignRun) -> Report:
             "Prescription",
             (f"{found.evaluations} Jacobians were traced. The camera's file can be used as it is.",),
             (
+                starts,
                 changed,
                 CameraFile(setup.test.name.lower(), "The new camera", "A file for scenes/library/cameras.", run.text),
             ),
         ),
     )
-    facts = (("start", setup.camera.name), ("variables", str(len(found.variables))))
+    facts = (
+        ("start", setup.camera.name),
+        ("variables", str(len(found.variables))),
+        ("starts", str(len(run.searched.attempts))),
+    )
     return Report(f"Design of {setup.test.name}", told, (), facts, summary, sections, warnings=run.warnings)
+
+
+def _start_row(number: int, attempt: Attempt) -> list[str | float]:
+    """A row of the table of starts."""
+    found = attempt.design
+    kind = "drawn" if attempt.drawn else "the camera"
+    way = "at once" if attempt.steps == 1 else f"in {attempt.steps} steps"
+    if found is None:
+        return [f"{number + 1}: {kind}", way, "", "", "", attempt.problem.partition(";")[0]]
+    ended = "settled" if found.converged else "out of iterations"
+    worst = float(found.after.errors.max())
+    return [f"{number + 1}: {kind}", way, rms_error(found.after), worst, float(found.evaluations), ended]
 
 
 def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
@@ -99,6 +126,7 @@ def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
         row("wavefront error, rms over the field [waves]", lambda j: np.sqrt(np.mean(j.errors**2))),
         row("principal distance [m]", lambda j: j.principal_distance),
         row("extent along the axis [m]", lambda j: j.envelope),
+        row("f along the line over f across it", lambda j: j.anamorphism),
         row("least clearance [m]", lambda j: j.clearances.min()),
     ]
 

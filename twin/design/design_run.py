@@ -1,4 +1,4 @@
-"""A camera's prescription optimised with exact Jacobians: the run and its numbers."""
+"""A camera's prescription optimised with exact Jacobians from several starts: the run and its numbers."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from optics.design.design_rays import trace_beams
 from optics.design.merit_function import MeritFunction, Operands
-from optics.design.optimiser import HELD, Design, DesignError, Held, optimise, rms_error
+from optics.design.optimiser import HELD, ITERATIONS, Design, DesignError, Held, rms_error
+from optics.design.starts import SAME, Attempt, Search, search
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
@@ -33,6 +35,10 @@ line CCD. Made by python -m twin.design from {start}: least squares of the wavef
 WORTH = 0.01
 """Share of the error that a constraint has to be worth, eased by a millimetre, to be spoken of."""
 
+_KEYS = {"envelope": ("envelope",), "clearance": ("clearance",), "anamorphism": ("anamorphism",)}
+"""Keys of the constraints that can be eased; the principal distance is held by what varies."""
+_REMEDIES = {"envelope": "a larger envelope", "clearance": "a smaller clearance", "anamorphism": "more anamorphism"}
+
 
 @dataclass(frozen=True, eq=False)
 class DesignRun:
@@ -40,19 +46,24 @@ class DesignRun:
 
     Attributes:
         setup: what its file says.
-        found: prescription before and after.
+        searched: what came of every start.
         text: the new camera's file.
         warnings: what its user should know.
     """
 
     setup: CameraDesignSetup
-    found: Design
+    searched: Search
     text: str
     warnings: tuple[str, ...] = ()
 
+    @property
+    def found(self) -> Design:
+        """The best: prescription before and after."""
+        return self.searched.best
+
 
 def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> DesignRun:
-    """Optimise the camera; nothing is drawn at random, the seed is not used.
+    """Optimise the camera; the seed is that of the starts that are drawn.
 
     Raises:
         InputError: the camera passes no light.
@@ -67,18 +78,22 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
     operands = operands_of(setup, first.principal_distance, first.envelope)
     try:
-        found = optimise(
+        searched = search(
             backend,
             start,
             variables_of(test),
             beams,
             operands,
             test.steps,
+            test.starts,
+            seed,
             advance=lambda done, total: advance("optimise", done, total),
         )
     except DesignError as error:
-        remedy = "a larger envelope, a smaller clearance, or more to vary"
-        raise BenchError(str(error), ("envelope",) if test.envelope is not None else ("vary",), remedy) from error
+        key = next((_KEYS[kind] for kind in error.violated if kind in _KEYS), ("vary",))
+        remedies = [_REMEDIES[kind] for kind in _REMEDIES if kind in error.violated]
+        raise BenchError(str(error), key, ", ".join([*remedies, "more to vary, or more starts"])) from error
+    found = searched.best
     remark = REMARK.format(start=camera.name)
     if test.envelope is not None:
         remark += (
@@ -86,11 +101,14 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         )
     spec = camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
-    warnings: tuple[str, ...] = ()
+    warnings = []
     worst = float(found.after.errors.max())
     if worst > BLURRED:
-        warnings = (f"camera {spec.name} is blurred: {worst:.3g} waves rms in its worst field, more than {BLURRED:g}",)
-    return DesignRun(setup, found, camera_file(spec, remark), warnings)
+        told = f"{worst:.3g} waves rms in its worst field, more than {BLURRED:g}"
+        warnings.append(f"camera {spec.name} is blurred: {told}")
+    if not found.converged:
+        warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
+    return DesignRun(setup, searched, camera_file(spec, remark), tuple(warnings))
 
 
 def design_numbers(run: DesignRun) -> dict[str, Any]:
@@ -104,6 +122,8 @@ def design_numbers(run: DesignRun) -> dict[str, Any]:
         "fields_deg": np.degrees(found.merit.beams.fields).tolist(),
         "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
         "envelope_m": {"before": before.envelope, "after": after.envelope},
+        "anamorphism": {"before": before.anamorphism, "after": after.anamorphism},
+        "chief_ray_deg": {"before": _chief_rays(found, False), "after": _chief_rays(found, True)},
         "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},
         "improved": found.improved,
         "held_by": [
@@ -116,7 +136,49 @@ def design_numbers(run: DesignRun) -> dict[str, Any]:
             for held in found.held
         ],
         "jacobians": found.evaluations,
+        "converged": found.converged,
+        "starts": [_start(attempt) for attempt in run.searched.attempts],
+        "starts_at_best": run.searched.agreeing,
+        "local_optimum": run.searched.local,
     }
+
+
+def _start(attempt: Attempt) -> dict[str, Any]:
+    """One start and what came of it."""
+    found = attempt.design
+    return {
+        "drawn": attempt.drawn,
+        "steps": attempt.steps,
+        "wavefront_error_waves": None if found is None else rms_error(found.after),
+        "worst_field_waves": None if found is None else float(found.after.errors.max()),
+        "converged": found is not None and found.converged,
+        "jacobians": None if found is None else found.evaluations,
+        "problem": attempt.problem,
+    }
+
+
+def _chief_rays(found: Design, after: bool) -> list[float]:
+    """Angles of the fields' chief rays from the normal of the focal plane, degrees."""
+    prescription = found.prescription if after else found.begun
+    direction = trace_beams(found.merit.backend, prescription, found.merit.beams).direction[:, 0]
+    return np.degrees(np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), np.abs(direction[:, 2]))).tolist()
+
+
+def agreement(run: DesignRun) -> str:
+    """Whether other starts end at as good a camera; a sentence."""
+    searched, count = run.searched, len(run.searched.attempts)
+    if count == 1:
+        return "A local optimum: from one start it is not known whether there is a better one (starts: 6 tries more)"
+    failed = sum(attempt.design is None for attempt in searched.attempts)
+    unheld = f", {failed} cannot hold the constraints" if failed else ""
+    if not searched.local:
+        return f"All {count} starts end within {100 * SAME:g} % of it"
+    worst = max(attempt.error for attempt in searched.attempts if attempt.design is not None)
+    return (
+        f"A local optimum: of {count} starts {searched.agreeing} "
+        f"{'ends' if searched.agreeing == 1 else 'end'} within {100 * SAME:g} % of the best, others at up to "
+        f"{worst:.4f} waves{unheld}"
+    )
 
 
 def verdict(run: DesignRun) -> str:
@@ -136,7 +198,11 @@ def _held_text(held: tuple[Held, ...], start: str) -> str:
     """The dearest constraints, at most three, each with by how much."""
     parts = []
     for one in held[:3]:
-        text = f"the {one.name} ({one.limit:.6g} m" if one.limit > 1.0 else f"the {one.name} ({1e3 * one.limit:.4g} mm"
+        if one.name.startswith("anamorphism"):
+            limit = f"{100 * one.limit:.4g} %"
+        else:
+            limit = f"{one.limit:.6g} m" if one.limit > 1.0 else f"{1e3 * one.limit:.4g} mm"
+        text = f"the {one.name} ({limit}"
         if one.start > HELD:
             text += f", which {start} breaks by {1e3 * one.start:.3g} mm"
         parts.append(f"{text}; easing it by 1 mm is worth {1e-3 * one.worth:.2g} waves)")
@@ -144,4 +210,4 @@ def _held_text(held: tuple[Held, ...], start: str) -> str:
 
 
 # the start is there to be improved, however blurred it is
-DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers, judged=False, seeded=False)
+DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers, judged=False)

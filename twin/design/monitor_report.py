@@ -19,6 +19,7 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.sensors.grey_steps import coarse_warnings
 
 _MOST_CAUSES = 6
 
@@ -64,7 +65,8 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     )
     facts = (("start", start), ("disturbances", stated), ("best", best.name))
     lead = (f"The instrument of the best layout is artefacts/{best.name.lower()}.yaml.",)
-    return Report(f"Layout of {test.name}", verdict(run), lead, facts, summary, sections)
+    title = f"Layout of {test.name}"
+    return Report(title, verdict(run), lead, facts, summary, sections, warnings=coarse_warnings(run.setup))
 
 
 _FRONT = (

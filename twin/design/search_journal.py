@@ -6,10 +6,11 @@ import base64
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.models.monitor_layout import Beam
 from twin.design.layout_bench import BeamFacts, LayoutFacts, Seen
 from twin.design.layout_gradient import LayoutNumber, Slope
+from twin.run.durable import make_folders
 from twin.run.run_folder import RunFolderError
 from twin.run.versions import source_digest
 
@@ -29,53 +31,58 @@ Item = Beam | tuple[Beam, ...] | LayoutNumber
 
 
 class Journal:
-    """Context manager; inside it everything that is kept stands in the file at once.
+    """Context manager; inside it everything that is kept stands in the file at once. The file stays: whoever writes
+    what came of the search removes it when that is safe.
 
     Args:
         file: of the journal; what it holds already is known. None keeps nothing.
         config: what the search is about; a file about anything else, or of another program, is refused.
 
     Raises:
-        RunFolderError: on entering, the file is about another search, or cannot be written.
+        RunFolderError: on entering, the file is about another search; then and later, it cannot be written.
     """
 
     def __init__(self, file: Path | None, config: str) -> None:
         self.file = file
         self._head = hashlib.sha256(f"{source_digest()}\n{config}".encode()).hexdigest()
         self._known: dict[str, Any] = {}
-        self._out: TextIO | None = None
+        self._out: BinaryIO | None = None
 
     def __enter__(self) -> Journal:
         """Read what is there."""
         if self.file is None:
             return self
         try:
-            lines = self.file.read_text("utf-8").splitlines() if self.file.exists() else []
-            if lines and lines[0] != self._head:
+            make_folders(self.file.parent)
+            self._out = self.file.open("r+b" if self.file.exists() else "x+b")
+            lines = self._out.read().splitlines(keepends=True)
+            if lines and lines[0] != f"{self._head}\n".encode():
                 raise RunFolderError(
                     f"{self.file} is of another search, or of another version of this program; remove it to begin anew"
                 )
+            whole = len(lines[0]) if lines else 0
             for line in lines[1:]:
-                try:
-                    entry = json.loads(line)
-                except ValueError:  # the last line of a process that was killed
+                if not line.endswith(b"\n"):  # the last line of a process that was killed
                     break
+                whole += len(line)
+                check, _, text = line[:-1].partition(b" ")
+                if check != _check(text):  # damaged: what it held is tried again
+                    continue
+                entry = json.loads(text)
                 self._known[entry["of"]] = _decoded(entry["is"])
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            self._out = self.file.open("w", encoding="utf-8")
+            self._out.truncate(whole)
+            self._out.seek(whole)
         except OSError as error:
             raise RunFolderError(f"{self.file}: {error.strerror}") from error
-        self._write(self._head)
-        for name, result in self._known.items():
-            self._write(json.dumps({"of": name, "is": _encoded(result)}))
+        if not whole:
+            self._write(self._head)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Close the file; one of a search that is complete goes."""
-        if self._out is not None and self.file is not None:
-            self._out.close()
-            if kind is None:
-                self.file.unlink(missing_ok=True)
+        """Close the file."""
+        if self._out is not None:
+            with suppress(OSError):  # what could not be written has been told
+                self._out.close()
 
     def known(self, item: Item) -> Any:
         """What came of a beam, a layout or a number of one, None if it was not tried."""
@@ -84,12 +91,26 @@ class Journal:
     def keep(self, item: Item, result: BeamFacts | LayoutFacts | Slope) -> None:
         """Keep what came of it."""
         if self._out is not None:
-            self._write(json.dumps({"of": _name(item), "is": _encoded(result)}))
+            self._write(_line(_name(item), result))
 
     def _write(self, line: str) -> None:
         assert self._out is not None
-        self._out.write(line + "\n")
-        self._out.flush()
+        try:
+            self._out.write(f"{line}\n".encode())
+            self._out.flush()
+        except OSError as error:
+            text = f"{self.file}: {error.strerror}; what it holds is kept, go on with --resume"
+            raise RunFolderError(text) from error
+
+
+def _line(name: str, result: Any) -> str:
+    """A line of the journal: a checksum, and what was tried with what came of it."""
+    text = json.dumps({"of": name, "is": _encoded(result)})
+    return f"{_check(text.encode()).decode()} {text}"
+
+
+def _check(text: bytes) -> bytes:
+    return hashlib.sha256(text).hexdigest()[:16].encode()
 
 
 def _name(item: Item) -> str:

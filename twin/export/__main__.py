@@ -74,9 +74,9 @@ def main(
         report = export_report(done)
         found = {**done.numbers(), "verdict": report.verdict}
         chosen = ["--frames", frames, "--tables", tables]
-        again = " ".join(["python -m", PROGRAM, str(run), *chosen, "--out again"])
+        again, times = (PROGRAM, str(run), *chosen), (session.started, session.seconds)
         config = dump_yaml({"run": str(run), "frames": frames, "tables": tables})
-        facts = RunFacts(config, "", "", None, session.started, session.seconds, PROGRAM, "", again=again)
+        facts = RunFacts(config, "", "", None, *times, PROGRAM, "", again, given=(run,))
         write_test(KIND, found, report, facts, session.folder)
         return Result(described(KIND, found), lambda console: print_report(report, console))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,13 +14,14 @@ import xarray as xr
 from analysis.images.image_file import ImageFile
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.input_file import is_file
 from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_fits, read_frames, run_cards
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
 from twin.run.data_table import TABLE_FORMATS, DataTable, MissingPackage
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
-from twin.run.run_folder import MANIFEST, Manifest, RunFolder, read_manifest
+from twin.run.run_folder import MANIFEST, Manifest, RunFolder, altered, read_manifest
 
 __all__ = ["FRAMES", "KIND", "NONE", "Exported", "ExportedFile", "export", "export_report", "read_source"]
 
@@ -107,7 +107,7 @@ def read_source(folder: Path) -> Manifest:
     if manifest is None:
         problem = "no such folder" if not folder.is_dir() else f"not a run folder: it has no {MANIFEST} of a run"
         raise InputError(Issue(problem, str(folder), allowed="a folder that a command of the twin has written"))
-    missing = [name for name in manifest.sha256 if not (folder / name).is_file()]
+    missing = [name for name in manifest.sha256 if not is_file(folder / name)]
     if missing:
         raise InputError(*(Issue("file of the run is missing", str(folder / name)) for name in missing[:5]))
     return manifest
@@ -127,7 +127,7 @@ def export(source: Path, manifest: Manifest, frames: str, tables: str, folder: R
     Raises:
         InputError: the run has nothing of what is asked for, a file of it cannot be read, or a package is missing.
     """
-    changed = tuple(name for name, known in manifest.sha256.items() if _checksum(source / name) != known)
+    changed = tuple(altered(source, manifest))
     files: list[ExportedFile] = []
     if frames != NONE:
         files += _frames(source, manifest, folder, advance)
@@ -155,13 +155,12 @@ def _told(place: Path) -> Iterator[None]:
     """What cannot be read in a run folder is bad input."""
     try:
         yield
+    except InputError:
+        raise
     # readers of spoilt files fail in ways that cannot be foreseen
     except Exception as error:
-        raise InputError(Issue(f"cannot be read as a file of a run: {error}", str(place))) from None
-
-
-def _checksum(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+        problem = f"cannot be read as a file of a run: {error}"
+        raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
 
 
 def _source_of(table: DataTable) -> str:
@@ -181,11 +180,12 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
     for k, name in enumerate(pictures):
         with _told(source / name):
             recorded = read_frames(source / name)
-        known = about if "area CCD" in str(recorded.pages[0].get("camera", "")) else []
-        content = frames_fits(recorded, [*known, *cards])
+            known = about if "area CCD" in str(recorded.pages[0].get("camera", "")) else []
+            content = frames_fits(recorded, [*known, *cards])
         file = f"{name.removesuffix('.tiff')}.fits"
         yield _put(folder, file, content, name, _what(recorded.pages[0]), len(recorded.frames))
-        if not np.array_equal(ImageFile.open(folder.path / file).frames(), recorded.frames):
+        real = recorded.frames.dtype.kind == "f"
+        if not np.array_equal(ImageFile.open(folder.path / file).frames(), recorded.frames, equal_nan=real):
             raise RuntimeError(f"{file} does not hold what was put into it")
         advance("frames", k + 1, len(pictures))
     for name, stem in EXPECTED.items():

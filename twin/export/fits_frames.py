@@ -63,6 +63,10 @@ def read_frames(path: Path) -> RecordedFrames:
         frames = np.stack([page.asarray() for page in file.pages])
         pages = tuple(json.loads(page.description) for page in file.pages)
         tags = {tag.code: tag.value for tag in file.pages[0].tags.values()}
+    if frames.ndim != 3 or frames.dtype.kind not in "uif":
+        raise ValueError(f"pages of {frames.dtype.name} with {frames.ndim - 1} axes are no recorded frames")
+    if not all(isinstance(page, Mapping) for page in pages):
+        raise ValueError("a page says of itself what no page of a run does")
     if _SCALE not in tags:
         return RecordedFrames(frames, pages)
     across, down, _ = tags[_SCALE]

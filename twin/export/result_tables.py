@@ -17,6 +17,7 @@ import h5py
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
+from scenes.yaml.json_file import read_json
 from twin.run.data_table import DataColumn, DataTable
 from twin.run.run_folder import MANIFEST
 
@@ -80,6 +81,9 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
         "column": ("px", "column of the spot's centre on the area CCD; 0 is the centre of the first"),
         "sigma_row": ("px", "standard deviation of row"),
         "sigma_column": ("px", "standard deviation of column"),
+        "reduced_chi_square": ("", "of the fit of the spot's shape to all pixels; 1 for a spot as calibrated"),
+        "core_chi_square": ("", "the same of the pixels of the spot's core"),
+        "sigma_widened": ("", "factor by which the fit widened the standard deviations; 1 for a spot that fits"),
         "d_alpha_arcsec": ("arcsec", "turn of the camera about its Y, right-handed, perturbed minus nominal"),
         "d_beta_arcsec": ("arcsec", "turn of the camera about its X, right-handed, perturbed minus nominal"),
         "d_gamma_arcsec": ("arcsec", "turn of the camera about its Z, the line of sight, perturbed minus nominal"),
@@ -132,13 +136,10 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
         files: of it, relative to it, as its manifest lists them.
 
     Raises:
+        InputError: a JSON file cannot be read.
         ValueError: a JSON or CSV file is not what runs write.
     """
-    data = {
-        name: json.loads((folder / name).read_text("utf-8"))
-        for name in files
-        if name.endswith(".json") and name not in _OTHER_FILES
-    }
+    data = {name: read_json(folder / name) for name in files if name.endswith(".json") and name not in _OTHER_FILES}
     tables = [numbers] if (numbers := _numbers(data)) is not None else []
     tables += [table for nested in NESTED if (table := _nested(nested, data.get(nested.file, {}))) is not None]
     taken = {table.name for table in tables}

@@ -24,7 +24,7 @@ from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, Traced, make_rays, require_some, trace
 from optics.waves.diffraction import Grid, PupilField, image
-from optics.waves.pixel_response import PixelResponse
+from optics.waves.pixel_response import PixelResponse, UnsampledImageError
 from optics.waves.wavefront import eikonal
 from scenes.models.autocollimator_model import UNITS, Bench, autocollimator_body, outgoing, pinhole_body, round_trip
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
@@ -60,6 +60,9 @@ class AutocollimatorPath:
         bench: the bench.
         backend: where to trace.
         nodes: on the mirror; by default a quadrature that makes the images right to 1e-6 of their peak.
+
+    Raises:
+        InputError: area CCDs that do not sample the spots.
     """
 
     def __init__(self, bench: Bench, backend: Backend, nodes: PupilNodes | None = None) -> None:
@@ -76,10 +79,19 @@ class AutocollimatorPath:
 
     @cached_property
     def response(self) -> PixelResponse:
-        """What a 1/FINE part of a pixel and the pinhole do to the image."""
+        """What a 1/FINE part of a pixel and the pinhole do to the image.
+
+        Raises:
+            InputError: the pixels are too coarse for the image, or the pinhole is too wide for them.
+        """
         collimator = self.bench.spec.autocollimator
         cutoff = 2.0 * self.bench.numerical_aperture / collimator.wavelength
-        return PixelResponse.fit(self.pitch / FINE, collimator.reticle.pinhole, cutoff)
+        try:
+            return PixelResponse.fit(self.pitch / FINE, collimator.reticle.pinhole, cutoff)
+        except UnsampledImageError as error:
+            key = ("reticle", "pinhole") if error.of_source else ("area_ccd", "pitch")
+            problem = f"the area CCDs cannot follow the spots: of {FINE} samples to the pixel, {error}"
+            raise self.bench.spec.error(problem, ("autocollimator", *key), allowed=error.remedy) from error
 
     @cached_property
     def _slopes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

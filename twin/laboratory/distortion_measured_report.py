@@ -13,7 +13,7 @@ from analysis.orientation.interior import gain
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
-from twin.laboratory.distortion_report import ESTIMATES, dress, typeset
+from twin.laboratory.distortion_report import ESTIMATES, dress, joint_section, typeset
 from twin.laboratory.distortion_run import MeasuredDistortion
 from twin.laboratory.turntable_measured_report import DOUBTFUL
 from twin.laboratory.turntable_report import FIT_NAMES
@@ -48,7 +48,7 @@ def measured_distortion_report(run: MeasuredDistortion) -> Report:
             ("description", spec.description),
         ),
         summary=_summary(run, data),
-        sections=(_curve(run, data), _estimates(run, data), _noise(run, data)),
+        sections=(_curve(run, data), joint_section(data["joint"]), _estimates(run, data), _noise(run, data)),
         warnings=_warnings(run, data),
     )
 
@@ -81,7 +81,7 @@ def _verdict(run: MeasuredDistortion, data: Mapping[str, Any]) -> str:
     expected = noise["rejected_expected_of_good"]
     known = 1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2)))
     return one_sentence(
-        f"The principal distance is {f:.4f} ± {sigma:.4f} mm, limited by {_limit(run)}",
+        f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm, limited by {_limit(run)}",
         f"distortion is known to {known:.2f} µm, and points lie within {data['rms_compensated_um']:.2f} µm rms of a "
         "smooth curve",
         f"chi-square {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise, "
@@ -124,17 +124,24 @@ def _warnings(run: MeasuredDistortion, data: Mapping[str, Any]) -> tuple[str, ..
 
 def _summary(run: MeasuredDistortion, data: Mapping[str, Any]) -> Table:
     rows: list[tuple[Cell, ...]] = [
-        ("principal distance [mm]", f"{data['principal_distance_mm']:.4f}", data["principal_distance_mm_sigma"]),
+        (
+            "balanced principal distance [mm]",
+            f"{data['principal_distance_mm']:.4f}",
+            data["principal_distance_mm_sigma"],
+        ),
         ("principal point [mm]", f"{data['principal_point_mm']:.3f}", data["principal_point_mm_sigma"]),
         ("correlation of the two", f"{data['correlation']:.3f}", None),
-        ("radial term [mm]", f"{data['radial3_mm']:.3f}", data["radial3_mm_sigma"]),
+        ("radial term of the joint model [mm]", f"{data['radial3_mm']:.3f}", data["radial3_mm_sigma"]),
         ("residual of smooth model [µm rms]", f"{data['rms_compensated_um']:.3f}", None),
     ]
     if run.compensation is not None:
         rows.append(("residual of smooth model, angles as read [µm rms]", f"{data['rms_raw_um']:.3f}", None))
     rows.append(("chi-square of the smooth model", f"{data['chi_square']:.1f}", None))
     rows.append(("degrees of freedom", f"{data['degrees_of_freedom']}", None))
-    caption = "f and p by least squares with a constant, which is the unknown zero of the angles."
+    caption = (
+        "f and p by least squares with a constant, which is the unknown zero of the angles. Balanced: the f that "
+        "leaves the smallest distortion over the points; with the radial term use the joint model."
+    )
     return Table("distortion-result", "Result", caption, ("", "measured", "sigma"), rows, (None, 3, 4))
 
 
@@ -193,7 +200,7 @@ def _estimates(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
     rows: list[tuple[Cell, ...]] = [
         (
             ESTIMATES[name],
-            f"{one['principal_distance_mm']:.4f}",
+            one["principal_distance_mm"],
             one["principal_distance_mm_sigma"],
             one["principal_point_mm"],
             one["principal_point_mm_sigma"],
@@ -204,13 +211,8 @@ def _estimates(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
     heads = ("estimate", "f [mm]", "sigma of f [mm]", "p [mm]", "sigma of p [mm]", "D [µm rms]")
     terms = data["covariance_terms"]
     covariance: list[tuple[Cell, ...]] = [
-        (name.replace("_", " "), *(f"{value:.6g}" for value in row))
+        (name.replace("_", " "), *(float(value) for value in row))
         for name, row in zip(terms, data["covariance_mm2"], strict=True)
-    ]
-    smooth = run.compensated.smooth
-    correlation: list[tuple[Cell, ...]] = [
-        (name.replace("_", " "), *(float(v) for v in row))
-        for name, row in zip(smooth.terms, smooth.correlation, strict=True)
     ]
     text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
@@ -228,7 +230,7 @@ def _estimates(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
                 "",
                 heads,
                 rows,
-                (None, 3, 3, 3, 3, 2),
+                (None, 4, 3, 3, 3, 2),
             ),
             Table(
                 "distortion-covariance",
@@ -236,14 +238,6 @@ def _estimates(run: MeasuredDistortion, data: Mapping[str, Any]) -> Section:
                 "Square millimetres, all noise that is stated and found.",
                 ("", *(name.replace("_", " ") for name in terms)),
                 covariance,
-            ),
-            Table(
-                "distortion-correlation",
-                "Correlation of the terms",
-                "Of the fit with radial distortion.",
-                ("", *(name.replace("_", " ") for name in smooth.terms)),
-                correlation,
-                (None, *(3 for _ in smooth.terms)),
             ),
         ),
     )

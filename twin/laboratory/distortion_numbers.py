@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.orientation.line_orientation import LINE_TERMS, LineOrientation
 from analysis.turntable.chauvenet import expected_rejections
 from analysis.units import ARCSEC
 from scenes.specs.lab_setup import DistortionSetup, resolve_distortion_test
@@ -26,6 +27,7 @@ from twin.run.plain_data import plain_data
 from twin.run.procedure import Procedure
 
 Array = NDArray[np.float64]
+JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,52 @@ class CorrelationNumbers:
 
     terms: Sequence[str]
     matrix: Array
+
+
+@dataclass(frozen=True)
+class LineNumbers:
+    """The joint model as a line of a payload's file: tan of the angle from the camera's Z is (y - y0) times
+    (1 + k1 (y - y0)^2) / f, with y the place along the line. Units: axis, the camera's Z from the zero of the angles,
+    arcsec; focal_length and principal_point mm; k1 1/m^2; the covariance in these.
+    """
+
+    terms: Sequence[str]
+    values: Array
+    sigma: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, line: LineOrientation) -> LineNumbers:
+        """Of a fit."""
+        unit = np.array([1.0 / ARCSEC, 1e3, 1e3, 1.0])
+        return cls(LINE_TERMS, line.values * unit, line.sigma * unit, line.covariance * np.outer(unit, unit))
+
+
+@dataclass(frozen=True)
+class JointNumbers:
+    """Constant, f, p and radial term of one model, which belong together and reproduce the spots; units mm and mm^2.
+    Its f is the slope in the middle of the field, not the balanced one.
+    """
+
+    model: str
+    terms: Sequence[str]
+    values_mm: Array
+    sigma_mm: Array
+    covariance_mm2: Array
+    line: LineNumbers
+
+    @classmethod
+    def of(cls, run: DistortionRun) -> JointNumbers:
+        """Of the smooth model with compensated angles."""
+        fit = run.compensated.smooth
+        return cls(
+            model=JOINT_MODEL,
+            terms=fit.terms,
+            values_mm=1e3 * fit.values,
+            sigma_mm=1e3 * np.sqrt(np.diagonal(fit.covariance)),
+            covariance_mm2=1e6 * fit.covariance,
+            line=LineNumbers.of(run.line),
+        )
 
 
 @dataclass(frozen=True)
@@ -183,7 +231,11 @@ class TruthNumbers:
 
 @dataclass(frozen=True)
 class DistortionNumbers:
-    """distortion.json. Without a calibration of the turntable raw and compensated are the same."""
+    """distortion.json. Without a calibration of the turntable raw and compensated are the same.
+
+    principal_distance_mm is the balanced one, the slope that leaves the smallest distortion over these points, and
+    principal_point_mm belongs to it; radial3_mm is that of `joint`, whose f is another.
+    """
 
     name: str
     seed: int
@@ -197,6 +249,7 @@ class DistortionNumbers:
     rms_raw_um: float
     rms_compensated_um: float
     zero_arcsec: float
+    joint: JointNumbers
     points: tuple[PointNumbers, ...]
     radial3_mm: float
     radial3_mm_sigma: float
@@ -300,6 +353,7 @@ def _found(run: DistortionRun, name: str) -> dict[str, Any]:
         "rms_raw_um": 1e6 * rms(run.raw.smooth.residual),
         "rms_compensated_um": 1e6 * rms(smooth.residual),
         "zero_arcsec": run.compensated.zero / ARCSEC,
+        "joint": JointNumbers.of(run),
         "points": PointNumbers.of(run),
         "radial3_mm": 1e3 * smooth.value("radial3"),
         "radial3_mm_sigma": 1e3 * smooth.sigma("radial3"),

@@ -15,7 +15,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_run import SimulatedDistortion, rms
 from twin.laboratory.turntable_report import FIT_NAMES
-from twin.run.artefact import FAR, Cell, SvgFigure, Table
+from twin.run.artefact import FAR, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
@@ -149,7 +149,7 @@ def distortion_report(run: SimulatedDistortion) -> Report:
             ),
         ),
         summary=_summary(data),
-        sections=(_curve(run), _compensation(run), _estimates(run), _noise(run, data)),
+        sections=(_curve(run), _compensation(run), joint_section(data["joint"]), _estimates(run), _noise(run, data)),
         images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
         image_facts=FrozenMap({f"spot-{i + 1:02d}": facts for i in numbers}),
         warnings=_warnings(run),
@@ -163,7 +163,7 @@ def _verdict(data: Mapping[str, Any], truth: Mapping[str, Any]) -> str:
     with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
     gain = "compensating them helps" if with_it < without else "compensating them does not help"
     return one_sentence(
-        f"The principal distance is {found:.3f} ± {sigma:.3f} mm, {well} {FAR:g} σ of the truth "
+        f"The balanced principal distance is {found:.3f} ± {sigma:.3f} mm, {well} {FAR:g} σ of the truth "
         f"({truth['principal_distance_mm']:.3f} mm, {ratio:.1f} σ)",
         f"distortion is measured to {with_it:.2f} µm rms with compensated angles and {without:.2f} µm with angles as "
         f"read: {gain}, see the curve and the compensation",
@@ -172,7 +172,15 @@ def _verdict(data: Mapping[str, Any], truth: Mapping[str, Any]) -> str:
 
 def typeset(text: str) -> str:
     """A statement of the analysis, which is plain ASCII, as the report and the terminal show it."""
-    for plain, shown in (("+-", "±"), ("tan^2", "tan²"), (" um", " µm"), (" deg", "°"), ("= -", "= −")):
+    for plain, shown in (
+        ("+-", "±"),
+        ("tan^2", "tan²"),
+        ("tan^3", "tan³"),
+        (" um", " µm"),
+        (" deg", "°"),
+        (" - ", " − "),
+        ("= -", "= −"),
+    ):
         text = text.replace(plain, shown)
     return text
 
@@ -198,7 +206,7 @@ def _summary(data: Mapping[str, Any]) -> Table:
     truth = data["truth"]
     rows: list[tuple[Cell, ...]] = [
         (
-            "principal distance [mm]",
+            "balanced principal distance [mm]",
             # six digits, which tables show of a number, are too few here
             f"{data['principal_distance_mm']:.4f}",
             data["principal_distance_mm_sigma"],
@@ -217,7 +225,8 @@ def _summary(data: Mapping[str, Any]) -> Table:
         ("error of distortion, compensated [µm rms]", truth["error_rms_compensated_um"], None, None),
     ]
     caption = (
-        "f and p with compensated angles, by least squares with a constant, which is the unknown zero of the angles."
+        "f and p with compensated angles, by least squares with a constant, which is the unknown zero of the angles. "
+        "Balanced: the f that leaves the smallest distortion over the points; with a radial term use the joint model."
     )
     return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
 
@@ -280,13 +289,55 @@ def _compensation(run: SimulatedDistortion) -> Section:
 
 ESTIMATES = {
     "eq2": "(2): f and p",
-    "eq3": "(3): f, p = 0",
-    "eq4": "(4): p, with f of (3)",
+    "eq3": "(3): balanced f, p = 0",
+    "eq4": "(4): p, with balanced f of (3)",
     "eq2_zero_from_constant": "(2), W counted from the fitted zero",
-    "constant": "constant, f, p (taken)",
-    "constant_radial3": "constant, f, p, radial",
+    "constant": "constant, balanced f, p (taken)",
+    "constant_radial3": "constant, f, p, radial (joint)",
 }
 """Estimate -> what it is, for readers."""
+
+
+def joint_section(joint: Mapping[str, Any]) -> Section:
+    """The terms of one model that belong together, as they reproduce the spots and as a payload's file has them.
+
+    Args:
+        joint: of distortion.json.
+    """
+    text = (
+        "With a radial term f is the slope in the middle of the field; the balanced f, which leaves the smallest "
+        "distortion without such a term, is another. Terms of one table belong together: the f of one with the radial "
+        "term of the other would miss the spots at the edge by more than half of the radial distortion there.",
+    )
+
+    def table(name: str, title: str, caption: str, part: Mapping[str, Any], suffix: str, shown: list[str]) -> Table:
+        size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"sigma{suffix}"])
+        spread = np.array(part["covariance_mm2" if suffix else "covariance"]) / np.outer(sigma, sigma)
+        rows: list[tuple[Cell, ...]] = [
+            (label, *(OwnDecimals(v, decimals_for(own)) for v in (value, own)), *(float(v) for v in row))
+            for label, value, own, row in zip(shown, size, sigma, spread, strict=True)
+        ]
+        heads = ("", "measured", "sigma", *(f"correlation: {label.split(' [')[0]}" for label in shown))
+        return Table(name, title, caption, heads, rows, (None, None, None, *(3 for _ in shown)))
+
+    names = [f"{name.replace('_', ' ')} [mm]" for name in joint["terms"]]
+    line = ["axis [arcsec]", "focal_length f [mm]", "principal_point y0 [mm]", "k1 [1/m²]"]
+    return Section(
+        "Joint model",
+        text,
+        (
+            table("distortion-joint", "Joint model", f"{typeset(joint['model'])}.", joint, "_mm", names),
+            table(
+                "distortion-line",
+                "The same as a line of a payload's file",
+                "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which stands at `axis` from the zero of "
+                "the angles; focal_length, principal_point: [0 mm, y0] and k1 with the signs of a payload's file.",
+                joint["line"],
+                "",
+                line,
+            ),
+        ),
+    )
 
 
 def _estimates(run: SimulatedDistortion) -> Section:
@@ -294,7 +345,7 @@ def _estimates(run: SimulatedDistortion) -> Section:
     rows: list[tuple[Cell, ...]] = [
         (
             ESTIMATES[name],
-            f"{mm * e.f:.4f}",
+            mm * e.f,
             None if e.f_sigma is None else mm * e.f_sigma,
             mm * (e.f - e.f_true),
             mm * e.p,
@@ -304,7 +355,6 @@ def _estimates(run: SimulatedDistortion) -> Section:
         )
         for name, e in run.estimates.items()
     ]
-    smooth = run.compensated.smooth
     zero = (run.compensated.zero - run.truth.zero) / ARCSEC
     text = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
@@ -327,20 +377,9 @@ def _estimates(run: SimulatedDistortion) -> Section:
             *("p [mm]", "sigma of p [mm]", "error of p [mm]", "error of D [µm rms]"),
         ),
         rows,
-        (None, 3, 3, 3, 2, 2, 2, 2),
+        (None, 4, 3, 3, 2, 2, 2, 2),
     )
-    correlation = Table(
-        "distortion-correlation",
-        "Correlation of the terms",
-        "Of the fit with radial distortion.",
-        ("", *(name.replace("_", " ") for name in smooth.terms)),
-        [
-            (name.replace("_", " "), *(float(v) for v in row))
-            for name, row in zip(smooth.terms, smooth.correlation, strict=True)
-        ],
-        (None, *(3 for _ in smooth.terms)),
-    )
-    return Section("Estimators and what can be observed", text, (estimates, correlation))
+    return Section("Estimators and what can be observed", text, (estimates,))
 
 
 def _noise(run: SimulatedDistortion, data: Mapping[str, Any]) -> Section:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
 from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
 from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
+from analysis.orientation.line_orientation import LineOrientation, line_orientation
 from analysis.orientation.measurement import (
     CALIBRATED,
     SMOOTH,
@@ -108,6 +109,11 @@ class DistortionRun:
     common: Array
     raw: Distortion
     compensated: Distortion
+
+    @cached_property
+    def line(self) -> LineOrientation:
+        """The joint model with compensated angles in the terms of a payload's line."""
+        return line_orientation(self.compensated.smooth)
 
     @cached_property
     def found_estimates(self) -> Mapping[str, FoundEstimate]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.focal_plane.through_focus import FocusError, FocusVertex, focus_vertex
 from analysis.mtf.edge_location import EdgeError
-from analysis.mtf.slanted_edge import measure_edge
+from analysis.mtf.edge_pages import grey_step, measure_pages
 from analysis.spots.noise import NoiseModel
 from optics.geometry.pose import Pose
 from optics.numerics.threads import cores, one_blas_thread
@@ -153,7 +153,7 @@ class Recorder:
 
 
 def edge_mtf(frames: np.ndarray, noise: NoiseModel | None, frequency: float = NYQUIST) -> tuple[float, float]:
-    """MTF of the knife edge in the mean of frames (frames, H, W) and its sigma, whichever bench they come from.
+    """MTF of the knife edge in frames (frames, H, W) and its sigma, whichever bench they come from.
 
     Args:
         frames: as recorded.
@@ -163,7 +163,7 @@ def edge_mtf(frames: np.ndarray, noise: NoiseModel | None, frequency: float = NY
     Raises:
         EdgeError: no edge can be measured in them.
     """
-    return measure_edge(frames.mean(axis=0), noise=noise, frames=len(frames)).at(frequency)
+    return measure_pages(frames, noise=noise, step=grey_step(frames)).at(frequency)
 
 
 def scan(recorder: Recorder, advance: Advance = silent, search: bool = True) -> tuple[SiteScan, ...]:

@@ -289,11 +289,15 @@ def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
 
 
 def _groups(table: Table) -> Places:
-    """Number of the angle that each row belongs to, (rows,)."""
+    """Number of the angle that each row belongs to, (rows,), rising with the readings."""
+    reading = table["reading"]
     if "position" in table:
         _, group = np.unique(table["position"], return_inverse=True)
-        return np.asarray(group, np.int64)
-    reading = table["reading"]
+        # the smallest reading of a stop, whose order is that of the means where no two stops overlap, and which no
+        # order of rows rounds differently
+        least = np.full(int(group.max()) + 1, np.inf)
+        np.minimum.at(least, group, reading)
+        return np.asarray(np.argsort(np.argsort(least, kind="stable"))[group], np.int64)
     order = np.argsort(reading, kind="stable")
     new = np.concatenate([[0], np.cumsum(np.diff(reading[order]) > SAME_READING)])
     group = np.empty(len(reading), np.int64)
@@ -384,9 +388,15 @@ def _check_angles(cells: _Cells, angle: Array, path: str, fewest: int) -> None:
 
 
 def _check_positions(cells: _Cells, reading: Array, angle: Array) -> None:
-    """InputError unless readings of one position lie nearer to it than half way to the next."""
+    """InputError unless readings of one position lie nearer to it than half way to the next, which stands elsewhere."""
     if "position" not in cells.table or len(angle) < 2:
         return
+    same = np.diff(angle) == 0.0
+    if np.any(same):
+        rows = sorted(int(row) for row in cells.first[int(np.argmax(same)) :][:2])
+        text = f"two positions with the same readings, the other in line {cells.table.lines[rows[0]]}"
+        allowed = "one number for all comparisons of a stop, however often the table came back to it"
+        raise cells.table.error(rows[1], "position", text, f"{cells.table['position'][rows[1]]:g}", allowed)
     rank = np.sort(angle)
     at = np.searchsorted(rank, angle)
     gap = np.diff(rank)

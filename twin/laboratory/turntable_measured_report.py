@@ -139,10 +139,11 @@ def measured_turntable_report(run: MeasuredTurntable) -> Report:
     worst = max(size, key=lambda part: size[part])
     limit = names[worst] if size[worst] > noise else "the noise of the calibration"
     span = float(np.ptp(run.series.mean)) / ARCSEC
-    judged = f" and misses held-out angles by {data['fits'][chosen]['heldout_rms_arcsec']:.3f} arcsec RMS"
+    missed = data["fits"][chosen]["heldout_rms_arcsec"]
+    judged = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
     verdict = one_sentence(
         f"The dividing error spans {span:.2f} arcsec; the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec"
-        f"{judged if run.held_out is not None else ''}, limited by {limit}",
+        f"{judged}, limited by {limit}",
         f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec, {data['rejected']} of "
         f"{int(np.sum(run.series.taken))} comparisons rejected where "
         f"{data['rejected_expected_of_good']:.0f} are expected of good ones, see what is left of a compensated angle",

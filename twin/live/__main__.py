@@ -107,7 +107,7 @@ def _serve(
     except ImportError as error:
         raise InputErrorText(f"{EXTRA} ({error.name})") from None
     from twin.live.computer import CannotStart, Computer
-    from twin.live.guard import BadToken, Guard, new_token
+    from twin.live.guard import EVERYWHERE, BadToken, Guard, names_of_this_machine, new_token
 
     try:
         token = new_token()
@@ -128,8 +128,11 @@ def _serve(
         if console is not None:
             for line in about:
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
-            shown = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+            shown = "127.0.0.1" if host in EVERYWHERE else f"[{host}]" if ":" in host else host
             console.print(f"open http://{shown}:{bound}/?token={token}", highlight=False, soft_wrap=True)
+            for name in names_of_this_machine()[:1] if host in EVERYWHERE else ():
+                text = f"from other machines: http://{name}:{bound}/?token={token}"
+                console.print(text, highlight=False, soft_wrap=True)
             console.print("Ctrl-C ends it" + ("." if stay else ", and so does closing the last page."))
         LiveServer(computer, guard, stay).run(listening)
     except CannotStart as error:

@@ -82,7 +82,7 @@ class CameraPictures:
             photons = place.ccd.white_photons(settings.white) * place.pupil.light * place.edge_image(imager)
             taken = place.ccd.expose(photons, place.column, pattern, frames, stream(seed, 4, when))
             mean = np.asarray(taken.mean(axis=0))
-            shots.append((mean, read_edge(place, imager.optics.normal, mean, frames)))
+            shots.append((mean, read_edge(place, DIRECTIONS[0], imager.optics.normal, mean, frames)))
         images = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.5))
         top = max(float(mean.max()) for mean, _ in shots)
         curve = images[2]

@@ -41,10 +41,22 @@ MOST_RECORDED = 20_000
 """States of a recording; the oldest are forgotten."""
 MOST_LETTERS = 32
 """Answers beside states and pictures that wait for a slow line."""
+LOOK = 0.25
+"""Seconds from one look at the process that computes to the next."""
+STOPPED = 10.0
+"""Seconds for which it may be stopped by a signal; then it is started again."""
 PATIENCE = 20.0
 """Seconds that a page may take to receive one answer."""
 POLICY_VIOLATION, TOO_BIG, TRY_AGAIN = 1008, 1009, 1013
 """Codes with which a WebSocket is closed."""
+
+
+AGAIN = "{}; it is started again, and the knobs stay"
+HALTED = (
+    "the process that computes ({pid}) was stopped by a signal; `kill -CONT {pid}` lets it go on, after "
+    "{seconds:.0f} s it is started again; the knobs stay"
+)
+"""What pages are told of the process that computes."""
 
 
 class Goodbye(Exception):
@@ -57,6 +69,19 @@ class Goodbye(Exception):
     def __init__(self, code: int, reason: str) -> None:
         super().__init__(reason)
         self.code, self.reason = code, reason
+
+
+@dataclass(frozen=True, eq=False)
+class Wish:
+    """Something that a page wants.
+
+    Attributes:
+        kind: the attribute of `Client` in which it stood, one of ``saves`` for "save".
+        asked: the message.
+    """
+
+    kind: str
+    asked: Any
 
 
 @dataclass(eq=False)
@@ -91,6 +116,27 @@ class Client:
     def busy(self) -> bool:
         """Whether it waits for something."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
+
+    def next_wish(self) -> Wish:
+        """What it wants next, which it then no longer wants. It has to want something."""
+        if self.factors is not None:
+            wish, self.factors = Wish("factors", self.factors), None
+        elif self.state is not None:
+            wish, self.state = Wish("state", self.state), None
+        elif self.reveal is not None:
+            wish, self.reveal = Wish("reveal", self.reveal), None
+        elif self.saves:
+            wish = Wish("save", self.saves.popleft())
+        else:
+            wish, self.view = Wish("view", self.view), None
+        return wish
+
+    def put_back(self, wish: Wish) -> None:
+        """It could not be served; what was asked for since goes before it."""
+        if wish.kind == "save":
+            self.saves.appendleft(wish.asked)
+        elif getattr(self, wish.kind) is None:
+            setattr(self, wish.kind, wish.asked)
 
     def take(self, text: str | bytes) -> None:
         """Take a message of the page.
@@ -210,7 +256,10 @@ class Desk:
         self.clients: list[Client] = []
         self.states = 0
         """Number of states computed so far."""
+        self.trouble: dict[str, Any] = {}
+        """What is wrong with the process that computes, as pages are told; empty if nothing is."""
         self._wake = asyncio.Event()
+        self._suspect: object = None
 
     def enter(self) -> Client:
         """A new page.
@@ -234,19 +283,71 @@ class Desk:
         self._wake.set()
 
     async def work(self) -> None:
-        """Answer for ever."""
+        """Answer for ever.
+
+        Raises:
+            CannotStart: the process that computes ended and cannot be started again.
+        """
         while True:
+            if self.computer.condition == "ended":
+                await self._start_again()
             client = self._next()
             if client is None:
                 self._wake.clear()
                 await self._wake.wait()
                 continue
+            wish = client.next_wish()
             try:
-                await self._serve(client)
+                await self._serve(client, wish)
             except ComputerLost as error:
-                client.tell({"type": "lost", "problem": f"{error}; it was started again"})
-                for one in self.clients:
-                    one.before = None
+                self._lost(client, wish, str(error))
+                await self._start_again()
+
+    async def watch(self) -> None:
+        """Look for ever how the process that computes is; tell the pages when it does not run, and what comes next."""
+        since = 0.0
+        while True:
+            await asyncio.sleep(LOOK)
+            condition, known = self.computer.condition, self.trouble.get("state", "runs")
+            if condition == "ended":
+                self._tell_of("ended", AGAIN.format(self.computer.ending))
+                self.wake()
+            elif condition == "stopped" and known != "stopped":
+                since = time.monotonic()
+                self._tell_of("stopped", HALTED.format(pid=self.computer.pid, seconds=STOPPED))
+            elif condition == "stopped" and time.monotonic() - since > STOPPED:
+                self.computer.kill()
+            elif condition == "runs" and known == "stopped":
+                self._tell_of("runs")
+
+    def _tell_of(self, state: str, problem: str = "") -> None:
+        """Tell all pages, those that come later too, how it is with the process that computes; each news once."""
+        told = {"type": "computing", "state": state, "problem": problem}
+        if told == self.trouble or (state == "ended" and self.trouble.get("state") == "ended"):
+            return
+        self.trouble = told if problem else {}
+        for one in self.clients:
+            one.tell(told)
+
+    def _lost(self, client: Client, wish: Wish, problem: str) -> None:
+        """The process ended over a wish. It is kept, unless the process has ended over it before."""
+        self._tell_of("ended", AGAIN.format(problem))
+        if wish.asked is self._suspect:
+            client.tell({"type": "refused", "problem": f"{problem} twice over the same {wish.kind}, which is left out"})
+        else:
+            self._suspect = wish.asked
+            client.put_back(wish)
+
+    async def _start_again(self) -> None:
+        """Start the process that computes anew; who waits goes on waiting."""
+        self._tell_of("ended", AGAIN.format(self.computer.ending))
+        before = self.computer.opened.greeting
+        await self.computer.start_again()
+        for one in self.clients:
+            one.before = None
+            if self.computer.opened.greeting != before:  # its files were changed meanwhile
+                one.tell({"type": "hello", **self.computer.opened.greeting})
+        self._tell_of("runs")
 
     def _next(self) -> Client | None:
         """The next page that wants a state, else anything; a page that was served goes to the end."""
@@ -265,31 +366,26 @@ class Desk:
         if isinstance(found, str):
             client.tell({"type": "refused", "problem": found})
         else:
-            self.computer.opened = found
             for one in self.clients:
                 one.shown = one.before = one.recorded = None
         for one in self.clients:
             one.tell({"type": "hello", **self.computer.opened.greeting})
 
-    async def _serve(self, client: Client) -> None:
-        if client.factors is not None:
-            asked_factors, client.factors = client.factors, None
-            await self._build(client, asked_factors)
-        elif client.state is not None:
-            asked, client.state = client.state, None
+    async def _serve(self, client: Client, wish: Wish) -> None:
+        asked = wish.asked
+        if isinstance(asked, Factors):
+            await self._build(client, asked)
+        elif wish.kind == "state":
             key = (asked.noise, asked.frames, asked.seed)
             client.answer(await self.computer.ask("state", (asked, client.before)), key)
             client.kept(asked)
             self.states += 1
-        elif client.reveal is not None:
-            asked, client.reveal = client.reveal, None
+        elif wish.kind == "reveal":
             client.letter(await self.computer.ask("hidden", asked))
-        elif client.saves:
-            save = client.saves.popleft()
-            if save.what == "job":
-                client.letter(await self.computer.ask("job", save.state))
+        elif isinstance(asked, Save):
+            if asked.what == "job":
+                client.letter(await self.computer.ask("job", asked.state))
             else:
                 client.letter(await self.computer.ask("course", list(client.recorded or ())))
-        elif client.view is not None:
-            view, client.view = client.view, None
-            client.picture(await self.computer.ask("view", view))
+        else:
+            client.picture(await self.computer.ask("view", asked))

@@ -12,20 +12,25 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Literal
 
 from twin.live.messages import Opened
 
 Kind = Literal["state", "view", "hidden", "job", "course", "factors"]
 BeforeKey = tuple[bool, int, int]
+Condition = Literal["starts", "runs", "stopped", "ended"]
 ENDS = 3.0
 """Seconds that the process is given to end by itself."""
+ATTEMPTS = 3
+"""How often it is started again when it ends while it starts."""
 
 
 class ComputerLost(Exception):
-    """The process that computes ended; the next question starts another."""
+    """The process that computes ended; the text says how."""
 
 
 class CannotStart(Exception):
@@ -46,6 +51,10 @@ class Computer:
         self._process: Any = None
         self._pipe: Connection | None = None
         self._turn = asyncio.Lock()
+        self._starting = self._asked = self._leaving = False
+        # two threads that ask the system for one process' end take it from each other
+        self._looks = threading.Lock()
+        self._factors: Any = None
         self.opened = Opened({}, b"")
 
     def start(self, advance: Callable[[str], None] = lambda part: None) -> None:
@@ -56,6 +65,18 @@ class Computer:
 
         Raises:
             CannotStart: why.
+        """
+        try:
+            self._start(advance)
+        except ComputerLost as error:
+            raise CannotStart(str(error)) from error
+
+    def _start(self, advance: Callable[[str], None] = lambda part: None) -> None:
+        """Likewise.
+
+        Raises:
+            CannotStart: the instrument cannot be built.
+            ComputerLost: the process ended before it was.
         """
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
@@ -75,7 +96,38 @@ class Computer:
                 else:
                     raise CannotStart(value)
         except (EOFError, OSError) as error:
-            raise CannotStart(f"the process that computes ended ({self._process.exitcode})") from error
+            raise ComputerLost(self._end_of_it()) from error
+
+    def _start_again(self) -> None:
+        """Start it as it was: with what was last made of a study's factors.
+
+        Raises:
+            CannotStart: why.
+        """
+        for attempt in range(1, ATTEMPTS + 1):
+            try:
+                self._start()
+                if self._factors is not None:
+                    found = self._exchange("factors", self._factors)
+                    if not isinstance(found, str):
+                        self.opened = found
+                return
+            except ComputerLost as error:
+                if attempt == ATTEMPTS or self._leaving:
+                    raise CannotStart(f"{error}, {attempt} times when it was started again") from error
+
+    async def start_again(self) -> None:
+        """Start another process in place of one that ended, as that was.
+
+        Raises:
+            CannotStart: why.
+        """
+        async with self._turn:
+            self._starting = True
+            try:
+                await asyncio.get_running_loop().run_in_executor(None, self._start_again)
+            finally:
+                self._starting = False
 
     async def ask(self, kind: Kind, question: Any) -> Any:
         """The answer to a question.
@@ -84,25 +136,68 @@ class Computer:
             ComputerLost: the process ended.
         """
         async with self._turn:
-            if self._process is None or not self._process.is_alive():
-                await asyncio.get_running_loop().run_in_executor(None, self.start)
-            assert self._pipe is not None
-            pipe = self._pipe
+            answer = await asyncio.get_running_loop().run_in_executor(None, self._exchange, kind, question)
+            if kind == "factors" and not isinstance(answer, str):
+                self._factors, self.opened = question, answer
+            return answer
 
-            def exchange() -> Any:
-                pipe.send((kind, question))
-                return pipe.recv()
+    def _exchange(self, kind: Kind, question: Any) -> Any:
+        assert self._pipe is not None
+        self._asked = True
+        try:
+            self._pipe.send((kind, question))
+            return self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise ComputerLost(self._end_of_it()) from error
+        finally:
+            self._asked = False
 
-            try:
-                return await asyncio.get_running_loop().run_in_executor(None, exchange)
-            except (EOFError, OSError) as error:
-                self._process.join(ENDS)
-                raise ComputerLost(f"the process that computes ended ({self._process.exitcode})") from error
+    def _end_of_it(self) -> str:
+        """How it ended, of a process that has closed its pipe; whatever is left of it is ended."""
+        last = time.monotonic() + ENDS
+        while self._alive():
+            if time.monotonic() > last:
+                self.kill()
+            time.sleep(0.01)
+        return self.ending
+
+    def _alive(self) -> bool:
+        with self._looks:
+            return self._process is not None and bool(self._process.is_alive())
+
+    @property
+    def ending(self) -> str:
+        """In words, how the process ended that has."""
+        code = None if self._process is None else self._process.exitcode
+        if code is None:
+            return "the process that computes ended"
+        how = f"exit code {code}" if code >= 0 else f"killed by {signal.Signals(-code).name}"
+        return f"the process that computes ended ({how})"
 
     @property
     def pid(self) -> int | None:
         """Of the process."""
         return None if self._process is None else self._process.pid
+
+    @property
+    def condition(self) -> Condition:
+        """How the process is: stopped by a signal, or ended by itself or by somebody."""
+        alive = self._alive()
+        if alive and _stopped(self._process.pid):
+            return "stopped"
+        return "starts" if self._starting else "runs" if alive else "ended"
+
+    def kill(self) -> None:
+        """End it at once; whoever waits for an answer is told that it ended."""
+        with self._looks:
+            if self._process is not None:
+                self._process.kill()
+
+    def leave(self) -> None:
+        """The server ends: nobody waits for an answer any more, and one that is awaited would keep the server."""
+        self._leaving = True
+        if self._asked or self._starting or self.condition == "stopped":
+            self.kill()
 
     def stop(self) -> None:
         """End the process."""
@@ -113,6 +208,15 @@ class Computer:
             if self._process.is_alive():
                 self._process.kill()
                 self._process.join()
+
+
+def _stopped(pid: int) -> bool:
+    """Whether a process was stopped by a signal, but not by a debugger; False where the system does not tell."""
+    try:
+        told = Path(f"/proc/{pid}/stat").read_text("utf-8", "replace")
+    except OSError:
+        return False
+    return told.rpartition(")")[2].split()[:1] == ["T"]
 
 
 def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:

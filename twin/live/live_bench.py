@@ -25,6 +25,7 @@ from scenes.specs.job import check_nodes
 from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState, Course
+from twin.main_job.assumptions import contradiction, doubted
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT
 from twin.main_job.render_results import RenderRun
@@ -34,6 +35,7 @@ from twin.monitor.state_reading import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
+from twin.sensors.grey_steps import coarse_warnings
 
 BLIND = 7
 """Random stream of what is hidden, beside those of the monitor and of targets."""
@@ -309,7 +311,7 @@ class LiveBench:
             told["guess"] = self._guess(asked)
         light = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
         told["light"] = [float(share) for share in light]
-        told["warnings"] = self._warnings(run, light)
+        told["warnings"] = [*self._warnings(run, light), *doubted(run), *contradiction(run)]
         told["collisions"] = [
             f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in self.clearances.overlaps(placed)
         ]
@@ -325,7 +327,7 @@ class LiveBench:
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
         detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels
-        out = []
+        out = list(coarse_warnings(self.twin.resolved))
         saturated = np.ravel(detector.saturated(run.after).pixels)
         for channel, share, full in zip(channels, light, saturated, strict=True):
             if full:

@@ -13,8 +13,20 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.live.knobs import AXES, Knob, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState
+from twin.run.provenance import Provenance
+from twin.run.versions import versions
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
+
+
+def _head() -> str:
+    """What a recording says of where it was made, as a comment."""
+    made, by = Provenance.here(), versions()
+    kernels = ", ".join(dict.fromkeys(f"{one.name} {one.version} for {one.kernels}" for one in made.blas))
+    return (
+        f"{HEAD}# made by space-camera-twin {by['space-camera-twin']}, source {made.source}, Python {by['python']}, "
+        f"numpy {by['numpy']}, Dr.Jit {by['drjit']}, on {made.processor}; {kernels}\n"
+    )
 
 
 def job_text(bench: LiveBench, asked: AskedState) -> str:
@@ -31,7 +43,7 @@ def job_text(bench: LiveBench, asked: AskedState) -> str:
     plain = resolved.plain()
     if asked.time is not None and resolved.job.course is not None:
         plain["job"]["course"]["detail"] = moment(resolved.job.course.times[asked.time])
-    return HEAD + dump_yaml(plain)
+    return _head() + dump_yaml(plain)
 
 
 def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> str:
@@ -63,7 +75,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
         **_courses(moving, first.pivots, knobs, len(steps)),
     }
     validate(JobSpec, YamlFile("", job, {}))
-    return HEAD + dump_yaml(plain)
+    return _head() + dump_yaml(plain)
 
 
 def _thinned(kept: Sequence[tuple[float, AskedState]]) -> list[tuple[float, AskedState]]:

@@ -19,7 +19,8 @@ from starlette.websockets import WebSocket
 
 from twin.live.clients import POLICY_VIOLATION, TOO_BIG, Client, Desk, Goodbye
 from twin.live.computer import Computer
-from twin.live.guard import HEADERS, Guard, cookie
+from twin.live.connections import AT_ONCE, SILENCE, Connections, PageSocket, PatientServer
+from twin.live.guard import HEADERS, Guard
 from twin.live.messages import LARGEST_MESSAGE
 
 LINGER = 10.0
@@ -60,7 +61,9 @@ class LiveServer:
         self.guard = guard
         self.stay = stay
         self._last: asyncio.TimerHandle | None = None
+        self.connections = Connections(guard.knows_cookie)
         self._uvicorn: uvicorn.Server | None = None
+        self._failed: BaseException | None = None
         self.app = Starlette(
             routes=[
                 Route("/", self._index),
@@ -78,45 +81,57 @@ class LiveServer:
 
         Args:
             listening: bound and not yet accepting.
+
+        Raises:
+            CannotStart: the computing ended and cannot be started again; anything else is a fault of the program.
         """
         config = uvicorn.Config(
             self.app,
-            log_level="warning",
+            # whatever a stranger sends is nothing to tell a terminal; errors of the program are
+            log_level="error",
             access_log=False,
             server_header=False,
             date_header=False,
+            http=self.connections.protocol(),
+            ws=PageSocket,
             ws_max_size=LARGEST_MESSAGE,
             ws_max_queue=16,
             ws_per_message_deflate=False,
             ws_ping_interval=20.0,
             ws_ping_timeout=30.0,
-            limit_concurrency=64,
-            timeout_keep_alive=30,
+            timeout_keep_alive=int(SILENCE),
             timeout_graceful_shutdown=2,
             h11_max_incomplete_event_size=1 << 15,
+            backlog=AT_ONCE,
         )
-        self._uvicorn = uvicorn.Server(config)
+        self._uvicorn = PatientServer(config)
         # it ends in order and then repeats the signal, which here is no accident
         with contextlib.suppress(KeyboardInterrupt):
             self._uvicorn.run(sockets=[listening])
+        if self._failed is not None:
+            raise self._failed
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, app: Starlette) -> AsyncIterator[None]:
-        work = asyncio.create_task(self.desk.work())
-        work.add_done_callback(self._ended)
+        tasks = [asyncio.create_task(what) for what in (self.desk.work(), self.desk.watch())]
+        for task in tasks:
+            task.add_done_callback(self._ended)
         try:
             yield
         finally:
-            work.cancel()
+            for task in tasks:
+                task.cancel()
+            self.desk.computer.leave()
 
-    def _ended(self, work: asyncio.Task[None]) -> None:
+    def _ended(self, task: asyncio.Task[None]) -> None:
         """The computing cannot be started again: nothing is left to serve."""
-        if not work.cancelled() and work.exception() is not None:
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._failed = error
             self._stop()
 
     async def _index(self, request: Request) -> Response:
         if "token" in request.query_params:
-            return RedirectResponse("/", 303, headers={"set-cookie": cookie(self.guard.token)})
+            return RedirectResponse("/", 303, headers={"set-cookie": self.guard.cookie})
         return _part("index.html")
 
     async def _session(self, request: Request) -> Response:
@@ -143,6 +158,8 @@ class LiveServer:
         self._came()
         await ws.accept()
         client.tell({"type": "hello", **self.desk.computer.opened.greeting})
+        if self.desk.trouble:
+            client.tell(self.desk.trouble)
         reading = asyncio.create_task(self._read(ws, client))
         sending = asyncio.create_task(client.send(ws.send_text, ws.send_bytes))
         try:
@@ -201,15 +218,17 @@ class _Gate:
         if len(headers) != len(scope["headers"]) and [k for k, _ in scope["headers"]].count(b"host") > 1:
             headers["host"] = ""
         socket_wanted = scope["type"] == "websocket"
-        why = self.guard.refuses(headers, socket_wanted)
+        reached = (scope.get("server") or ("", None))[0]
+        why = self.guard.refuses(headers, socket_wanted, reached)
         if why and not socket_wanted and self._brings_token(scope):
-            why = self.guard.refuses_host(headers)
+            why = self.guard.refuses_host(headers, reached)
         if why and socket_wanted:
             # closed before it is accepted: the browser gets status 403
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": why})
             return
         if why or (not socket_wanted and scope["method"] not in ("GET", "HEAD")):
-            answer = PlainTextResponse(f"refused: {why or 'this server only shows'}\n", 403 if why else 405)
+            text = f"refused: {why or 'this server only shows'}\n"
+            answer = PlainTextResponse(text, 403 if why else 405, headers={"connection": "close"})
             await answer(scope, receive, _with_headers(send))
             return
         await self.app(scope, receive, send if socket_wanted else _with_headers(send))

@@ -4,7 +4,6 @@ folder of any command whose instrument can be shown.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.live.messages import MOST_FRAMES
 from twin.live.study_factors import FactorKnob, base_with, factor_knobs
+from twin.run.owned_files import digest
 from twin.run.run_folder import Manifest, read_manifest
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup, resolve_study
@@ -114,7 +114,7 @@ def _of_folder(folder: Path, run: int | None) -> Source:
     source = _of_file(config, run, manifest)
     notes = list(source.notes)
     listed = None if manifest is None else manifest.sha256.get(CONFIG)
-    if listed is not None and listed != hashlib.sha256(config.read_bytes()).hexdigest():
+    if listed is not None and listed != digest(config):
         notes.append(f"{config} was changed after the run: the page shows what it says now, and not what the run did")
     return replace(source, about=f"{folder.name}: {source.about}", notes=tuple(notes))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,6 +25,7 @@ __all__ = [
     "contradicted",
     "contradiction",
     "course_agrees",
+    "doubted",
     "limits",
     "share_text",
 ]
@@ -43,8 +45,17 @@ def assumed(reading: MonitorReading) -> str:
     return (
         f"σ: noise and the stated disturbances {stated.name}; the shifts {agree} (chi-square "
         f"{significant(found.chi_square)} of {found.degrees} coordinates, limit {found.limit:.1f}, false-alarm rate "
-        f"{found.false_alarm:g})"
+        f"{found.false_alarm:g}){_from_statement(reading)}"
     )
+
+
+def _from_statement(reading: MonitorReading) -> str:
+    """How much of the sigmas is from the statement: the least and the largest share of the posterior's variances."""
+    shares = [share for own in reading.from_statement.values() for share in own.values()]
+    if not shares:
+        return ""
+    ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
+    return f"; {' to '.join(ends)} % of the variances are from the statement, not from the spots"
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
@@ -55,6 +66,15 @@ def contradiction(run: RenderRun) -> tuple[str, ...]:
         when = f" at {moment(float(run.series.times[k]))}, the worst of {len(run.series.times)} times"
         rate += " for the course"
     return contradicted(run.experiment.disturbances, found, when, rate)
+
+
+def doubted(run: RenderRun) -> tuple[str, ...]:
+    """Warnings where spots are not as calibrated, and of readings that are not linear; of a course at the worst of its
+    times.
+    """
+    if run.series is None:
+        return (*run.reading.doubts, *run.reading.notes)
+    return run.series.doubts([f"{camera}/{side}" for camera, side in run.reading.channels])
 
 
 def contradicted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,11 +11,17 @@ from typing import Any
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.curvature import BEYOND
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, consistency
 from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.limits import Quantity, posterior_sigma, quantities
 from analysis.monitor.recovery import Recovery
+from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
+from analysis.spots.fit_state import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
+from twin.run.provenance import SelfCheck
+from twin.uncertainty.words import short_text, unseen_texts
 
 __all__ = ["STATED", "STATED_SIGMA", "MonitorReading", "stated"]
 
@@ -34,6 +40,7 @@ class MonitorReading:
             instrument is modelled.
         frames: of each spot after.
         centroid: by which method the spots were found.
+        found_wrong: why sigma does not hold, as far as it was found before the spots were read.
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -44,6 +51,7 @@ class MonitorReading:
     crosstalk: Mapping[str, CameraCrosstalk]
     frames: int
     centroid: str
+    found_wrong: tuple[str, ...] = ()
 
     @property
     def estimators(self) -> dict[str, Estimator]:
@@ -59,6 +67,76 @@ class MonitorReading:
     def gains(self) -> dict[str, np.ndarray]:
         """Estimator -> (4 x cameras, 2 x spots) parameters (rad, m) per pixel of shift, at this measurement."""
         return estimator_gains(self.cameras, self.disturbances, self.recovery.shift_covariance[0])
+
+    @cached_property
+    def doubts(self) -> tuple[str, ...]:
+        """Why sigma does not hold for this measurement though nothing else says so: spots that are not as calibrated,
+        and readings that are not linear and cannot be worked out anew. Sentences without their end.
+        """
+        out = list(self.found_wrong)
+        evidence = self.recovery.evidence
+        told = None if evidence is None else evidence.doubt(0, [f"{camera}/{side}" for camera, side in self.channels])
+        if told is not None and not out:
+            out.append(told.text)
+        for name, found in self.recovery.curvature.items():
+            if not found.holds[0]:
+                out.append(
+                    f"σ does not hold: the motions that the {self.estimators[name].title} reads are not small, and the "
+                    f"state that it stands for cannot be traced again ({self._off(name)}); readings are linear ones"
+                )
+        return tuple(out)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was worked out anew since it is not linear; sentences without their end."""
+        return tuple(
+            f"the motions that the {self.estimators[name].title} reads are not small: {self._off(name)} against the "
+            "state traced again, so that its readings are those of Gauss and Newton's steps to their end"
+            for name, found in self.recovery.curvature.items()
+            if found.beyond[0] and found.holds[0]
+        )
+
+    @cached_property
+    def unseen(self) -> tuple[str, ...]:
+        """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma;
+        sentences without their end.
+        """
+        stated, noise = self.disturbances, self.recovery.shift_covariance[0]
+        if stated is None or not np.any(noise):
+            return ()
+        return unseen_texts(stated, noise, self._quantities, self.gains[self.judged])
+
+    def _off(self, name: str) -> str:
+        """The quantity whose linear reading is off by most, and by how much."""
+        worst, size = self.recovery.curvature[name].worst()
+        if not math.isfinite(size):
+            return "its light is lost"
+        return f"the linear {short_text(self._quantities[worst])} is off by {size:.3g} σ"
+
+    @cached_property
+    def _quantities(self) -> tuple[Quantity, ...]:
+        return quantities(self.cameras, self.ground)
+
+    @property
+    def sigma_holds(self) -> bool:
+        """Whether nothing that was measured contradicts the sigmas."""
+        return not self.doubts and (self.consistency is None or self.consistency.agrees)
+
+    @cached_property
+    def from_statement(self) -> dict[str, dict[str, float]]:
+        """Group -> key -> share of the posterior's variance that no spot constrains, however little noise it has: what
+        rests on the statement alone. Empty where nothing is stated, and without noise.
+        """
+        stated, noise = self.disturbances, self.recovery.shift_covariance[0]
+        if stated is None or not np.any(noise):
+            return {}
+        rows = np.stack([quantity.row for quantity in self._quantities])
+        left, unseen = (posterior_sigma(rows, stated, spread) for spread in (noise, 0.0 * noise))
+        out: dict[str, dict[str, float]] = {}
+        for quantity, sigma, alone in zip(self._quantities, left, unseen, strict=True):
+            share = min(float(alone / sigma) ** 2, 1.0) if sigma > 0.0 else 0.0
+            out.setdefault(quantity.group, {})[quantity.key] = round(share, SHARE)
+        return out
 
     @cached_property
     def consistency(self) -> Consistency | None:
@@ -102,6 +180,22 @@ class MonitorReading:
         others = self.any_motions(stated)
         return worst, consistency(shifts[worst], covariance[worst], stated, others, false_alarm=false_alarm)
 
+    @property
+    def checks(self) -> Iterator[SelfCheck]:
+        """What was checked of the fits, of the statement and of what is linear."""
+        evidence = self.recovery.evidence
+        if evidence is not None:
+            yield from _fits("spots before", evidence.before)
+            yield from _fits("spots after", evidence.after)
+        if self.consistency is not None:
+            yield stated_check("shifts against the stated disturbances", self.consistency)
+        for name, found in self.recovery.curvature.items():
+            size = found.worst()[1]
+            if math.isfinite(size):
+                done = "worked out anew" if found.beyond[0] and found.holds[0] else "linear"
+                says = f"readings are {done}; beyond {BEYOND:g} sigma they are worked out anew, or sigma does not hold"
+                yield SelfCheck(f"linear readings of {name} against the state traced again", size, None, "sigma", says)
+
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
         cameras = {
@@ -110,10 +204,12 @@ class MonitorReading:
         }
         spots: dict[str, Any] = {}
         r = self.recovery
+        fits = None if r.evidence is None else (r.evidence.before, r.evidence.after)
         for i, (camera, side) in enumerate(self.channels):
+            first, last = (None, None) if fits is None else (_fit(own, i) for own in fits)
             spots.setdefault(camera, {})[side] = {
-                "before": _spot(r.before[0, i], r.sigma_before[0, i]),
-                "after": _spot(r.after[0, i], r.sigma_after[0, i]),
+                "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **(first or {})},
+                "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **(last or {})},
             }
         out: dict[str, Any] = {"cameras": cameras, "spots": spots}
         if r.angle:
@@ -122,9 +218,27 @@ class MonitorReading:
             out["ground"] = {e: _first(g.to_dict()) for e, g in r.ground.items()}
         if self.consistency is not None:
             out["disturbances"] = self._stated(self.consistency)
+        if self.from_statement:
+            out["from_statement"] = self.from_statement
+        if r.curvature:
+            out["retraced"] = {name: self._retraced(name) for name in r.curvature}
+        out["sigma_holds"] = self.sigma_holds
+        out["doubts"] = list(self.doubts)
         out["centroid"] = self.centroid
         out["frames"] = self.frames
         return out
+
+    def _retraced(self, name: str) -> dict[str, Any]:
+        """What the state that an estimator's readings stand for says of them."""
+        found = self.recovery.curvature[name]
+        worst, size = found.worst()
+        quantity = self._quantities[worst]
+        return {
+            "off_in_sigma": round(size, OFF) if math.isfinite(size) else None,
+            "of": f"{quantity.group} {quantity.key}" if size >= 1.0 else "",
+            "relinearised": bool(found.beyond[0] and found.holds[0]),
+            "holds": bool(found.holds[0]),
+        }
 
     def _stated(self, found: Consistency) -> dict[str, Any]:
         """What the total sigmas rest on, and whether the shifts agree with it."""
@@ -150,6 +264,40 @@ class MonitorReading:
         }
 
 
+def _fits(what: str, fits: FitStates) -> Iterator[SelfCheck]:
+    """The worst fit of some spots, over its limit."""
+    ratio = np.fmax(fits.whole / fits.whole_limit, fits.core / fits.core_limit)
+    if np.any(np.isfinite(ratio) & (ratio > 0.0)):
+        says = f"reduced chi-square over its limit; false-alarm rate {SPOT_ALARM:g} a fit; beyond 1 sigma is widened"
+        yield SelfCheck(f"fit of the {what}", float(np.nanmax(ratio)), 1.0, "of the limit", says)
+
+
+def stated_check(name: str, told: Consistency) -> SelfCheck:
+    """Whether shifts agree with what is stated to move.
+
+    Args:
+        name: of the check.
+        told: how they do.
+    """
+    says = f"chi-square of {told.degrees} degrees; false-alarm rate {told.false_alarm:.2g}; a warning beyond it"
+    return SelfCheck(name, told.chi_square, told.limit, "", says)
+
+
+def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
+    """Of several readings the check that comes out worst, of each name.
+
+    Args:
+        readings: of states or times.
+    """
+    out: dict[str, SelfCheck] = {}
+    for check in (check for reading in readings for check in reading.checks):
+        if check.name not in out or check.value > out[check.name].value:
+            out[check.name] = check
+    return tuple(out.values())
+
+
+SHARE, OFF = 3, 1
+"""Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
 STATED_SIGMA = 8
@@ -190,6 +338,20 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
 def _first(arrays: Mapping[str, Any]) -> dict[str, float]:
     """The only state's values."""
     return {key: float(np.ravel(value)[0]) for key, value in arrays.items()}
+
+
+def _fit(fits: FitStates, spot: int) -> dict[str, float]:
+    """How good the fit of a spot is; nothing where no shape was fitted."""
+    if not math.isfinite(fits.whole[0, spot]):
+        return {}
+    values = {
+        "reduced_chi_square": fits.whole,
+        "reduced_chi_square_sigma_noise": fits.whole_sigma,
+        "core_chi_square": fits.core,
+        "core_chi_square_sigma_noise": fits.core_sigma,
+        "sigma_widened": fits.widening,
+    }
+    return {key: _to_digits(float(value[0, spot])) for key, value in values.items()}
 
 
 def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:

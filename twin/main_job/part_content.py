@@ -181,10 +181,10 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
     rows = []
     for i, channel in enumerate(channels):
         name = f"{channel.key}/area_ccd"
-        families = [pair for pair in after.traced.relative(channel.key) if pair[0].detector == name]
-        families.sort(key=lambda pair: -pair[1])
+        families = [one for one in after.traced.relative(channel.key) if one[0].detector == name]
+        families.sort(key=lambda one: -one[1])
         nominal = after.traced.runs[channel.key].nominal(name).touches
-        by_kind = {kind: sum(share for f, share in families if f.kind == kind) for kind in ("ghost", "stray")}
+        by_kind = {kind: sum(share for f, share, _ in families if f.kind == kind) for kind in ("ghost", "stray")}
         rows.append(
             {
                 "channel": channel.key,
@@ -192,7 +192,7 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
                 "ghosts": significant(by_kind["ghost"]),
                 "scattered": significant(by_kind["stray"]),
                 "peak": significant(float(after.photons[i].max())),
-                "families": [_family(f, share, name, nominal) for f, share in families[:STRONGEST]],
+                "families": [_family(*family, name, nominal) for family in families[:STRONGEST]],
             }
         )
     taken = [
@@ -202,7 +202,7 @@ def stray_content(run: RenderRun) -> dict[str, Any] | None:
     return {"paths": f"{after.paths:,}".replace(",", "\N{THIN SPACE}"), "rows": rows, "taken": taken}
 
 
-def _family(family: Family, share: float, detector: str, nominal: tuple[Touch, ...]) -> dict[str, str]:
+def _family(family: Family, share: float, sigma: float, detector: str, nominal: tuple[Touch, ...]) -> dict[str, str]:
     x, y = (fixed(1e6 * c, 1) for c in family.centroid)
     way = [str(touch) for touch in family.touches]
     common = _common(way)
@@ -210,7 +210,7 @@ def _family(family: Family, share: float, detector: str, nominal: tuple[Touch, .
     return {
         "kind": family.kind,
         "name": family_name(family.touches, nominal),
-        "share": significant(share),
+        "share": f"{significant(share)} ± {significant(sigma, 1)}",
         "x": x,
         "y": y,
         "way": text,

@@ -16,10 +16,10 @@ from twin.main_job.assumptions import assumed
 from twin.main_job.deformation_results import faces_of
 from twin.main_job.finish_section import finish_section
 from twin.main_job.heat_section import heat_section
-from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, drawings, load_drawing
+from twin.main_job.render_drawings import FILES, SCENE, drawings, load_drawing, without_failed
 from twin.main_job.render_files import write_results
 from twin.main_job.render_job import render_job
-from twin.main_job.render_report import PICTURES, render_report
+from twin.main_job.render_report import PICTURES, again_words, render_report
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.verdict import judge, recovered_numbers
@@ -78,7 +78,7 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
         beside: the process that helps with the drawing; None for one that begins now.
 
     Returns:
-        Why the pictures are not complete, empty when they are or nobody asked for them.
+        What could not be drawn and why, empty where all was.
     """
     if beside is None:
         with SecondProcess(load_drawing) as helper:
@@ -91,20 +91,21 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     tables = tuple(section for section in made if section is not None)
     further = further_sections("render", run)
     limits = _limits(run)
-    drawn = beside.results()
-    for name, file in ((IRRADIANCE, "irradiance.nc"), (SCENE, "scene.glb"), (SUMMARY, "summary.png")):
-        folder.write_bytes(file, drawn[name])
+    drawn, missing = without_failed(beside.results())
+    for name, file in FILES.items():
+        if name in drawn:
+            folder.write_bytes(file, drawn[name])
     sections = (*tables, limits, *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
-    problem = ""
-    if picture:
-        problem = _pictures(run, session)
+    problems = [*missing, _pictures(run, session) if picture else ""]
     pictures = [place for name in PICTURES if (place := folder.path / name).exists()]
-    folder.write_text("report.html", render_report(run, sections, drawn[SCENE], pictures, drawn))
-    warnings = list(judge(run).warnings)
+    folder.write_text("report.html", render_report(run, sections, drawn.get(SCENE), pictures, drawn))
+    warnings = [*judge(run).warnings, *missing]
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
-    write_manifest(folder, PROGRAM, session.started, seconds, **entries)
-    return problem
+    again = list(again_words(run, session.backend.name, picture))
+    checks = [check.to_dict() for check in run.checks]
+    write_manifest(folder, PROGRAM, session.started, seconds, **entries, again=again, checks=checks)
+    return "; ".join(filter(None, problems))
 
 
 def _limits(run: RenderRun) -> Section:

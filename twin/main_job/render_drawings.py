@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from xml.sax.saxutils import escape
 
 from optics.geometry.tree import State
 from scenes.models.instrument_model import Instrument
 from twin.main_job.render_results import RenderRun
 from twin.pictures.light_paths import LightPaths
 
-__all__ = ["APART", "IRRADIANCE", "SCENE", "SUMMARY", "drawings", "load_drawing"]
+__all__ = ["APART", "FILES", "IRRADIANCE", "SCENE", "SUMMARY", "drawings", "load_drawing", "without_failed"]
 
 SUMMARY, SCENE, IRRADIANCE = "summary", "scene", "irradiance"
 """What is no figure of the report: the bytes of summary.png, scene.glb, irradiance.nc."""
 APART = (SUMMARY, SCENE, IRRADIANCE)
+FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"}
+"""Where these are written."""
 
 
 def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any]]:
@@ -46,7 +50,43 @@ def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any
     if run.quality is not None and run.quality.obstruction:
         out["pupils"] = partial(_pupils, run)
     out[SCENE] = partial(_scene, experiment.instrument, run.state, paths)
-    return out
+    return {name: partial(_tried, draw) for name, draw in out.items()}
+
+
+@dataclass(frozen=True)
+class Undrawn:
+    """A drawing that could not be made.
+
+    Attributes:
+        why: the error.
+    """
+
+    why: str
+
+
+def _tried(draw: Callable[[], Any]) -> Any:
+    """A drawing, or Undrawn: what cannot be drawn must not cost what was computed."""
+    try:
+        return draw()
+    except Exception as error:
+        return Undrawn(f"{type(error).__name__}: {' '.join(str(error).split())}")
+
+
+def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Drawings with a note in the place of a figure that could not be made; files that could not are left out. And what
+    is missing, a sentence each.
+    """
+    out, missing = dict(drawn), []
+    for name, made in drawn.items():
+        if isinstance(made, Undrawn):
+            what = f"the file {FILES[name]}" if name in APART else f"the figure {name!r}"
+            missing.append(f"{what} could not be drawn: {made.why}")
+            del out[name]
+            if name not in APART:
+                out[name] = (
+                    f'<svg viewBox="0 0 1060 40" role="img"><text x="8" y="25">{escape(missing[-1])}</text></svg>'
+                )
+    return out, tuple(missing)
 
 
 def load_drawing() -> None:

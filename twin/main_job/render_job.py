@@ -25,13 +25,15 @@ from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import require_memory
 from twin.monitor.monitor_rays import SpotFocus
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
 from twin.run.procedure import Advance, silent
+from twin.sensors.grey_steps import coarse_warnings
 from twin.targets.target_images import TargetLostError
-from twin.targets.target_measurement import check_targets, render_targets
+from twin.targets.target_measurement import check_targets, render_targets, target_pixels
 from twin.targets.target_result import TargetRun
 
 STAGES = (
@@ -87,7 +89,8 @@ def render_job(
         experiment: the job's instrument where it has been built already; results are the same.
 
     Raises:
-        InputError: an unknown node, or a perturbation so large that light misses the mirrors or a spot its CCD.
+        InputError: an unknown node, more memory than there is, or a perturbation so large that light misses the mirrors
+            or a spot its CCD.
     """
     count = resolved.frames if frames is None else frames
     number = resolved.job.render.seed if seed is None else seed
@@ -97,6 +100,8 @@ def render_job(
     stage = _Stages(advance)
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
+    times = 0 if resolved.job.course is None else len(resolved.job.course.times)
+    require_memory(resolved, experiment.size(count, times, target_pixels(resolved)), experiment.detector)
     check_nodes(resolved.job, experiment.instrument.nodes)
     experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
@@ -133,12 +138,15 @@ def render_job(
     stage.begin(6)
     try:
         recovery = recover(
-            before, after, calibration, resolved.job.analysis.centroid, disturbances=experiment.disturbances
+            before,
+            after,
+            calibration,
+            resolved.job.analysis.centroid,
+            disturbances=experiment.disturbances,
+            motions=experiment.motion_models,
         )
     except SpotError as error:
-        channels = experiment.path.channels
-        reasons = "; ".join(f"{channels[i % len(channels)].key}: {reason}" for i, reason in error.reasons.items())
-        raise _too_large(resolved, f"a spot cannot be measured ({reasons})") from error
+        raise _unmeasured(experiment, before, error, focus) from error
     stage.begin(7)
     tables = crosstalk(experiment, _covariances(experiment.instrument, recovery))
     stage.end()
@@ -167,6 +175,7 @@ def render_job(
         crosstalk=tables,
         warnings=(
             *blur_warnings(resolved, backend),
+            *coarse_warnings(resolved),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
             *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
@@ -282,9 +291,24 @@ def _no_spots(resolved: ResolvedJob, reason: str) -> InputError:
     return resolved.instrument.error(
         f"the monitor does not work even as designed, without any perturbation: {reason}",
         ("monitor",),
-        allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a camera with which the beams pass "
-        "the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
+        allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a sharp camera with which the "
+        "beams pass the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
     )
+
+
+def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
+    """What is wrong where a spot cannot be measured: the instrument, if already the spots before cannot."""
+    channels, resolved = experiment.path.channels, experiment.resolved
+
+    def told(error: SpotError) -> str:
+        reasons = "; ".join(f"{channels[i % len(channels)].key}: {why}" for i, why in error.reasons.items())
+        return f"a spot cannot be measured ({reasons})"
+
+    try:
+        recover(before, before[None], experiment.calibration, resolved.job.analysis.centroid)
+    except SpotError as first:
+        return _no_spots(resolved, "; ".join([told(first), *_blurred(experiment, focus)]))
+    return _too_large(resolved, told(error))
 
 
 def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]:

@@ -12,12 +12,12 @@ from markupsafe import Markup
 
 from twin.main_job import assumptions, crosstalk_content, part_content, report_content, report_labels
 from twin.main_job.job_tables import config_text
-from twin.main_job.render_drawings import APART, drawings
+from twin.main_job.render_drawings import APART, drawings, without_failed
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.report_tables import report_tables, setup_tables
 from twin.main_job.verdict import judge
 from twin.pictures.light_paths import trace_light_paths
-from twin.pictures.viewer import viewer_markup, viewer_scripts
+from twin.pictures.viewer import viewer_markup, viewer_programs, viewer_scripts
 from twin.run.artefact import FAR
 from twin.run.page import artefact_content, environment, reproduce, section_contents
 from twin.run.report import Section
@@ -54,7 +54,7 @@ def render_report(
     experiment, backend = run.experiment, run.experiment.backend.name
     if drawn is None:
         paths = trace_light_paths(experiment.instrument, experiment.backend, run.state)
-        drawn = {name: draw() for name, draw in drawings(run, paths).items() if name not in APART}
+        drawn, _ = without_failed({name: draw() for name, draw in drawings(run, paths).items() if name not in APART})
     tables = report_content.results(run)
     figures: dict[str, Any] = {}
     for name, svg in drawn.items():
@@ -74,6 +74,7 @@ def render_report(
         csvs=csvs,
         viewer=viewer_markup(", ".join(p["node"] for p in setup["perturbations"])) if scene else "",
         scripts=viewer_scripts(scene) if scene else "",
+        programs=viewer_programs() if scene else (),
         pictures=[_picture(picture) for picture in pictures],
         course=part_content.series_content(run),
         stray=part_content.stray_content(run),
@@ -99,10 +100,16 @@ def render_report(
         run=run,
         pitch_um=f"{1e6 * experiment.path.pitch:g}",
         config=config_text(run.resolved),
-        command=reproduce(PROGRAM, "config.yaml", f"--seed {run.seed} --frames {run.frames}", f"--backend {backend}"),
+        command=reproduce(again_words(run, backend, bool(pictures))),
         versions=versions(),
         backend=backend,
     )
+
+
+def again_words(run: RenderRun, backend: str, pictures: bool) -> tuple[str, ...]:
+    """Words of the command that makes a run again from its own folder."""
+    options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
+    return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
 
 
 def _picture(place: Path) -> dict[str, Any]:

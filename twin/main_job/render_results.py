@@ -19,13 +19,14 @@ from optics.geometry.tree import State
 from scenes.models.measured_finishes import MeasuredFinishes
 from scenes.models.obstruction import Obstruction
 from scenes.specs.resolved import ResolvedJob
-from twin.main_job.monitor_reading import MonitorReading
+from twin.main_job.monitor_reading import MonitorReading, stated_check
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
+from twin.run.provenance import SelfCheck
 from twin.targets.target_result import TargetRun
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
 
@@ -150,6 +151,14 @@ class RenderRun:
         """As the reading's."""
         return self.reading.consistency
 
+    @property
+    def sigma_holds(self) -> bool:
+        """Whether nothing that was measured contradicts the sigmas; of a course at none of its times."""
+        if self.series is None:
+            return self.reading.sigma_holds
+        agrees = self.worst_of_course is None or self.worst_of_course[1].agrees
+        return agrees and bool(np.all(self.series.sigma_holds))
+
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
         """Of the times of a course the one whose shifts agree least with the stated disturbances, and how they do (see
@@ -166,6 +175,19 @@ class RenderRun:
         if self.experiment.disturbances is None:
             return None
         return find_limits(self.experiment, expected_covariance(self.experiment, self.frames), self.frames)
+
+    @property
+    def checks(self) -> tuple[SelfCheck, ...]:
+        """What was checked of images and readings, and of the balance of stray light."""
+        out = [*self.experiment.path.checked.told(), *self.reading.checks]
+        if self.worst_of_course is not None:
+            out.append(stated_check("worst time of the course against the statement", self.worst_of_course[1]))
+        if self.stray is not None:
+            for when, light in (("before", self.stray.before), ("after", self.stray.after)):
+                error = max((abs(path.balance.error) for path in light.traced.runs.values()), default=0.0)
+                says = "emitted light less what was absorbed, detected, escaped and given up"
+                out.append(SelfCheck(f"balance of stray light {when}", error, None, "of the light", says))
+        return tuple(out)
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""

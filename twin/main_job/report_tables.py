@@ -195,16 +195,16 @@ def _stray(run: RenderRun) -> Iterator[Table]:
     for i, channel in enumerate(run.experiment.path.channels):
         name = f"{channel.key}/area_ccd"
         nominal = after.traced.runs[channel.key].nominal(name).touches
-        families = [pair for pair in after.traced.relative(channel.key) if pair[0].detector == name]
-        by_kind = [sum(share for f, share in families if f.kind == kind) for kind in ("ghost", "stray")]
+        families = [one for one in after.traced.relative(channel.key) if one[0].detector == name]
+        by_kind = [sum(share for f, share, _ in families if f.kind == kind) for kind in ("ghost", "stray")]
         amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
-        for f, share in sorted(families, key=lambda pair: -pair[1]):
+        for f, share, sigma in sorted(families, key=lambda one: -one[1]):
             x, y = (1e6 * c for c in f.centroid)
             chain = " ".join(map(str, f.touches))
-            rows.append([channel.key, f.kind, family_name(f.touches, nominal), share, x, y, f.count, chain])
+            rows.append([channel.key, f.kind, family_name(f.touches, nominal), share, sigma, x, y, f.count, chain])
     heads = ["area CCD", "all / spot", "ghosts / spot", "scattered / spot", "brightest pixel [photons]"]
     yield _table("stray", heads, amounts)
-    heads = ["area CCD", "kind", "name", "share of the spot", "x [µm]", "y [µm]", "paths", "surfaces in order"]
+    heads = ["area CCD", "kind", "name", "share of the spot", "its σ", "x [µm]", "y [µm]", "paths", "surfaces in order"]
     yield _table("stray_families", heads, rows)
     taken: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
     yield _table("stray_prisms", ["prism", "beam", "takes [%]", "of it used by its channel [%]"], taken)
@@ -239,6 +239,9 @@ def _mtf(run: RenderRun) -> Table:
                         found = reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
                         value, sigma = found if found is not None else (None, None)
                         where: list[Cell] = [name, camera.band, place, DIRECTION_NAMES[direction], when, kind]
-                        rows.append([*where, value, sigma, reading.true_nyquist])
+                        rows.append(
+                            [*where, value, sigma, reading.true_nyquist, *reading.at_nyquist, reading.true_axis]
+                        )
     heads = ["camera", "band", "place", "direction", "state", "target", "MTF at Nyquist", "sigma", "true"]
+    heads += ["along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
     return _table("mtf", heads, rows)

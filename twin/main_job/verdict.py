@@ -13,12 +13,14 @@ from scipy.special import ndtr, ndtri
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
+from scenes.models.statement_excess import beyond_statement
 from scenes.specs.course import moment
-from twin.main_job.assumptions import NOISE, combination, contradiction, limits, share_text
+from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics
+from twin.main_job.unseen_motions import perturbed_unseen
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.time_series import TimeSeries
 from twin.run.artefact import FAR, SAME, decimals_for, fixed, plain, residual_text, significant
@@ -169,9 +171,17 @@ def judge(run: RenderRun) -> Judgement:
         verdict = _misled(run, found, off)
     else:
         verdict = _recovered(run, found)
-    warnings = (*run.warnings, *contradiction(run), *_misreadings(run))
+    unseen = _unseen(run)
+    given = (*run.warnings, *doubted(run), *contradiction(run), *unseen)
+    warnings = (*given, *_unstated(run, found, unseen), *_misreadings(run))
     limit = f"; {limited(run)}" if limited(run) else ""
-    return Judgement(f"{verdict}{limit}{_dimmed(run)}{_blurred(run)}.", warnings)
+    doubt = "; σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
+    return Judgement(f"{verdict}{limit}{_dimmed(run)}{_blurred(run)}{doubt}.", warnings)
+
+
+def _unseen(run: RenderRun) -> tuple[str, ...]:
+    """Warnings of motions that change a camera and that no spot tells."""
+    return (*perturbed_unseen(run), *run.reading.unseen)
 
 
 def recovered_numbers(run: RenderRun) -> dict[str, Any]:
@@ -432,6 +442,28 @@ def _blurred(run: RenderRun) -> str:
 def alarm_limit(count: int) -> float:
     """Sigmas that a normal error exceeds in any of ``count`` readings with a chance of FALSE_ALARM at most."""
     return -float(ndtri(0.5 * FALSE_ALARM / count))
+
+
+def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...]) -> tuple[str, ...]:
+    """A warning where readings are wrong beyond chance in a job that moves more than it states: in a measurement of
+    such an instrument nobody would know. Bodies that are told already are left out.
+    """
+    limit = alarm_limit(len(found))
+    off = [r for r in found if abs(r.ratio) > limit]
+    if not off or run.series is not None:
+        return ()
+    every = beyond_statement(run.resolved, run.experiment.stated)
+    beyond = [excess for excess in every if not any(text.startswith(f"{excess.body}:") for text in told)]
+    if not beyond:
+        return ()
+    largest = joined([excess.text for excess in beyond[:NAMED]])
+    more = f" and {len(beyond) - NAMED} more" if len(beyond) > NAMED else ""
+    stated = run.experiment.stated
+    who = "nothing is stated to move" if stated is None else f"the disturbances {stated.name} state less"
+    return (
+        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, and {who}; a measurement "
+        "of such an instrument would not tell",
+    )
 
 
 def _misreadings(run: RenderRun) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.derivatives import RayTangents, jvp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.waves.diffraction import PupilTangent, image_derivative
+from twin.monitor.monitor_beams import MonitorBeams
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, pivot_states
 
@@ -23,7 +24,7 @@ def size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
 
-def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
+def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tuple[RayTangents, np.ndarray]:
     """Push motions forward through the traced path, about the unperturbed instrument; rays stay on their nodes.
 
     Returns:
@@ -55,7 +56,7 @@ def ray_tangents(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> tupl
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
-def _of_one_structure(path: MonitorPath, states: list[State]) -> list[State]:
+def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
     """The same states, of which the first names the highest figure term of every mirror, as none: so the derivatives by
     any motions take one and the same kernel, which is by far the longest to compile.
     """
@@ -90,7 +91,7 @@ def hit_slopes(
     return axes, np.swapaxes(pushed.position[..., :2].reshape(*direction.shape[:2], 2, 2), -1, -2)
 
 
-def spot_jacobian(path: MonitorPath, motions: Sequence[ElementaryMotion]) -> np.ndarray:
+def spot_jacobian(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> np.ndarray:
     """Derivative of every spot's position by elementary motions.
 
     The position is the mean of the rays over the aperture, which is the energy centroid of the diffraction image.

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
@@ -22,6 +23,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
+from optics.waves.pixel_response import UnsampledImageError
 from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
 from scenes.models.heated_bodies import HeatedBody, heated_body, with_heat
@@ -34,7 +36,9 @@ from scenes.specs.course import NO_MOTION
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
+from twin.monitor.line_curvature import motion_models
 from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.monitor_rays import SpotFocus
 from twin.monitor.motions import line_family
@@ -54,6 +58,10 @@ class MonitorExperiment:
         resolved: the job with everything it names; its perturbation is not used here.
         backend: where to trace.
         free_beams: as of ``build_instrument``.
+
+    Raises:
+        InputError: a part that cannot be where it is, area CCDs that do not sample the spots, or whose images need more
+            memory than there is.
     """
 
     def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
@@ -63,9 +71,24 @@ class MonitorExperiment:
         self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
         self.path = MonitorPath(self.instrument, backend)
+        self._require_sampled()
+        require_memory(resolved, self.size(), self.detector)
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
         self._heated: dict[tuple[str, TableTemperatureSpec], HeatedBody] = {}
         self._patterns: dict[int, FixedPattern] = {}
+
+    def _require_sampled(self) -> None:
+        try:
+            self.path.response  # noqa: B018 - fitted before anything is traced
+        except UnsampledImageError as error:
+            key = ("monitor", "reticle", "pinhole") if error.of_source else ("monitor", "area_ccd", "pitch")
+            problem = f"the area CCDs cannot follow the spots: {error}"
+            raise self.resolved.instrument.error(problem, key, allowed=error.remedy) from error
+
+    def size(self, frames: int = 1, times: int = 0, pictures: int = 0) -> MonitorSize:
+        """Numbers that decide how much memory a job of this instrument takes; arguments as of ``MonitorSize``."""
+        phase = self.path.node_classes.phase_per_pixel
+        return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
         """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
@@ -75,7 +98,7 @@ class MonitorExperiment:
         """
         other = copy(self)
         other.resolved = resolved
-        for name in ("stated", "disturbances"):
+        for name in ("stated", "disturbances", "motion_models"):
             vars(other).pop(name, None)
         return other
 
@@ -163,10 +186,11 @@ class MonitorExperiment:
         """Sharpness of the unperturbed instrument's spots.
 
         Raises:
-            BeamMissedError, AimError: they do not come to their CCDs.
+            BeamMissedError, AimError: they do not come to their CCDs, or cannot be worked out.
         """
         focus = self.path.focus
         self.nominal_truth  # noqa: B018 - the line's light, too, has to arrive
+        self.wide_photons  # noqa: B018 - and the spots have to be right
         return focus
 
     @cached_property
@@ -240,6 +264,12 @@ class MonitorExperiment:
         if self.stated is None:
             return None
         return disturbances_of(self.stated, self.path, self.thermal, self.instrument, self.backend)
+
+    @cached_property
+    def motion_models(self) -> Mapping[str, MotionModel]:
+        """Estimator -> the motions by which it reads, to be traced again. Raises InputError as `stated`."""
+        stated, known = self.stated, self.disturbances
+        return motion_models(self.path, self.sight, self.cameras, self.thermal, stated, known)
 
     def geometry(self, camera: str) -> MonitorGeometry:
         """Calibrated numbers for the formulas: principal distance, plate scale across the line, distortion, L, pixel.

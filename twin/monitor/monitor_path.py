@@ -1,9 +1,9 @@
-"""The monitor's light path: from every pinhole through the camera to the return face and back to the area CCD.
+"""The monitor's light: from every pinhole through the camera to the return face and back onto the pixels of the area
+CCD.
 
-The beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state,
-so that its edge is exact; at the CCD each ray is a plane wave, and the matrix Fourier transform gives the image on the
-CCD's own pixels (``optics.waves.diffraction``). The face is taken as evenly lit, the pinhole as an incoherent disk
-imaged at unit scale.
+The matrix Fourier transform of a traced beam gives its image on the CCD's own pixels (``optics.waves.diffraction``);
+the pinhole is an incoherent disk imaged at unit scale. Every image is made with as many rays as it needs, and checked
+(``image_sampling``).
 """
 
 from __future__ import annotations
@@ -13,54 +13,50 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry import zernike
 from optics.geometry.tree import PlacedBodies, State
-from optics.numerics import quadrature
-from optics.numerics.array_math import inverse, product
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
-from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.element_numbers import touched_bodies
-from optics.raytrace.system import SystemBatch, assemble
-from optics.raytrace.trace import BeamMissedError, make_rays, trace
-from optics.waves.diffraction import Grid, PupilField, image
-from optics.waves.pixel_response import PixelResponse
-from optics.waves.wavefront import eikonal
+from optics.waves.diffraction import PupilField, image
+from optics.waves.pixel_response import PixelResponse, UnsampledImageError
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, Channel
-from twin.monitor.monitor_rays import Aimed, CcdRays, CoarseTrace, SpotFocus
+from scenes.specs.channel import BASE
+from twin.monitor.image_sampling import (
+    GOOD,
+    SPOT_RANGES,
+    WINGS,
+    WRONG,
+    ImageChecks,
+    NodeClasses,
+    UncertainImageError,
+    disagreement,
+    lost_or_gained,
+)
+from twin.monitor.monitor_beams import MonitorBeams
+from twin.monitor.monitor_rays import CcdRays, CoarseTrace
 
-MAP_TERMS = 15
-"""Zernike terms (to fourth order) of the map from the aperture to direction cosines; the rest is below 1e-7 of it."""
+MOST_RAYS = 400_000
+"""Traced at once, to bound memory: blurred spots need many."""
 
-SPOT_RANGES = (0.25, 0.5, 0.8)
-"""Shares of the CCD's half size up to which spots may be off its middle, one class of pupil nodes for each: the farther
-off a spot, the farther its farthest pixel, and the more nodes it needs. Beyond the last the estimators refuse it."""
-
-COARSE_RINGS = 6
-"""Rings of the quadrature for means: exact for polynomials to degree 23."""
-
-SCOUT_RINGS = 4
-"""Rings of the rays that are aimed in every state to find out how far the others have to be turned."""
-
-AIM_TOLERANCE = 1e-9
-"""Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
-radius."""
-
-CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
-"""Likewise of the rays from which those of other states are predicted."""
+WIDEST = 1.1
+"""Growth of the beams' aperture that the filter of the pixels still follows (to 3e-6 of the peak), and step to the next
+one."""
 
 
-class MonitorPath:
+class MonitorPath(MonitorBeams):
     """Traces and images the monitor channels of one instrument.
 
     Args:
         instrument: the instrument.
         backend: where to trace.
-        nodes: pupil quadrature; by default one that is right to 1e-6 of the peak for spots anywhere in the last of
-            ``SPOT_RANGES`` of the CCD, out to the far corner, and for images those of ``classes``.
+        nodes: pupil quadrature, then used for all states and not checked; by default one that is right to 1e-6 of the
+            peak for the unperturbed instrument's spots anywhere in the last of ``SPOT_RANGES`` of the CCD, out to the
+            far corner, and for images those of ``class_beams``.
         cameras: whose channels; None for all. Numbers of a channel do not depend on which others there are.
+
+    Attributes:
+        checked: what the checks of all images found that it has given.
     """
 
     def __init__(
@@ -70,240 +66,105 @@ class MonitorPath:
         nodes: PupilNodes | None = None,
         cameras: Collection[str] | None = None,
     ) -> None:
-        self.instrument = instrument
-        self.backend = backend
-        self.cameras = tuple(name for name in instrument.cameras if cameras is None or name in cameras)
-        self.channels: tuple[Channel, ...] = tuple(c for c in instrument.channels if c.camera in self.cameras)
-        ccd = instrument.spec.monitor.area_ccd
-        self.shape = (ccd.rows, ccd.columns)
-        self.pitch: float = ccd.pitch
-        self.wavelength: float = instrument.spec.monitor.wavelength
-        self.face_radius = np.array([0.5 * channel.aperture for channel in self.channels])
+        super().__init__(instrument, backend, nodes, cameras)
         self._sized = nodes is None
-        self.nodes = self._nodes_for(SPOT_RANGES[-1]) if nodes is None else nodes
-
-    def _nodes_for(self, spot_range: float) -> PupilNodes:
-        """Nodes for spots in a share of the CCD, by the phase at the pupil's edge for the farthest pixel."""
-        reach = 0.5 * (1.0 + spot_range) * self.pitch * float(np.hypot(*self.shape))
-        return quadrature.disk_for(2.0 * np.pi * self.numerical_aperture * reach / self.wavelength)
+        self.checked = ImageChecks()
+        self._class_beams: dict[int, MonitorBeams] = {}
+        self._responses: dict[int, PixelResponse] = {}
 
     @cached_property
-    def classes(self) -> tuple[MonitorPath, ...]:
-        """Paths with as many nodes as the spots in each of ``SPOT_RANGES`` need; the last one is this path."""
-        if not self._sized:
-            return (self,)
-        return (*(self._with(self._nodes_for(share)) for share in SPOT_RANGES[:-1]), self)
-
-    def _with(self, nodes: PupilNodes) -> MonitorPath:
-        return MonitorPath(self.instrument, self.backend, nodes, self.cameras)
-
-    def class_of(self, place: np.ndarray, margin: int = 0) -> np.ndarray:
-        """Number of the first of ``classes`` that is right for all spots of each state, (S,).
-
-        Args:
-            place: middle of the spots (C, S, 2), pixels from the CCD's middle.
-            margin: extra pixels rendered on every side of the CCD.
-        """
-        half = 0.5 * np.array(self.shape)
-        farthest = np.max(np.linalg.norm(np.abs(place) + half + margin, axis=-1), axis=0)
-        reached = (1.0 + np.array(SPOT_RANGES[: len(self.classes) - 1])) * np.linalg.norm(half)
-        return np.searchsorted(reached, farthest)
+    def node_classes(self) -> NodeClasses:
+        """Of this instrument's images."""
+        phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
+        return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
     @property
-    def numerical_aperture(self) -> float:
-        """Of the returned beam at the CCD, the largest among the cameras."""
-        scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
-        widest = max(channel.aperture for channel in self.instrument.channels)
-        return 0.5 * widest / float(np.min(scales))
+    def nodes(self) -> PupilNodes:
+        """Pupil quadrature of the unperturbed instrument's spots, wherever on their CCDs.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``; UncertainImageError: no quadrature would do.
+        """
+        if self._nodes is None:
+            self._nodes = self.node_classes.nodes(self._own_class)
+        return self._nodes
 
     @cached_property
-    def coarse(self) -> MonitorPath:
-        """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
-        return self._with(quadrature.disk(COARSE_RINGS))
+    def _own_class(self) -> int:
+        known = self.coarse_trace([{}])
+        far = np.broadcast_to((1.0 - 1e-9) * SPOT_RANGES[-1] * 0.5 * np.array(self.shape), known.place.shape)
+        number = int(self.node_classes.class_of(far, 0, known.blur, known.aperture / self.numerical_aperture)[0])
+        return self._require_class(number, known, 0)
+
+    def class_beams(self, number: int) -> MonitorBeams:
+        """Beams with as many nodes as a class of spots needs."""
+        if not self._sized or number == self._own_class:
+            return self
+        if number not in self._class_beams:
+            self._class_beams[number] = self._with(self.node_classes.nodes(number))
+        return self._class_beams[number]
 
     @cached_property
-    def scout(self) -> MonitorPath:
-        """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
-        return self._with(quadrature.disk(SCOUT_RINGS))
+    def _second(self) -> dict[int, MonitorBeams]:
+        """Class -> beams with the nodes that check its images."""
+        return {}
 
-    @cached_property
-    def nominal(self) -> Aimed:
-        """Aimed rays of the unperturbed instrument, the start for all other states."""
-        return self._aim_nominal()
-
-    @cached_property
-    def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N, T)."""
-        x, y = self.nodes.x, self.nodes.y
-        basis = zernike.basis(MAP_TERMS, x, y)
-        # the terms are orthonormal over the disk, and the quadrature is exact for their products
-        solve = (basis * self.nodes.share[:, None]).T
-        dx, dy = (zernike.gradient_basis(MAP_TERMS, x, y, axis) for axis in (0, 1))
-        return solve, basis, dx, dy
-
-    def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N)."""
-        solve, _, dx, dy = self._smooth
-        a, b = product(u, solve.T), product(v, solve.T)
-        return product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)
-
-    def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
-        """Rays from each pinhole toward the optics, and the systems up to the return face."""
-        position, direction = [], []
-        for channel in self.channels:
-            position.append(placed.translation[:, placed.index[channel.reticle_body]])
-            direction.append(self.instrument.toward_optics(placed, channel.camera))
-        guess = np.concatenate(direction)[:, None]
-        axes = transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape))
-        names = [f"{c.key}/outgoing" for c in self.channels]
-        systems = assemble(self.instrument.assembly, names, states, placed=placed)
-        return RayFan(np.concatenate(position)[:, None].real, guess, axes), systems
-
-    @cached_property
-    def target(self) -> np.ndarray:
-        """Nodes on the return faces, (C, N, 2), metres of their nominal sizes."""
-        return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
-
-    def targets(self, states: int) -> np.ndarray:
-        """The same for as many states, channel-major, (C*S, N, 2)."""
-        return np.repeat(self.target, states, axis=0)
-
-    def _aim_nominal(self) -> Aimed:
-        """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
-        fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
-        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=CLOSE_TOLERANCE)
-        near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
-        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, CLOSE_TOLERANCE)
-        place, heading = fan.at(q)
-        return Aimed(place, heading, fan.axes, q, slope)
-
-    def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
-        """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
+    def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+        """Number of the class of nodes that is right for all spots of each state, (S,), as far as a few rays can tell.
 
         Args:
-            states: S states.
-            placed: their bodies, when already placed.
-
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
+            known: of the states.
+            margin: extra pixels rendered on every side of the CCD.
         """
-        scout, count = self.scout, len(states)
-        placed = self.instrument.assembly.place(states) if placed is None else placed
-        fan, outgoing = self._outgoing(placed, states)
-        names = [f"{c.key}/monitor" for c in self.channels]
-        back = assemble(self.instrument.assembly, names, states, placed=placed)
-        nominal = scout.nominal
-        start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
-        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, CLOSE_TOLERANCE)
-        turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
-        uploaded = back.upload(self.backend)
-        traced = trace(self.backend, uploaded, make_rays(self.backend, *fan.at(q)))
-        pitch = self.pitch * back.size[:, None]
-        place = np.einsum("n,bnk->bk", scout.nodes.share, traced.place())[:, ::-1] / pitch
-        return CoarseTrace(fan, outgoing, back, uploaded, turn, place.reshape(len(self.channels), count, 2))
+        if not self._sized:
+            return np.zeros(known.place.shape[1], np.intp)
+        widening = known.aperture / self.numerical_aperture
+        # a beam that is lost stands nowhere; its full trace says where it is lost
+        place = np.where(known.aperture[..., None] > 0.0, known.place, 0.0)
+        return self.node_classes.class_of(place, margin, known.blur, widening)
 
-    def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
-        """Rays at the CCDs for C channels x S states, channel-major.
-
-        Args:
-            states: S states.
-            coarse: what ``coarse_trace`` says of them, if it is known.
-
-        Raises:
-            BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
-                message.
-        """
-        known = self.coarse_trace(states) if coarse is None else coarse
-        start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
-        q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
-        launch = known.fan.at(q)
-        face = len(known.outgoing.structure) - 1
-        traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
-        goal = self.targets(len(states))
-        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
-            # a change that is not smooth enough for its few terms
-            q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
-            launch = known.fan.at(q)
-            traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
-        position, direction, length, valid = traced.numpy()
-        rays = CcdRays(position / known.back.size[:, None, None], direction, length, valid, known.back.size)
-        for i, channel in enumerate(self.channels):
-            own = slice(i * len(states), (i + 1) * len(states))
-            if not np.all(np.any(rays.valid[own], axis=1)):
-                lost = int(np.argmin(np.any(rays.valid[own], axis=1)))
-                first = own.start + lost
-                where = self._where_lost(channel, states[lost], launch[0][first], launch[1][first])
-                raise BeamMissedError(f"the whole beam of the monitor channel {channel.key} misses {where}")
-            self._require_on_ccd(channel, rays.position[own])
-        return rays
-
-    def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
-        """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
-        names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
-        steps = alive_along(self.backend, self.instrument.assembly, names, position, direction, state)
-        count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
-        return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
-
-    def fields(self, states: Sequence[State]) -> PupilField:
-        """Plane waves at the CCDs for C channels x S states, channel-major, in each chip's own x, y about its centre.
-
-        Raises:
-            BeamMissedError, AimError: as ``rays``.
-        """
-        return self.field_of(self.rays(states))
-
-    def field_of(self, rays: CcdRays) -> PupilField:
-        """Plane waves of traced rays."""
-        direction = rays.direction
-        u, v = direction[..., 0], direction[..., 1]
-        # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.waves.diffraction, with A the face's area
-        amplitude = np.sqrt(np.abs(self.area_ratio(u, v)) / np.pi) * self.nodes.weight * rays.valid
-        phase = eikonal(rays.size[:, None, None] * rays.position, direction, rays.path, np.zeros(3))
-        phase = phase - phase[:, :1]
-        return PupilField(u, v, phase, amplitude, self.wavelength).in_lengths_of(rays.size)
-
-    def _require_on_ccd(self, channel: Channel, position: np.ndarray) -> None:
-        """Raise BeamMissedError when the middle of a spot (rays (S, N, 3) on the chip) is outside its CCD."""
-        half = 0.5 * (np.array(self.shape) - 1)
-        place = np.einsum("n,snk->sk", self.nodes.share, position[..., 1::-1]) / self.pitch
-        beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
-        if np.any(beyond > 0.0):
-            worst = int(np.argmax(beyond))
-            row, column = place[worst] + half
-            raise BeamMissedError(
-                f"the spot {channel.key} falls on row {row:.0f}, column {column:.0f}, outside its area CCD of "
-                f"{self.shape[0]} x {self.shape[1]} pixels: {beyond[worst]:.3g} px or "
-                f"{1e3 * self.pitch * beyond[worst]:.3g} mm beyond its edge"
+    def _require_class(self, number: int, known: CoarseTrace, state: int) -> int:
+        """The number of a class, if there is one. Raises UncertainImageError for a spot that is blurred too much."""
+        if number >= len(self.node_classes.reached):
+            worst = int(np.argmax(known.blur[:, state]))
+            raise UncertainImageError(
+                f"the spot {self.channels[worst].key} is blurred so much that its image is not worked out: its rays "
+                f"spread over {2.0 * known.blur[worst, state]:.3g} px or "
+                f"{2e3 * self.pitch * known.blur[worst, state]:.3g} mm; refocus the camera, or make its aberrations "
+                "smaller"
             )
+        return number
 
-    @cached_property
+    @property
     def response(self) -> PixelResponse:
-        """What pixel and pinhole do to the image; a pinhole is taken to grow with the CCD beside it."""
-        pinhole = self.instrument.spec.monitor.reticle.pinhole
-        return PixelResponse.fit(self.pitch, pinhole, cutoff=2.0 * self.numerical_aperture / self.wavelength)
-
-    @cached_property
-    def focus(self) -> SpotFocus:
-        """How sharp the unperturbed instrument's spots are.
+        """What pixel and pinhole do to the unperturbed instrument's images; a pinhole is taken to grow with the CCD
+        beside it.
 
         Raises:
-            BeamMissedError, AimError: as ``rays``.
+            UnsampledImageError: the pixels are too coarse or the pinhole is too wide for them.
         """
-        rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
-        paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))
-        error, defocus = np.empty(len(paths)), np.empty(len(paths))
-        for i, (direction, path) in enumerate(zip(rays.direction, paths, strict=True)):
-            root = np.sqrt(weight * rays.valid[i])
-            # light to a point (x, y, z) of the CCD's frame has there an eikonal of -(u x + v y + w z) and a constant
-            basis = np.column_stack([np.ones_like(path), direction - direction[0]]) * root[:, None]
-            scale = np.linalg.norm(basis, axis=0)
-            flat, point = (
-                np.linalg.lstsq(basis[:, :n] / scale[:n], path * root, rcond=None)[0] / scale[:n] for n in (3, 4)
-            )
-            error[i] = np.linalg.norm(path * root - basis[:, :3] @ flat) / np.linalg.norm(root)
-            # the CCD's z is the plane's -Z; the pinhole moves with the CCD, its image the other way
-            defocus[i] = 0.5 * point[3]
-        return SpotFocus(error / self.wavelength, defocus)
+        return self._response(0)
+
+    def _response(self, wider: int) -> PixelResponse:
+        """Likewise for beams wider by some steps of ``WIDEST``."""
+        if wider not in self._responses:
+            pinhole = self.instrument.spec.monitor.reticle.pinhole
+            cutoff = 2.0 * self.numerical_aperture * WIDEST**wider / self.wavelength
+            self._responses[wider] = PixelResponse.fit(self.pitch, pinhole, cutoff)
+        return self._responses[wider]
+
+    def _response_of(self, known: CoarseTrace) -> PixelResponse:
+        """What pixel and pinhole do to the images of some states.
+
+        Raises:
+            UncertainImageError: they are too fine for the pixels.
+        """
+        widening = max(float(np.max(known.aperture)) / self.numerical_aperture, 1.0)
+        try:
+            return self._response(max(0, int(np.ceil(np.log(widening) / np.log(WIDEST))) - 1))
+        except UnsampledImageError as error:
+            problem = f"beams have {widening:.3g} times the aperture as designed: {error}"
+            raise UncertainImageError(f"{problem}; {error.remedy} would do") from error
 
     def expected_photons(
         self, states: Sequence[State], margin: int = 0, chunk: int = 32, single: bool = True
@@ -356,11 +217,13 @@ class MonitorPath:
                 part = self._of_cameras(moved)
                 coarse = part.coarse_trace([state], placed)
                 photons, usual = self._at_rest(single)
-                # spots far off need more nodes, and then all channels get them
-                if part.class_of(coarse.place)[0] == usual:
-                    out = photons.copy()
-                    out[[c.camera in moved for c in self.channels]] = part._render([state], 0, single, coarse)[0]
-                    return out
+                # spots far off or blurred need more nodes, and then all channels get them
+                if part.class_of(coarse)[0] <= usual:
+                    own, number = part._render_classed([state], 0, single, coarse)
+                    if number[0] == usual:
+                        out = photons.copy()
+                        out[[c.camera in moved for c in self.channels]] = own[0]
+                        return out
             return np.asarray(self._render([state], 0, single, self.coarse_trace([state], placed))[0])
 
     def moved_cameras(self, state: State, placed: PlacedBodies | None = None) -> tuple[str, ...]:
@@ -392,8 +255,8 @@ class MonitorPath:
     def _of_cameras(self, names: tuple[str, ...]) -> MonitorPath:
         """The path of these cameras alone."""
         if names not in self._parts:
-            nodes = None if self._sized else self.nodes
-            self._parts[names] = MonitorPath(self.instrument, self.backend, nodes, names)
+            self._parts[names] = MonitorPath(self.instrument, self.backend, None if self._sized else self.nodes, names)
+            self._parts[names].checked = self.checked
         return self._parts[names]
 
     @cached_property
@@ -403,8 +266,8 @@ class MonitorPath:
     def _at_rest(self, single: bool) -> tuple[np.ndarray, int]:
         """Photons of the unperturbed instrument (C, rows, columns), and the number of their class."""
         if single not in self._rested:
-            coarse = self.coarse_trace([{}])
-            self._rested[single] = self._render([{}], 0, single, coarse)[0], int(self.class_of(coarse.place)[0])
+            photons, number = self._render_classed([{}], 0, single)
+            self._rested[single] = photons[0], int(number[0])
         return self._rested[single]
 
     @cached_property
@@ -414,21 +277,115 @@ class MonitorPath:
     def _render(
         self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
     ) -> np.ndarray:
-        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class."""
-        channels, response = len(self.channels), self.response
-        y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
+        """Expected photons (S, C, rows + 2 margin, columns + 2 margin), each state with the nodes of its class.
+
+        Raises:
+            UncertainImageError: an image is not right whatever the nodes.
+        """
+        return self._render_classed(states, margin, single, coarse)[0]
+
+    def _render_classed(
+        self, states: Sequence[State], margin: int, single: bool, coarse: CoarseTrace | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What ``_render`` gives, and the class of each state, (S,)."""
         coarse = self.coarse_trace(states) if coarse is None else coarse
-        chosen = self.class_of(coarse.place, margin)
-        out = np.empty((len(states), channels, *(n + 2 * margin for n in self.shape)))
-        for number in np.unique(chosen):
+        for channel, place, aperture in zip(self.channels, coarse.place, coarse.aperture, strict=True):
+            self._require_on_ccd(channel, place[aperture > 0.0])
+        chosen = self.class_of(coarse, margin)
+        out = np.empty((len(states), len(self.channels), *(n + 2 * margin for n in self.shape)))
+        number = 0
+        while number <= np.max(chosen):
             own = np.flatnonzero(chosen == number)
-            path, known = self.classes[number], coarse.take(own, self.backend)
-            field = path.field_of(path.rays([states[s] for s in own.tolist()], known))
-            photons = response.apply(image(field, x, y, single))
-            photons = photons.reshape(channels, len(own), *photons.shape[1:])
-            photons *= self.light_per_pixel[:, None, None, None]
-            out[own] = np.swapaxes(photons, 0, 1)
-        return out
+            for piece in np.array_split(own, -(-len(own) * self._rays_of(number) // MOST_RAYS) or 1):
+                if len(piece):
+                    self._require_class(number, coarse, int(piece[0]))
+                    known = coarse.take(piece, self.backend)
+                    some = [states[s] for s in piece.tolist()]
+                    # some are made again with more nodes
+                    out[piece], chosen[piece] = self._images(some, known, number, margin, single)
+            number += 1
+        return out, chosen
+
+    def _rays_of(self, number: int) -> int:
+        """Rays of a state with the nodes of a class."""
+        last = len(self.node_classes.reached) - 1
+        return self.class_beams(min(number, last)).nodes.count * len(self.channels)
+
+    def _images(
+        self, states: Sequence[State], known: CoarseTrace, number: int, margin: int, single: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Expected photons of states with the nodes of a class, (S, C, ...), and the class that each asks for, (S,).
+
+        A larger class where two rules disagree. The last one for a beam that is cut: at its edge each rule has an
+        error of its own, and two may agree by chance.
+
+        Raises:
+            UncertainImageError: an image is not right with the most nodes, or its light is not that of its rays.
+        """
+        beams, response = self.class_beams(number), self._response_of(known)
+        y, x = (self.grid(axis, margin + response.reach) for axis in (0, 1))
+        rays = beams.rays(states, known)
+        waves = image(beams.field_of(rays), x, y, single)
+        wanted, last = np.full(len(states), number), len(self.node_classes.reached) - 1
+        difference = np.zeros((len(self.channels), len(states)))
+        if self._sized:
+            difference = disagreement(waves, self._second_field(states, known, number), x, y)
+            difference = difference.reshape(-1, len(states))
+            if number + 2 <= last:
+                wanted[np.any(difference > GOOD, axis=0)] += 2
+            wanted[~np.all(rays.valid.reshape(len(self.channels), len(states), -1), axis=(0, 2))] = last
+            self._require_alike(np.where(wanted == number, difference, 0.0), rays)
+        photons = response.apply(waves)
+        if self._sized:
+            light = self._require_energy(photons, rays, beams.nodes.share, margin, wanted > number)
+            self.checked.add(difference[:, wanted == number].ravel(), light)
+        photons = photons.reshape(len(self.channels), len(states), *photons.shape[1:])
+        photons *= self.light_per_pixel[:, None, None, None]
+        return np.swapaxes(photons, 0, 1), wanted
+
+    def _second_field(self, states: Sequence[State], known: CoarseTrace, number: int) -> PupilField:
+        """The same beams at the nodes that check a class."""
+        if number not in self._second:
+            self._second[number] = self._with(self.node_classes.second_nodes(number))
+        second = self._second[number]
+        return second.field_of(second.rays(states, known))
+
+    def _require_alike(self, difference: np.ndarray, rays: CcdRays) -> None:
+        """Raise UncertainImageError where two rules differ too much (C, S), of the peaks."""
+        channel, state = np.unravel_index(np.argmax(difference), difference.shape)
+        if difference[channel, state] > WRONG:
+            lost = 1.0 - float(np.mean(rays.valid[channel * difference.shape[1] + state]))
+            why = (
+                f"an aperture stops {100.0 * lost:.2g} % of its rays; widen it, or move the beam to its middle"
+                if lost
+                else "its wavefront is too rough for smooth nodes; make figures and deformations smoother, or motions "
+                "smaller"
+            )
+            raise UncertainImageError(
+                f"the image of the spot {self.channels[channel].key} is uncertain by "
+                f"{100.0 * difference[channel, state]:.2g} % of its peak: {why}"
+            )
+
+    def _require_energy(
+        self, images: np.ndarray, rays: CcdRays, share: np.ndarray, margin: int, known_bad: np.ndarray
+    ) -> np.ndarray:
+        """Raise UncertainImageError where the light of images (C*S, R, C) is not that of their rays; by how much it is
+        beyond what is allowed, (C*S,).
+        """
+        half = 0.5 * np.array(self.shape) + margin
+        wings = np.full(len(images), WINGS * self.wavelength / (2.0 * np.pi * self.numerical_aperture * self.pitch))
+        light = np.sum(images, axis=(-2, -1)) * self.pitch**2
+        off = lost_or_gained(light, rays.position[..., 1::-1] / self.pitch, share * rays.valid, half, wings)
+        off = np.where(np.tile(known_bad, len(self.channels)), 0.0, off)
+        worst = int(np.argmax(np.abs(off)))
+        if off[worst]:
+            channel = self.channels[worst // len(known_bad)]
+            raise UncertainImageError(
+                f"the image of the spot {channel.key} has {100.0 * abs(off[worst]):.2g} % of its light too "
+                f"{'much' if off[worst] > 0.0 else 'little'} against its rays, beyond what diffraction can do; its "
+                "beam is folded or distorted: refocus the camera, or make its aberrations smaller"
+            )
+        return off
 
     @property
     def light_per_pixel(self) -> np.ndarray:
@@ -436,12 +393,3 @@ class MonitorPath:
         pixel.
         """
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
-
-    def grid(self, axis: int, margin: int = 0) -> Grid:
-        """Pixel centres of the rows (0) or columns (1) on the chip, from the CCD's centre, in nominal metres."""
-        n = self.shape[axis]
-        return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
-
-    def axis(self, axis: int) -> np.ndarray:
-        """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
-        return self.grid(axis).points()

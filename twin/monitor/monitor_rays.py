@@ -38,6 +38,8 @@ class CoarseTrace:
         uploaded: the latter where they are traced.
         turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
         place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
+        blur: distance of the farthest rays from there, estimated at the aperture's edge, pixels, (C, S).
+        aperture: numerical apertures of the beams, the largest half width, (C, S).
     """
 
     fan: RayFan
@@ -46,6 +48,8 @@ class CoarseTrace:
     uploaded: UploadedSystems
     turn: np.ndarray
     place: np.ndarray
+    blur: np.ndarray
+    aperture: np.ndarray
 
     def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
         """The states of the given indices."""
@@ -55,7 +59,8 @@ class CoarseTrace:
         own = (np.arange(channels)[:, None] * count + states).ravel()
         fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
         outgoing, back = self.outgoing.take(own), self.back.take(own)
-        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.turn[:, own], self.place[:, states])
+        spots = (spot[:, states] for spot in (self.place, self.blur, self.aperture))
+        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.turn[:, own], *spots)
 
 
 @dataclass(frozen=True, eq=False)

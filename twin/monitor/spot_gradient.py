@@ -25,8 +25,8 @@ from optics.raytrace.derivatives import vjp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_model import Instrument
+from twin.monitor.monitor_beams import AIM_TOLERANCE, MonitorBeams
 from twin.monitor.monitor_derivative import hit_slopes, size_steps
-from twin.monitor.monitor_path import AIM_TOLERANCE, MonitorPath
 from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion
 
 CHUNK = 1 << 17
@@ -50,7 +50,7 @@ def every_motion(instrument: Instrument) -> tuple[ElementaryMotion, ...]:
 
 
 def spot_gradient(
-    path: MonitorPath, motions: Sequence[ElementaryMotion], about: State | None = None, chunk: int = CHUNK
+    path: MonitorBeams, motions: Sequence[ElementaryMotion], about: State | None = None, chunk: int = CHUNK
 ) -> np.ndarray:
     """Derivative of every spot's position by elementary motions, as ``twin.monitor.monitor_derivative.spot_jacobian``.
 
@@ -145,7 +145,7 @@ class _Tangents:
 
 
 def _numbers(
-    path: MonitorPath,
+    path: MonitorBeams,
     sequence: str,
     middle: State,
     states: Sequence[State],
@@ -185,7 +185,7 @@ def _union(states: Sequence[State], about: State) -> State:
     return {**about, **{body: replace(about.get(body, AT_REST), figure=terms) for body, terms in figures.items()}}
 
 
-def _aimed(path: MonitorPath, about: State) -> tuple[np.ndarray, np.ndarray]:
+def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
     """Launch points and directions (C, N, 3) of the rays that meet the nodes of the return faces in the state."""
     nominal = path.nominal
     start = np.broadcast_to(nominal.position, nominal.direction.shape)

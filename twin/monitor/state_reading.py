@@ -11,8 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from analysis.monitor.recovery import Recovery, measure_spots, recovery_of
+from analysis.monitor.recovery import Recovery, judged_spots, recovery_of
+from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
+from analysis.spots.fit_state import FitStates
 from analysis.spots.spot_positions import SpotPositions, difference_covariance
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.threads import one_blas_thread
@@ -60,11 +62,11 @@ class StateReader:
         return self.experiment.frames_before(self.frames, self.seed)
 
     @cached_property
-    def _spots_before(self) -> SpotPositions:
+    def _spots_before(self) -> tuple[SpotPositions, FitStates]:
         return self._spots(mean_frames(self.before))
 
     @cached_property
-    def _clean_before(self) -> SpotPositions:
+    def _clean_before(self) -> tuple[SpotPositions, FitStates]:
         return self._spots(self.experiment.expected_frames(self.experiment.nominal_photons))
 
     def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> StateReading:
@@ -87,12 +89,15 @@ class StateReader:
             photons = experiment.path.photons_of(state, placed, single)[None]
             frames = experiment.frames_after(photons, self.frames, self.seed, number)[0] if noise else None
             mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
-            first, second = self._clean_before if frames is None else self._spots_before, self._spots(mean)
+            first, fits = self._clean_before if frames is None else self._spots_before
+            second, more = self._spots(mean)
             calibration, stated = experiment.calibration, experiment.disturbances
             spread = difference_covariance(first, second, calibration.noise)
-            recovery = recovery_of(first, second, spread, calibration, stated)
+            evidence = SpotEvidence(fits, more)
+            again = experiment.motion_models
+            recovery = recovery_of(first, second, spread, calibration, stated, evidence=evidence, motions=again)
         return StateReading(placed, truth, photons[0], frames, recovery)
 
-    def _spots(self, mean: np.ndarray) -> SpotPositions:
+    def _spots(self, mean: np.ndarray) -> tuple[SpotPositions, FitStates]:
         """Of mean frames or expected images (C, rows, columns), grey values."""
-        return measure_spots(mean, self.frames, self.experiment.calibration, self.centroid)
+        return judged_spots(mean, self.frames, self.experiment.calibration, self.centroid)

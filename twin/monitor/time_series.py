@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor.curvature import Curvature
 from analysis.monitor.ground_error import AXES, GroundError
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
 from analysis.monitor.recovery import Estimates, Recovery, recover
+from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.spot_positions import SpotError
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
@@ -26,13 +28,10 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import CHUNK, largest_piece
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.monitor.truth import Truth
 
-CHUNK = 25
-"""States rendered at once, to bound memory; fewer when their frames are large."""
-LARGEST_FRAMES = 200_000_000
-"""Pixels of all frames that are exposed at once."""
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""
 
@@ -59,6 +58,8 @@ class TimeSeries:
         shown_photons: those of the time that is shown, as they were exposed, (C, rows, columns).
         frames: the first frame of each time, uint16 (T, C, rows, columns).
         warnings: what the user should know.
+        evidence: what the fits of all spots say.
+        curvature: estimator -> whether its motions are small enough to be linear, at all times.
     """
 
     times: np.ndarray
@@ -79,6 +80,42 @@ class TimeSeries:
     shown_photons: np.ndarray
     frames: np.ndarray
     warnings: tuple[str, ...]
+    evidence: SpotEvidence
+    curvature: Mapping[str, Curvature]
+
+    @property
+    def sigma_holds(self) -> np.ndarray:
+        """(T,) whether spots and readings of each time are as their sigmas take them to be."""
+        return np.all([self.evidence.holds, *(found.holds for found in self.curvature.values())], axis=0)
+
+    def doubts(self, spots: Sequence[str]) -> tuple[str, ...]:
+        """Where sigma does not hold, and which readings were worked out anew since they are not linear; sentences
+        without their end.
+
+        Args:
+            spots: their names.
+        """
+        out = []
+        bad = int(np.count_nonzero(~self.evidence.holds))
+        if bad:
+            worst = self.evidence.worst
+            told = self.evidence.doubt(worst, spots)
+            assert told is not None
+            out.append(f"course at {moment(float(self.times[worst]))}, the worst of {bad} times: {told.text}")
+        for name, found in self.curvature.items():
+            lost = np.flatnonzero(~found.holds)
+            again = np.flatnonzero(found.beyond & found.holds)
+            if len(lost):
+                out.append(
+                    f"course: σ does not hold at {len(lost)} times, first at {moment(float(self.times[lost[0]]))}: the "
+                    f"motions that the {name} reads are not small, and the states that it stands for cannot be traced"
+                )
+            if len(again):
+                out.append(
+                    f"course: at {len(again)} times, first at {moment(float(self.times[again[0]]))}, the motions that "
+                    f"the {name} reads are not small, and its readings are those of Gauss and Newton's steps"
+                )
+        return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
@@ -123,6 +160,7 @@ class TimeSeries:
                 "true": {f"{axis}_m": (v + 0.0).tolist() for axis, v in zip(AXES, self.true_ground.T, strict=True)},
                 **{e: g.to_dict() for e, g in {**self.recovered_ground, **changes.ground}.items()},
             }
+        out["sigma_holds"] = self.sigma_holds.tolist()
         if self.smoothed is not None:
             out["disturbances"] = self.smoothed.to_dict()
             if len(self.smoothed.times):
@@ -212,6 +250,7 @@ def run_series(
                         cores(),
                         experiment.disturbances,
                         keep_parts=experiment.disturbances is not None,
+                        motions=experiment.motion_models,
                     )
                 )
         except SpotError as error:
@@ -255,6 +294,8 @@ def run_series(
         shown_photons=shown_photons,
         frames=first,
         warnings=_warnings(experiment, course, saturated, share),
+        evidence=SpotEvidence.joined([r.evidence for r in recoveries if r.evidence is not None]),
+        curvature={e: Curvature.joined([r.curvature[e] for r in recoveries]) for e in recoveries[0].curvature},
     )
 
 
@@ -284,7 +325,7 @@ def pieces(count: int, each: int) -> Iterator[slice]:
         count: times.
         each: pixels of all frames of one.
     """
-    size = max(1, min(CHUNK, LARGEST_FRAMES // each))
+    size = largest_piece(each)
     for start in range(0, count, size):
         yield slice(start, min(start + size, count))
 

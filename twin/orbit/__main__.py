@@ -247,7 +247,7 @@ def export(
         from scenes.yaml.errors import InputError
         from twin.orbit.export.export_report import export_files, export_numbers, export_report
         from twin.orbit.export.export_run import run_export
-        from twin.run.page import RunFacts, reproduce, write_test
+        from twin.run.page import RunFacts, write_test
         from twin.run.procedure import BenchError
 
         read, heights = given
@@ -259,12 +259,12 @@ def export(
         numbers = {**export_numbers(run), "verdict": shown.verdict}
         for name, content in export_files(run).items():
             session.folder.write_bytes(name, content)
-        ends = "" if heights is None else f"--lowest '{heights[0]!r} m' --highest '{heights[1]!r} m'"
-        again = reproduce(PROGRAM, "export", str(source), ends, "--truth" if truth else "", f"--seed {read.seed}")
+        ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
-        facts = RunFacts(
-            read.config, str(source), name, read.seed, session.started, session.seconds, PROGRAM, "", again
-        )
+        options = (*ends, *(("--truth",) if truth else ()), "--seed", str(read.seed))
+        again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
+        times = session.started, session.seconds
+        facts = RunFacts(*(read.config, str(source), name, read.seed, *times, PROGRAM, "", again), given=(source,))
         write_test("export", numbers, shown, facts, session.folder)
         return Result(described("export", numbers), lambda console: print_report(shown, console))
 

@@ -55,11 +55,11 @@ class StrayLight:
         """Contents of stray.json: by source, the families at any detector and where the light went."""
         out: dict[str, Any] = {}
         for channel, run in self.traced.runs.items():
-            families = sorted(self.traced.relative(channel), key=lambda pair: -pair[1])[:FAMILIES]
+            families = sorted(self.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
             balance = run.balance
             nominal = run.nominal(f"{channel}/area_ccd").touches
             out[channel] = {
-                "families": [_family(family, share, nominal) for family, share in families],
+                "families": [_family(family, share, sigma, nominal) for family, share, sigma in families],
                 "balance": {
                     "emitted": balance.emitted,
                     "absorbed": dict(balance.absorbed),
@@ -72,13 +72,14 @@ class StrayLight:
         return {"paths_per_source": self.paths, "sources": out}
 
 
-def _family(family: Family, share: float, nominal: tuple[Touch, ...]) -> dict[str, Any]:
+def _family(family: Family, share: float, sigma: float, nominal: tuple[Touch, ...]) -> dict[str, Any]:
     return {
         "detector": family.detector,
         "kind": family.kind,
         "name": family_name(family.touches, nominal),
         "surfaces": [str(touch) for touch in family.touches],
         "relative_to_nominal": share,
+        "relative_to_nominal_sigma": sigma,
         "paths": family.count,
         "x_um": 1e6 * family.centroid[0],
         "y_um": 1e6 * family.centroid[1],

@@ -15,6 +15,7 @@ import numpy as np
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
 from scenes.models.instrument_model import Instrument
 from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
@@ -37,7 +38,7 @@ NARROW_ROOM = 1.2
 """Room around the rays to the outermost of these rings of the return face: they end 3 % inside its edge."""
 
 
-class NominalPathLost(RuntimeError):
+class NominalPathLost(PhysicalError, RuntimeError):
     """No path reached an area CCD by its nominal way, so that nothing can be normalised."""
 
 
@@ -56,11 +57,19 @@ class StrayResult:
     runs: Mapping[str, PathResult]
     photons_per_power: Mapping[str, float]
 
-    def relative(self, channel: str) -> tuple[tuple[Family, float], ...]:
-        """Families of a channel's source at any detector with their energy relative to its nominal family."""
+    def relative(self, channel: str) -> tuple[tuple[Family, float, float], ...]:
+        """Families of a channel's source at any detector, each with its energy relative to the nominal family's and the
+        standard deviation of that by the number of paths.
+        """
         run = self.runs[channel]
-        nominal = run.nominal(f"{channel}/area_ccd").energy
-        return tuple((family, family.energy / nominal) for family in run.families if family.kind != "nominal")
+        nominal = run.nominal(f"{channel}/area_ccd")
+        others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
+        # a path of the one is none of the other: the covariance of their energies is -1 / paths of the product
+        own = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
+        return tuple(
+            (family, share, share * float(np.sqrt((family.error / family.energy) ** 2 + own)))
+            for family, share in others
+        )
 
 
 def pinhole(

@@ -23,19 +23,23 @@ def viewer_markup(moved: str) -> Markup:
     return Markup(text).format(moved=moved or "nothing")
 
 
+def viewer_programs() -> tuple[str, str]:
+    """All that runs in the view: the program as it stands between its tags, and the library, which it puts in."""
+    return f"\n{(_HERE / 'viewer.js').read_text('utf-8')}", (_HERE / LIBRARY).read_text("utf-8")
+
+
 def viewer_scripts(scene: bytes) -> Markup:
     """What makes the view: the library and the scene, both packed, and the program. They stand at the end of a page.
 
     Args:
         scene: binary glTF, as ``scene_file.write_scene`` writes it.
     """
-    library = (_HERE / LIBRARY).read_bytes()
-    program = (_HERE / "viewer.js").read_text("utf-8")
+    program, library = viewer_programs()
     # names of tags cannot stand in base64, and the program is ours
     return Markup(
-        f'<script type="application/gzip" id="viewer-library">{_packed(library)}</script>\n'
+        f'<script type="application/gzip" id="viewer-library">{_packed(library.encode())}</script>\n'
         f'<script type="application/gzip" id="viewer-scene">{_packed(scene)}</script>\n'
-        f"<script>\n{program}</script>\n"
+        f"<script>{program}</script>\n"
     )
 
 

@@ -65,6 +65,7 @@ def main(
 
         run = run_recover(setup, session.backend, session.advance)
         # frames that cannot be measured are told before anything that draws is loaded
+        from twin.main_job.monitor_reading import worst_checks
         from twin.recover.recover_report import KIND, recover_numbers, recover_report
         from twin.run.page import RunFacts, write_test
 
@@ -78,6 +79,8 @@ def main(
             session.seconds,
             PROGRAM,
             "",
+            named=setup.plain(),
+            checks=worst_checks(run.readings),
         )
         write_test(KIND, numbers, shown, facts, session.folder)
         return Result(described(KIND, numbers), lambda console: print_report(shown, console))

@@ -9,13 +9,21 @@ import numpy as np
 from analysis.monitor.calibration import MonitorCalibration
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import mean_frames
-from analysis.spots.frame_screening import Finding, FramesError, ScreenedFrames, screen_frames
+from analysis.spots.fit_state import widened
+from analysis.spots.frame_screening import (
+    Finding,
+    FramesError,
+    ScreenedFrames,
+    noise_ratio,
+    screen_frames,
+    shown_noise,
+)
 from analysis.spots.learnt_noise import FittedSpot, LearntShift, learnt_shift
 from analysis.spots.learnt_template import LearntTemplate, learn_template, without_slopes
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
 from analysis.spots.repaired_image import repaired_centroid
-from analysis.spots.screened_fit import one_shape
+from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
 from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
@@ -115,8 +123,11 @@ class ChannelMeasurement:
         self._test, self.channel, self.shape = test, channel, shape
         self._learnt = shape is None
         self._screened: list[ScreenedFrames] = []
+        self._noise_ratios: list[float | None] = []
+        self._noisy = False
         self._examined: list[Examined | None] = []
         self._costs: dict[int, float] = {}
+        self._widened: list[float] = []
         self._learnt_from: LearntTemplate | None = None
         self._fitted: list[FittedSpot] = []
         self._shifts: list[LearntShift] = []
@@ -137,7 +148,8 @@ class ChannelMeasurement:
         known = channel.correction is None and channel.transfer is None
         untouched = all(screened.clean for screened in self._screened)
         untouched &= all(one is None or one.clean for one in self._examined)
-        return whole and same and integers and known and untouched and self._test.vibration == "none"
+        as_stated = known and not self._noisy
+        return whole and same and integers and as_stated and untouched and self._test.vibration == "none"
 
     def _template(self, state: StateFrames) -> SpotTemplate:
         assert self.shape is not None
@@ -148,6 +160,7 @@ class ChannelMeasurement:
     def search(self) -> list[Issue]:
         """Compare frames with each other, and images with the shape of the spot; what is refused."""
         issues: list[Issue] = []
+        self._show_noise()
         for number, state in enumerate(self.channel.states):
             burnt = ""
             try:
@@ -165,6 +178,24 @@ class ChannelMeasurement:
             if issues and number == 0:
                 break
         return issues
+
+    def _show_noise(self) -> None:
+        """From here on the detector has the noise of its noisiest frames, where that is more than stated."""
+        channel = self.channel
+        good = None if channel.bad is None else ~channel.bad
+        shown = []
+        for state in channel.states:
+            usable = np.isfinite(state.frames)
+            usable &= True if good is None else state.of_ccd(good)
+            frames = np.where(usable, state.frames, 0)
+            ratio = noise_ratio(frames, channel.raw_noise, usable)
+            self._noise_ratios.append(ratio)
+            shown.append(shown_noise(frames, channel.raw_noise, ratio).dark_noise_e)
+        most = max(shown)
+        if most > channel.raw_noise.dark_noise_e:
+            raw, corrected = (replace(one, dark_noise_e=most) for one in (channel.raw_noise, channel.noise))
+            self.channel = replace(channel, raw_noise=raw, noise=corrected)
+            self._noisy = True
 
     def _lost(self, state: StateFrames, error: SpotError, burnt: str = "") -> Issue:
         """Why a spot cannot be measured; where pixels are saturated, that comes first."""
@@ -256,7 +287,15 @@ class ChannelMeasurement:
                 positions, self._costs[number] = self._repaired(examined, state)
         if self._learnt and self._test.analysis.centroid == "ml":
             self._fitted.append(self._as_fitted(positions, number, state))
-        return self._on_ccd(positions, state)
+        self._widened.append(self._widening(number))
+        return self._on_ccd(widened(positions, np.array(self._widened[-1:])), state)
+
+    def _widening(self, number: int) -> float:
+        """Factor of sigma of a spot by how well its core fits; 1 where no shape was fitted."""
+        examined, first = self._examined[number], self._examined[0] if self._learnt else None
+        if examined is None or (self._learnt and number == 0):
+            return 1.0
+        return examined.fit.core_widening(None if first is None else first.fit)
 
     def _as_fitted(self, positions: SpotPositions, number: int, state: StateFrames) -> FittedSpot:
         """What the noise of a learnt shape rests on."""
@@ -274,7 +313,8 @@ class ChannelMeasurement:
             number: of the state after, from 1 on.
         """
         if self._shifts:
-            return self._shifts[number - 1].covariance[None]
+            # its noise is worked out with that of the learnt shape, and not from the positions
+            return self._shifts[number - 1].covariance[None] * max(self._widened[0], self._widened[number]) ** 2
         spread = difference_covariance(self.positions[0], self.positions[number], self.channel.noise)
         return spread + self._doubt(number)
 
@@ -333,6 +373,22 @@ class ChannelMeasurement:
         row, column = positions.row + state.offset[0], positions.column + state.offset[1]
         return replace(positions, row=row, column=column, gain_maps=gain, light_dn=light)
 
+    def _noisier(self, number: int, fit: ScreenedFit) -> float:
+        """By which factor the variance in a spot's core is more than stated, where frames have more noise beside the
+        spot: as their differences show it there, but not by more than beside it, since in the light all that flickers
+        and moves is in them, too.
+        """
+        ratio = self._noise_ratios[number]
+        if ratio is None or ratio <= 1.0:
+            return 1.0
+        frames = self.channel.states[number].frames
+        usable = np.isfinite(frames) & fit.used
+        light = fit.level - float(fit.level.min())
+        found = noise_ratio(
+            np.where(usable, frames, 0), self.channel.raw_noise, usable, light > CORE_SHARE * light.max()
+        )
+        return 1.0 if found is None else min(max(found, 1.0), ratio) ** 2
+
     def result(self) -> ChannelResult:
         """What was found."""
         spots = []
@@ -352,8 +408,10 @@ class ChannelMeasurement:
                     findings=findings,
                     cost=self._costs.get(number, 0.0),
                     core=None if fit is None else fit.core,
-                    fits=fit is None or (self._learnt and number == 0) or fit.core_fits(learnt),
-                    noise_ratio=screened.noise_ratio,
+                    fits=fit is None
+                    or (self._learnt and number == 0)
+                    or fit.core_fits(learnt, self._noisier(number, fit)),
+                    noise_ratio=self._noise_ratios[number],
                 )
             )
         return ChannelResult(self.channel, spots[0], tuple(spots[1:]))

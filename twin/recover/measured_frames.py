@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from analysis.images.image_file import ImageError, ImageFile
+from analysis.images.recording_time import recorded
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
@@ -22,6 +24,9 @@ __all__ = ["ChannelFrames", "StateFrames", "cannot_measure", "read_measurement"]
 
 Shape = tuple[int, int]
 
+MOST_GREY = 2.0**32
+"""Largest grey value, either sign: of a converter of 32 bits, beyond any that there is."""
+
 
 @dataclass(frozen=True, eq=False)
 class StateFrames:
@@ -32,12 +37,14 @@ class StateFrames:
         frames: (N, H, W) grey values as recorded.
         offset: row and column of the CCD at which they begin.
         key: where they stand in the measurement's file.
+        origin: of each file when it was recorded, and the note in it, as far as it says so.
     """
 
     files: tuple[str, ...]
     frames: np.ndarray
     offset: Shape
     key: KeyPath
+    origin: tuple[tuple[datetime | None, str], ...] = ()
 
     @property
     def shape(self) -> Shape:
@@ -154,7 +161,7 @@ def _state(test: Spec, files: tuple[str, ...], offset: Shape, key: KeyPath) -> S
     if min(frames.shape[1:]) < 24:
         text = f"{files[0]} has frames of {frames.shape[1]} x {frames.shape[2]} pixels"
         raise _told(test, key, text, "24 rows and columns or more, to measure a spot in")
-    return StateFrames(files, frames, offset, key)
+    return StateFrames(files, frames, offset, key, tuple(recorded(Path(file)) for file in files))
 
 
 def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
@@ -174,6 +181,10 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
             raise _told(test, key, str(error), "raw frames of a CCD: TIFF, FITS, 16-bit PNG") from error
         except OSError as error:
             raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
+        largest = float(np.max(np.abs(parts[-1]), where=np.isfinite(parts[-1]), initial=0.0))
+        if largest > MOST_GREY:
+            text = f"{file} has grey values up to {largest:.3g}"
+            raise _told(test, key, text, f"grey values of a converter, at most {MOST_GREY:g}")
         if parts[-1].shape[1:] != parts[0].shape[1:]:
             sizes = (" x ".join(map(str, part.shape[1:])) for part in (parts[0], parts[-1]))
             text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"

@@ -166,7 +166,8 @@ def _verdict(run: RecoverRun) -> str:
         most = round(100.0 * worst_spot.cost, 1)
         cost = f"up to {plain(most, 3)} %" if most >= 0.1 else "less than 0.1 %"
         cleaned = f"{count} of {total} sets of frames were corrected, which costs {cost} of σ by noise ({where})"
-    return one_sentence(first, limit, cleaned)
+    doubt = "" if reading.sigma_holds else "σ does not hold for this measurement: see the warnings"
+    return one_sentence(first, limit, cleaned, doubt)
 
 
 def recover_report(run: RecoverRun) -> Report:

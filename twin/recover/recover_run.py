@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from analysis.monitor.calibration import CameraCalibration, MonitorCalibration
+from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.recovery import Recovery, recover, recovery_of
@@ -30,9 +31,11 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.monitor.time_series import pieces
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
+from twin.recover.frame_origin import order_warnings, repeated_frames
 from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_measurement
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector
+from twin.sensors.grey_steps import told_of_steps
 
 __all__ = ["RecoverRun", "run_recover", "state_name"]
 
@@ -95,6 +98,11 @@ class _Bench:
     experiment: MonitorExperiment | None = None
     warnings: tuple[str, ...] = field(default=())
 
+    @property
+    def motions(self) -> Mapping[str, MotionModel] | None:
+        """Estimator -> the motions by which it reads; None where no instrument is modelled."""
+        return None if self.experiment is None else self.experiment.motion_models
+
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
         if self.experiment is None or self.disturbances is None:
             return {}
@@ -122,22 +130,29 @@ def run_recover(
     advance(CALIBRATE, 1, 1)
     count = len(setup.channels)
     channels = read_measurement(setup, bench.noise, bench.ccd, lambda done: advance(READ, done, count))
+    if issues := repeated_frames(setup.test, channels):
+        raise InputError(*issues)
     with one_blas_thread():
         results, recoveries, smoothed = _measured(setup, bench, channels, advance)
     names = tuple((camera, side) for camera, side in (name.split("/") for name in setup.channels))
     ground = None if bench.calibration is None else bench.calibration.ground
     centroid = setup.test.analysis.centroid
-    tables: Mapping[str, CameraCrosstalk] | None = None
-    readings = []
-    for k, one in enumerate(recoveries):
-        tables = bench.crosstalk(one) if tables is None else tables
-        frames = min(len(result.channel.after[k].frames) for result in results)
-        readings.append(MonitorReading(names, bench.cameras, ground, bench.disturbances, one, tables, frames, centroid))
     times = setup.test.times
     source = f"the data sheet {setup.detector.name} says"
     if setup.test.photon_transfer == "measured":
         source = "the frames in the dark and in even light say"
-    warnings = (*bench.warnings, *_unlike(results, times), *_noisy(results, times, source))
+    tables: Mapping[str, CameraCrosstalk] | None = None
+    readings: list[MonitorReading] = []
+    for k, one in enumerate(recoveries):
+        tables = bench.crosstalk(one) if tables is None else tables
+        frames = min(len(result.channel.after[k].frames) for result in results)
+        own = tuple(replace(result, after=result.after[k : k + 1]) for result in results)
+        wrong = (*_unlike(own, times, k), *_noisy(own, times, source, k))
+        told = bench.cameras, ground, bench.disturbances, one, tables, frames, centroid, wrong
+        readings.append(MonitorReading(names, *told))
+    of_frames = (*_unlike(results, times), *_noisy(results, times, source))
+    given = (*bench.warnings, *order_warnings(channels, times), *_coarse(channels, setup))
+    warnings = (*given, *of_frames, *_of_readings(readings, times), *readings[-1].unseen)
     return RecoverRun(setup, tuple(readings), results, bench.pitch, smoothed, warnings)
 
 
@@ -226,7 +241,7 @@ def _plain(
         try:
             found = recover(
                 before, after, calibration, setup.test.analysis.centroid,
-                disturbances=bench.disturbances, keep_parts=smoother is not None,
+                disturbances=bench.disturbances, keep_parts=smoother is not None, motions=bench.motions,
             )  # fmt: skip
         except SpotError as error:
             raise SpotError({piece.start * len(channels) + n: why for n, why in error.reasons.items()}) from error
@@ -251,7 +266,8 @@ def _corrected(
     for k in range(1, len(found[0].positions)):
         second = _joined([one.positions[k] for one in found])
         spread = [one.shift_covariance(k) for one in found]
-        out.append(recovery_of(first, second, np.concatenate(spread), calibration, bench.disturbances))
+        noise, stated = np.concatenate(spread), bench.disturbances
+        out.append(recovery_of(first, second, noise, calibration, stated, motions=bench.motions))
         if smoother is not None:
             before, after = zip(*(one.noise_parts(k) for one in found), strict=True)
             smoother.take(out[-1].shift, _together(before), _together(after))
@@ -308,12 +324,15 @@ def _worst(
     results: Sequence[ChannelResult],
     times: Sequence[float] | None,
     suspect: Callable[[SpotResult], tuple[float, ...] | None],
+    first: int = 0,
 ) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Of each channel with suspect spots the worst: where, and what makes it so. `suspect` gives that, largest for the
     worst, or None for nothing.
     """
     for result in results:
-        judged = ((suspect(spot), state_name(times, k)) for k, (_, spot) in enumerate(result.states()))
+        judged = (
+            (suspect(spot), state_name(times, k + first * (k > 0))) for k, (_, spot) in enumerate(result.states())
+        )
         found = [(why, state) for why, state in judged if why is not None]
         if found:
             why, state = max(found)
@@ -321,26 +340,62 @@ def _worst(
             yield f"{result.channel.name} {state}{others}", why
 
 
-def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None) -> tuple[str, ...]:
-    """Spots whose core is not as calibrated; of a series the worst of each channel."""
+def _of_readings(readings: Sequence[MonitorReading], times: Sequence[float] | None) -> tuple[str, ...]:
+    """Why sigma does not hold, beside what was found in the frames, and what was worked out anew; of a series the
+    first state of each.
+    """
+    told: dict[str, list[str]] = {}
+    for k, reading in enumerate(readings):
+        for text in (*reading.doubts, *reading.notes):
+            if text not in reading.found_wrong:
+                # the same words about other numbers are one warning
+                told.setdefault(text.partition(":")[0], []).append(f"{state_name(times, k + 1)}: {text}")
+    return tuple(same[0] if len(same) == 1 else f"{same[0]} (first of {len(same)} states)" for same in told.values())
+
+
+def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, first: int = 0) -> tuple[str, ...]:
+    """Spots whose core is not as calibrated; of a series the worst of each channel; `first` is the number of the first
+    state after that there is.
+    """
     return tuple(
         f"{where}: the spot has not the calibrated shape, reduced chi-square of its"
         f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
         " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
-        for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core)
+        for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core, first)
     )
 
 
-def _noisy(results: Sequence[ChannelResult], times: Sequence[float] | None, source: str) -> tuple[str, ...]:
-    """Frames that have another noise than is stated; of a series the worst of each channel."""
+def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
+    """Of CCDs whose noise does not spread over the steps of their grey values, by data sheet or as measured."""
+    if setup.test.photon_transfer == "stated":
+        return told_of_steps(channels[0].raw_noise, f"area CCD {setup.detector.name}")
+    whose = f"area CCD {setup.detector.name}, as measured,"
+    return tuple(text for one in channels for text in told_of_steps(one.raw_noise, f"{one.name}: {whose}"))
+
+
+def _why(ratio: float) -> str:
+    """What may be the cause of another noise than stated, and what becomes of it."""
+    if ratio > 1.0:
+        return (
+            "another gain or read-out, or interference; σ of noise and the search for defects take what is more for"
+            " read noise, and rest on the stated gain"
+        )
+    return (
+        "another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and the search for"
+        " defects rest on the stated noise"
+    )
+
+
+def _noisy(
+    results: Sequence[ChannelResult], times: Sequence[float] | None, source: str, first: int = 0
+) -> tuple[str, ...]:
+    """Frames that have another noise than is stated; of a series the worst of each channel; `first` as there."""
 
     def apart(spot: SpotResult) -> tuple[float, ...] | None:
         return None if spot.noise_ratio is None else (abs(math.log(spot.noise_ratio)), spot.noise_ratio)
 
     return tuple(
-        f"{where}: beside the spot the frames are {ratio:.2f} times as noisy as"
-        f" {source}: another gain or read-out, or frames that were averaged, smoothed or compressed; σ of noise and"
-        " the search for defects rest on it: name the right `detector`, or measure it with dark and flat frames"
-        " and `photon_transfer: measured`"
-        for where, (_, ratio) in _worst(results, times, apart)
+        f"{where}: beside the spot the frames are {ratio:.2f} times as noisy as {source}: {_why(ratio)}: name the right"
+        " `detector`, or measure it with dark and flat frames and `photon_transfer: measured`"
+        for where, (_, ratio) in _worst(results, times, apart, first)
     )

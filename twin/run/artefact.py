@@ -92,6 +92,18 @@ _SVG_NAMESPACE = 'xmlns="http://www.w3.org/2000/svg"'
 Cell = str | float | int | None
 
 
+class OwnDecimals(float):
+    """A number of a table that is shown with decimals of its own, as in a column whose rows have different units."""
+
+    def __new__(cls, value: float, decimals: int) -> OwnDecimals:
+        """The number ``value``, shown with so many decimals."""
+        made = super().__new__(cls, value)
+        made.decimals = decimals
+        return made
+
+    decimals: int
+
+
 @dataclass(frozen=True, eq=False)
 class Artefact:
     """Something to show beside the checks.
@@ -190,6 +202,8 @@ class Table(Artefact):
         ]
 
     def _text(self, value: float, place: int | None) -> str:
+        if isinstance(value, OwnDecimals):
+            return fixed(value, value.decimals)
         return significant(value, self.digits, floor=0.0) if place is None else fixed(value, place)
 
     @property
@@ -224,6 +238,31 @@ class Data(Artefact):
     def content(self) -> bytes:
         """The data; NaN and infinities are refused."""
         return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Undrawn(Artefact):
+    """A note in the place of a figure that could not be drawn.
+
+    Attributes:
+        why: the error.
+    """
+
+    why: str
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "txt"
+
+    def content(self) -> bytes:
+        """The note."""
+        return f"{self.note}\n".encode()
+
+    @property
+    def note(self) -> str:
+        """What is missing, and why."""
+        return f"the figure {self.title!r} could not be drawn: {self.why}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -210,30 +210,3 @@ def print_place(console: Console, target: Path) -> None:
 def print_verdict(console: Console, verdict: str) -> None:
     """The sentence that a result begins with."""
     console.print(verdict, style="bold", markup=False, highlight=False, soft_wrap=True)
-
-
-def ending_signals() -> tuple[signal.Signals, ...]:
-    """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
-    asked = (signal.SIGTERM, signal.SIGHUP)
-    return tuple(number for number in asked if signal.getsignal(number) != signal.SIG_IGN)
-
-
-@contextmanager
-def exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the program as an exception, so that a half-written run folder is removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    got: list[int] = []
-
-    def leave(number: int, frame: object) -> None:
-        if not got:  # a second one must not break off the clearing up
-            got.append(number)
-            raise SystemExit(128 + number)
-
-    before = {number: signal.signal(number, leave) for number in ending_signals()}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,6 @@ from twin.run.cli import (
     Seed,
     Standing,
     check_backend,
-    exit_on_terminate,
     explained,
     print_place,
     print_verdict,
@@ -37,9 +37,11 @@ from twin.run.cli import (
     progress_columns,
     result_table,
 )
+from twin.run.ending_signals import exit_on_terminate
 from twin.run.procedure import Advance, Procedure, Run
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
+from twin.run.versions import program_digest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -118,6 +120,7 @@ def run_command(
         folder = RunFolder(chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
+        program_digest()  # of the files that compute, which may be others when the run ends
         silent, standing = options.as_json or options.quiet, Standing()
         hidden = silent or not errors.is_terminal
         with (
@@ -231,7 +234,7 @@ def run_test(
 
     def work(setup: Any, session: Session) -> Result:
         from twin.run.page import RunFacts, write_test
-        from twin.run.report import with_warnings
+        from twin.run.report import numbers_only, with_warnings
 
         procedure, report = load()
         # a folder that cannot be made is told before the run
@@ -244,13 +247,21 @@ def run_test(
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
                 write_manifest(folder, program, session.started, session.seconds, **said)
-        shown = with_warnings(report(run), given)
+        try:
+            made, problem = report(run), ""
+        except Exception as error:  # minutes or hours of computing are not thrown away for a figure
+            problem = "the report could not be made"
+            made = numbers_only(f"{program} {command}", f"{procedure.kind}.json", error)
+            Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
+        shown = with_warnings(made, given)
         numbers = {**procedure.numbers(run), "verdict": shown.verdict}
-        config, name = setup.with_seed(number).to_yaml(), session.backend.name
+        seeded, name = setup.with_seed(number), session.backend.name
         drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
-        facts = RunFacts(config, str(file), name, drawn, session.started, session.seconds, program, command)
+        times = session.started, session.seconds
+        facts = RunFacts(seeded.to_yaml(), str(file), name, drawn, *times, program, command, named=seeded.plain())
         write_test(procedure.kind, numbers, shown, facts, session.folder)
-        return Result(described(procedure.kind, numbers), lambda console: print_report(shown, console), code=shown.code)
+        told = described(procedure.kind, numbers)
+        return Result(told, lambda console: print_report(shown, console), problem, shown.code)
 
     run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
 

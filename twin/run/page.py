@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, plain, significant
+from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, Undrawn, plain, significant
 from twin.run.data_files import FrameFacts, frame_files
 from twin.run.further_sections import further_sections
+from twin.run.page_policy import page_policy
+from twin.run.provenance import SelfCheck, checks_in, inputs_in
 from twin.run.reference_frames import described
 from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
@@ -25,12 +29,14 @@ SHARED = "twin.run"
 def environment(package: str) -> Environment:
     """Environment that finds the templates of ``package`` and the shared ones."""
     loader = FileSystemLoader([str(files(package)), str(files(SHARED))])
-    return Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    out = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    out.globals["page_policy"] = page_policy
+    return out
 
 
-def reproduce(*words: str) -> str:
-    """The command that makes a run again from its own folder: program, subcommand and options, empty ones left out."""
-    return " ".join(["python -m", *filter(None, words), "--out again"])
+def reproduce(words: Sequence[str]) -> str:
+    """The command line of a program, its subcommand and options that makes a run again, as one types it."""
+    return f"python -m {shlex.join(words)} --out again"
 
 
 def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
@@ -55,6 +61,8 @@ def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
         texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
         out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
         out["csv"] = artefact.address
+    elif isinstance(artefact, Undrawn):
+        out["caption"] = f"{artefact.note[0].upper()}{artefact.note[1:]}."
     elif not isinstance(artefact, Data):
         raise TypeError(f"the report cannot show {type(artefact).__name__}")
     return out
@@ -85,7 +93,11 @@ class RunFacts:
         seconds: that it took.
         program: that ran it, as the user calls it.
         command: its subcommand.
-        again: the command that runs it again, where it is not the test with the run's own config.yaml.
+        again: words of the command that runs it again, program first, where it is not the test with the run's own
+            config.yaml.
+        named: plain data in which files stand that the run read, by their absolute paths.
+        given: further files and folders that it read, as the user gave them.
+        checks: what it checked of itself beside what stands in its numbers.
     """
 
     config: str
@@ -96,7 +108,29 @@ class RunFacts:
     seconds: float
     program: str
     command: str
-    again: str = ""
+    again: tuple[str, ...] = ()
+    named: Any = None
+    given: tuple[Path, ...] = ()
+    checks: tuple[SelfCheck, ...] = ()
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Of the command that makes the run again in its folder."""
+        if self.again:
+            return self.again
+        seed = () if self.seed is None else ("--seed", str(self.seed))
+        command = (self.command,) if self.command else ()
+        return (self.program, *command, "config.yaml", *seed, "--backend", self.backend)
+
+    def kept(self, numbers: Mapping[str, Any]) -> dict[str, Any]:
+        """What a manifest says of it: how to make it again, what was read, what it checked of itself.
+
+        Args:
+            numbers: of the run.
+        """
+        place = {"started_in": str(Path.cwd())} if self.given else {}
+        checks = [check.to_dict() for check in self.checks or checks_in(numbers)]
+        return {"again": list(self.words), **place, "inputs": inputs_in(self.named, self.given), "checks": checks}
 
 
 def place(artefact: Artefact) -> str:
@@ -125,8 +159,6 @@ def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     """``report.html`` as text; its numbers are in KIND.json."""
-    seed = "" if facts.seed is None else f"--seed {facts.seed}"
-    options = f"{seed} --backend {facts.backend}".strip()
     return (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -139,7 +171,7 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
             summary=artefact_content(report.summary, place(report.summary)),
             sections=section_contents(report.sections),
             facts=facts,
-            command=facts.again or reproduce(facts.program, facts.command, "config.yaml", options),
+            command=reproduce(facts.words),
             versions=versions(),
         )
     )
@@ -164,4 +196,4 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
     entries = {"test": kind, "backend": facts.backend, "seed": facts.seed or 0, "warnings": list(report.warnings)}
-    write_manifest(folder, facts.program, facts.started, facts.seconds, **entries)
+    write_manifest(folder, facts.program, facts.started, facts.seconds, **entries, **facts.kept(numbers))

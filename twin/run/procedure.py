@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
@@ -19,7 +20,7 @@ def silent(part: str, done: int, total: int) -> None:
     """An ``Advance`` that tells nobody."""
 
 
-class BenchError(Exception):
+class BenchError(PhysicalError):
     """The test failed on the bench: what happened, which key of its file is to be changed, and how.
 
     Attributes:

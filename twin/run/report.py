@@ -77,6 +77,20 @@ class Report:
             raise ValueError(f"more than one artefact is called {', '.join(twice)}")
 
 
+def numbers_only(title: str, file: str, error: Exception) -> Report:
+    """What stands in the place of a report that could not be made: the numbers are in their file all the same.
+
+    Args:
+        title: of the report.
+        file: with the numbers.
+        error: why there is no more.
+    """
+    why = f"the report could not be made: {type(error).__name__}: {' '.join(str(error).split())}"
+    caption = "What was computed, with all digits."
+    summary = Table("files", "Numbers", caption, ("file",), [[file]])
+    return Report(title, f"The report could not be made, the numbers stand in {file}.", (), (), summary, (), {}, (why,))
+
+
 def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
     """The report with further warnings before its own."""
     return replace(report, warnings=(*given, *report.warnings))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -16,14 +15,14 @@ from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from twin.run.unfinished import OLD, PARTIAL, Unfinished, sweep
+from twin.run.durable import make_folders, put_in_place, sync_folder, sync_tree
+from twin.run.ending_signals import ending_later
+from twin.run.owned_files import MANIFEST as MANIFEST
+from twin.run.owned_files import digest, every_file, foreign_files, remove_files
+from twin.run.provenance import Checksum, Provenance
+from twin.run.unfinished import OLD, PARTIAL, Unfinished, successor, sweep
 from twin.run.versions import versions
 
-MANIFEST = "manifest.json"
-STUDY_STATE = "study_state.json"
-"""Says which study a folder belongs to, from the beginning; the manifest is written at the end."""
-STUDY_LOCK = ".lock"
-"""File in the folder of a study that its command holds locked."""
 NAMED = 5
 """Files that a message names at most."""
 
@@ -52,7 +51,7 @@ class Numbered:
         """
         for number in range(1, 1_000_000):
             candidate = self.folder / f"{self.stem}-{number:03d}"
-            if not (candidate.exists() or candidate.is_symlink()):
+            if not (candidate.exists() or candidate.is_symlink() or successor(candidate).exists()):
                 return candidate
         raise RunFolderError(f"no free name {self.stem}-NNN in {self.folder}; choose one with --out")
 
@@ -71,8 +70,8 @@ class RunFolder:
     Args:
         target: where the folder shall stand. Of several runs that start together with the same ``Numbered``, each gets
             a number of its own when it is complete.
-        force: replace an existing run folder. Only a folder that is empty, or of which a run's manifest lists every
-            file, is ever replaced.
+        force: replace an existing run folder, which stands until this one is complete. Only a folder that is empty, or
+            of which a run's manifest lists every file as it is, is ever replaced.
 
     Raises:
         RunFolderError: the target exists, or cannot be written.
@@ -88,7 +87,7 @@ class RunFolder:
         try:
             self._check_target()
         except OSError as error:
-            raise RunFolderError(f"cannot look at the output folder {self.target}: {_reason(error)}") from error
+            raise RunFolderError(f"cannot look at the output folder {self.target}: {reason(error)}") from error
 
     def _check_target(self) -> None:
         target = self.target
@@ -112,7 +111,7 @@ class RunFolder:
     def __enter__(self) -> RunFolder:
         """Make the temporary folder."""
         try:
-            self._make_parents()
+            self._made_parents = make_folders(self.target.parent)
             sweep(self.target.parent, remove_replaced)
             if self._numbered is None:
                 self._check_target()  # what a killed run had put aside may stand there again
@@ -121,7 +120,7 @@ class RunFolder:
             self.path.mkdir()
         except OSError as error:
             self._remove()
-            raise RunFolderError(f"cannot make the output folder {self.target}: {_reason(error)}") from error
+            raise RunFolderError(f"cannot make the output folder {self.target}: {reason(error)}") from error
         except BaseException:
             self._remove()
             raise
@@ -138,21 +137,14 @@ class RunFolder:
             except OSError as failure:
                 self._remove()
                 raise RunFolderError(
-                    f"cannot put the output folder {self.target} in place: {_reason(failure)}"
+                    f"cannot put the output folder {self.target} in place: {reason(failure)}"
                 ) from failure
             except BaseException:
                 self._remove()
                 raise
         self._remove()
         if isinstance(error, OSError):
-            raise RunFolderError(f"cannot write to {self.target}: {_reason(error)}; nothing was kept") from error
-
-    def _make_parents(self) -> None:
-        """Make the folders above the target, and remember which of them were not there."""
-        missing = [parent for parent in self.target.parents if not parent.exists()]
-        for parent in reversed(missing):
-            parent.mkdir(exist_ok=True)
-            self._made_parents.insert(0, parent)
+            raise RunFolderError(f"cannot write to {self.target}: {reason(error)}; nothing was kept") from error
 
     def _remove(self) -> None:
         """Take back everything that was made."""
@@ -167,23 +159,22 @@ class RunFolder:
 
     def _publish(self) -> None:
         assert self._unfinished is not None
-        if self.force and self.target.exists():
-            old = self._unfinished.path(OLD)
-            os.rename(self.target, old)
-            try:
-                os.rename(self.path, self.target)
-            except BaseException:
-                os.rename(old, self.target)
-                raise
-            remove_run(old, self.target)
-        else:
-            self._claim()
-            try:
-                os.rename(self.path, self.target)
-            except BaseException:
-                self.target.rmdir()
-                raise
-        self._unfinished.close()
+        sync_tree(self.path)
+        with ending_later():
+            if self.force and self.target.exists():
+                old = self._unfinished.path(OLD)
+                put_in_place(self.path, self.target, old)
+                with suppress(OSError):  # the next run beside it tries again
+                    remove_run(old, self.target)
+            else:
+                self._claim()
+                try:
+                    os.rename(self.path, self.target)
+                except BaseException:
+                    self.target.rmdir()
+                    raise
+                sync_folder(self.target.parent)
+            self._unfinished.close()
 
     def _claim(self) -> None:
         """Take the target's name with an empty folder, which the rename replaces; only one process can make it."""
@@ -198,7 +189,7 @@ class RunFolder:
 
     def write_json(self, name: str, data: Any) -> None:
         """Write a JSON file; NaN and infinities are refused, since JSON has none."""
-        self.write_text(name, json.dumps(data, indent=2, allow_nan=False) + "\n")
+        self.write_text(name, json_text(data))
 
     def write_text(self, name: str, text: str) -> None:
         """Write a UTF-8 text file."""
@@ -223,8 +214,13 @@ class RunFolder:
         out = {}
         for file in sorted(self.path.rglob("*")):
             if file.is_file():
-                out[file.relative_to(self.path).as_posix()] = hashlib.sha256(file.read_bytes()).hexdigest()
+                out[file.relative_to(self.path).as_posix()] = digest(file)
         return out
+
+
+def json_text(data: Any) -> str:
+    """The text of a JSON file, as every command writes it."""
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
 def _inside(name: str) -> str:
@@ -243,7 +239,11 @@ class Manifest(BaseModel):
         program: that made the folder, ``twin.render``.
         test: kind of the test, ``focus``.
         gradient: the run differentiates a study.
+        again: words of the command, without ``python -m``, that makes the run again from its own folder; none where no
+            command can.
+        started_in: absolute path of the folder where it was typed, if words of it are relative to that.
         versions: of the twin and of what it uses.
+        provenance: source, processor and linear algebra that made it.
         backend: where it was traced.
         seed: of all that was drawn.
         only, fast: the checks that were chosen, None for all; whether with fewer trials.
@@ -254,7 +254,11 @@ class Manifest(BaseModel):
         workers: processes.
         worst_relative: largest relative deviation of derivatives from differences, None where none was compared.
         warnings: what the user was told.
-        sha256: checksum of every file of the run but this one.
+        checks: what the run checked of itself, as of `twin.run.provenance.SelfCheck`.
+        inputs: absolute path of every file that the run read and that is not in its folder -> checksum.
+        sha256: checksum of every file of the run but this one, by its path in the folder. A study's chunks are not
+            among them: they have theirs in their index.
+        digest: checksum of all else that stands here, see `seal`.
     """
 
     model_config = ConfigDict(extra="allow", strict=True, frozen=True)
@@ -262,7 +266,10 @@ class Manifest(BaseModel):
     program: Annotated[str, Field(pattern=r"^twin\.[a-z_]+$")]
     test: str = ""
     gradient: bool = False
+    again: list[str] = []
+    started_in: str = ""
     versions: Annotated[dict[str, str], AfterValidator(lambda found: _ours(found))]
+    provenance: Provenance | None = None
     backend: str = ""
     seed: int = 0
     only: str | None = None
@@ -275,7 +282,10 @@ class Manifest(BaseModel):
     workers: int = 0
     worst_relative: float | None = None
     warnings: list[str] = []
-    sha256: dict[Annotated[str, AfterValidator(_inside)], Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
+    checks: list[dict[str, Any]] = []
+    inputs: dict[str, Checksum] = {}
+    sha256: dict[Annotated[str, AfterValidator(_inside)], Checksum]
+    digest: Checksum | None = None
 
 
 def _ours(found: dict[str, str]) -> dict[str, str]:
@@ -311,13 +321,38 @@ def write_manifest(folder: FilesOfRun, program: str, started: float, seconds: fl
         **facts,
         "program": program,
         "versions": versions(),
+        "provenance": Provenance.here().model_dump(),
         "started_unix_s": started,
         "wall_time_s": seconds,
         "sha256": folder.checksums(),
     }
     if unknown := sorted(entries.keys() - Manifest.model_fields.keys()):
         raise ValueError(f"no fact of a manifest: {', '.join(unknown)}")
-    folder.write_json(MANIFEST, {key: entries[key] for key in Manifest.model_fields if key in entries})
+    told = {key: entries[key] for key in Manifest.model_fields if key in entries}
+    folder.write_json(MANIFEST, {**told, "digest": seal(told)})
+
+
+def seal(told: Mapping[str, Any]) -> str:
+    """SHA-256 of what a manifest says but for its ``digest``: of its JSON with sorted keys and without blanks."""
+    content = {key: value for key, value in told.items() if key != "digest"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def altered(folder: Path, manifest: Manifest) -> list[str]:
+    """Files of a run that are not as it wrote them: other bytes, gone, or a link or folder in their place.
+
+    Args:
+        folder: of the run.
+        manifest: of it.
+
+    Raises:
+        OSError: one cannot be read.
+    """
+    return [name for name, known in manifest.sha256.items() if not _is_as_written(folder / name, known)]
+
+
+def _is_as_written(place: Path, known: str) -> bool:
+    return place.is_file() and not place.is_symlink() and digest(place) == known
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -333,48 +368,26 @@ def is_run_folder(folder: Path) -> bool:
     return read_manifest(folder) is not None
 
 
-def every_file(folder: Path) -> list[str]:
-    """Paths of all that stands in a folder and is not a folder itself, relative to it, in order."""
-    out = []
-    for place, folders, files in os.walk(folder):
-        names = [*files, *(name for name in folders if os.path.islink(os.path.join(place, name)))]
-        out += [(Path(place) / name).relative_to(folder).as_posix() for name in names]
-    return sorted(out)
-
-
 def unlisted(folder: Path) -> list[str] | None:
-    """Files in the folder of a run or study that it did not write; None when it is the folder of neither."""
-    manifest, study = read_manifest(folder), _is_study(folder)
-    if manifest is None and not study:
-        return None
-    own = {MANIFEST, *manifest.sha256} if manifest is not None else set()
-    return [name for name in every_file(folder) if not (name in own or (study and _OF_STUDIES.fullmatch(name)))]
-
-
-_OF_STUDIES = re.compile(
-    "|".join(map(re.escape, (STUDY_STATE, STUDY_LOCK, "config.yaml", "report.html", "chunks/index.txt")))
-    + r"|study\.(nc|csv|parquet|json)|chunks/[0-9]+\.npz(\.corrupt)?|(chunks/)?\.[a-z0-9_.]+\.partial"
-)
-"""What a study writes into its folder, finished or not."""
-
-
-def _is_study(folder: Path) -> bool:
-    try:
-        state = json.loads((folder / STUDY_STATE).read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(state, dict) and state.get("program") == "twin.study" and "fingerprint" in state
+    """Files in the folder of a run or study that it did not write, or not like this; None when it is the folder of
+    neither. Raises OSError.
+    """
+    manifest = read_manifest(folder)
+    return foreign_files(folder, None if manifest is None else manifest.sha256)
 
 
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
-    """Refuse to replace a folder with files in it that no run put there.
+    """Refuse to replace a folder with files in it that no run put there, or that were changed since.
 
     Raises:
         RunFolderError: there are some.
     """
     if not others:
         return
-    named = ", ".join(others[:NAMED]) + (f" and {len(others) - NAMED} more" if len(others) > NAMED else "")
+    manifest = read_manifest(folder)
+    changed = set(manifest.sha256 if manifest is not None else ())
+    shown = [f"{name} (changed since)" if name in changed else name for name in others[:NAMED]]
+    named = ", ".join(shown) + (f" and {len(others) - NAMED} more" if len(others) > NAMED else "")
     raise RunFolderError(
         f"output folder {folder} also holds what the run did not write: {named}; --force removes only the run's own "
         "files, so move these away or choose another folder with --out"
@@ -382,7 +395,7 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
 
 
 def remove_run(old: Path, new: Path) -> None:
-    """Remove the replaced folder of a run; files that were put into it meanwhile move to the new one.
+    """Remove the replaced folder of a run; files that were put into it or changed meanwhile move to the new one.
 
     Args:
         old: the replaced folder, under another name.
@@ -395,17 +408,7 @@ def remove_run(old: Path, new: Path) -> None:
             place = place.with_name(f"{place.name}.kept")
         place.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(place)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def remove_study(folder: Path) -> None:
-    """Remove a study's files from its folder, and the folder if that was all."""
-    for name in every_file(folder):
-        if _OF_STUDIES.fullmatch(name):
-            (folder / name).unlink(missing_ok=True)
-    for place, _, _ in os.walk(folder, topdown=False):
-        with suppress(OSError):  # somebody else has put something there
-            os.rmdir(place)
+    remove_files(old, set())
 
 
 def remove_replaced(old: Path, new: Path) -> bool:
@@ -416,6 +419,6 @@ def remove_replaced(old: Path, new: Path) -> bool:
     return True
 
 
-def _reason(error: OSError) -> str:
-    """In a few words; HDF5 puts a page into strerror."""
+def reason(error: OSError) -> str:
+    """Why a file cannot be, in a few words; HDF5 puts a page into strerror."""
     return os.strerror(error.errno) if error.errno else str(error)

@@ -87,8 +87,12 @@ def look(name: str) -> AbstractContextManager[None]:
 
 def to_svg(figure: Figure) -> str:
     """The figure as an <svg> element that can stand in an HTML page."""
+    import matplotlib
+
     text = StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    # without a salt Matplotlib draws lots for the identifiers
+    with matplotlib.rc_context({"svg.hashsalt": matplotlib.rcParams["svg.hashsalt"] or "figure"}):
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     svg = text.getvalue()
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)

@@ -2,7 +2,8 @@
 
 They are ``.NAME.TOKEN.partial`` (a run that is being written), ``.NAME.TOKEN.old`` (what it replaces) and
 ``.NAME.TOKEN.lock``, which the process holds locked as long as it lives. The lock is the operating system's and ends
-with the process, however that ends; so a name without a held lock is nobody's.
+with the process, however that ends; so a name without a held lock is nobody's. A study that is to replace a folder, and
+can be resumed, grows in ``.NAME.next`` (`successor`).
 """
 
 from __future__ import annotations
@@ -12,13 +13,25 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Callable
+import stat
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
+
+from twin.run.owned_files import MANIFEST
 
 PARTIAL, OLD, LOCK = "partial", "old", "lock"
 
 _NAME = re.compile(rf"\.(?P<name>.+)\.(?P<token>[0-9a-f]{{8}})\.(?:{PARTIAL}|{OLD}|{LOCK})")
+
+
+def successor(target: Path) -> Path:
+    """Where a study grows that is to take the place of ``target``; whoever resumes it finds it there. It is nobody's to
+    clear away, for hours of work may be in it.
+    """
+    return target.with_name(f".{target.name}.next")
 
 
 class Unfinished:
@@ -58,6 +71,53 @@ class Unfinished:
         self._lock.close()
 
 
+@contextmanager
+def scratch(stem: str) -> Iterator[Path]:
+    """A folder of this user alone for what ends with the block, where the system has such. What killed processes left
+    of theirs under this name goes first; what belongs to a live one, or to somebody else, is not touched.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    above = Path(tempfile.gettempdir())
+    for left in above.glob(f"{stem}-*.{LOCK}"):
+        with suppress(OSError):  # somebody else's, or gone meanwhile
+            _clear_scratch(left)
+    while True:
+        folder = above / f"{stem}-{secrets.token_hex(8)}"
+        place = _lock_of(folder)
+        lock = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        # whoever clears up between these lines takes the file for one that a killed process left
+        if _take(lock) is not False and place.exists():
+            break
+        os.close(lock)
+    try:
+        folder.mkdir(mode=0o700)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        place.unlink(missing_ok=True)
+        os.close(lock)
+
+
+def _lock_of(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.{LOCK}")
+
+
+def _clear_scratch(place: Path) -> None:
+    """Remove a folder of `scratch` whose lock nobody holds. Raises OSError."""
+    lock = os.open(place, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        about, folder = os.fstat(lock), place.with_suffix("")
+        if about.st_uid != os.getuid() or not stat.S_ISREG(about.st_mode) or not _take(lock):
+            return
+        if folder.is_dir() and not folder.is_symlink() and folder.lstat().st_uid == os.getuid():
+            shutil.rmtree(folder)
+        place.unlink(missing_ok=True)
+    finally:
+        os.close(lock)
+
+
 def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
     """Clear away what dead processes left in ``folder``; what belongs to a live one is not touched.
 
@@ -92,7 +152,11 @@ def sweep(folder: Path, replaced: Callable[[Path, Path], bool]) -> None:
 
 def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path], bool]) -> None:
     if places[PARTIAL].is_dir() and not places[PARTIAL].is_symlink():
-        shutil.rmtree(places[PARTIAL])
+        if (places[PARTIAL] / MANIFEST).exists() and target.exists() and not places[OLD].exists():
+            # complete: it has changed places with the target, or was about to
+            places[PARTIAL].rename(places[OLD])
+        else:
+            shutil.rmtree(places[PARTIAL])
     if places[OLD].is_dir() and not places[OLD].is_symlink():
         if not (target.exists() or target.is_symlink()):
             places[OLD].rename(target)
@@ -101,7 +165,7 @@ def _clear(target: Path, places: dict[str, Path], replaced: Callable[[Path, Path
     places[LOCK].unlink(missing_ok=True)
 
 
-def _take(lock: TextIO) -> bool | None:
+def _take(lock: TextIO | int) -> bool | None:
     """Lock a file: True, False when another process has it, None where the file system has no locks."""
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

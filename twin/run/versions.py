@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import platform
+import re
 from functools import cache
 from pathlib import Path
 
@@ -23,17 +24,39 @@ PACKAGES = (
     "trimesh",
     "karellen-llvm-core",
 )
+"""Those whose numbers results depend on."""
 
 
 def versions() -> dict[str, str]:
     """Python's and the packages' versions; ``not installed`` where there is none."""
-    out = {"python": platform.python_version()}
-    for package in PACKAGES:
-        try:
-            out[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            out[package] = "not installed"
-    return out
+    return {
+        "python": platform.python_version(),
+        **{package: _version(package) or "not installed" for package in PACKAGES},
+    }
+
+
+@cache
+def other_packages() -> dict[str, str]:
+    """Versions of the packages that the program asks for beside PACKAGES: they read, write and draw, and no number
+    depends on them.
+    """
+    try:
+        asked = importlib.metadata.requires(PACKAGES[0]) or []
+    except importlib.metadata.PackageNotFoundError:
+        return {}
+    named = (_PACKAGE.match(line) for line in asked if "extra ==" not in line)
+    names = sorted({found[0] for found in named if found is not None} - set(PACKAGES))
+    return {name: version for name in names if (version := _version(name)) is not None}
+
+
+_PACKAGE = re.compile(r"[A-Za-z0-9._-]+")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -61,3 +84,20 @@ def sources() -> dict[str, str]:
 def source_digest() -> str:
     """One checksum for all of ``sources``."""
     return hashlib.sha256(json.dumps(sources(), sort_keys=True).encode()).hexdigest()
+
+
+ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".py", ".svg", ".txt", ".yaml")
+"""Of the packages' own files, as a wheel holds them."""
+
+
+@cache
+def program_digest() -> str:
+    """One SHA-256 for every file of the program as this process found them first: code, library, templates; the same
+    for a source tree and for what was installed from it.
+    """
+    every = {}
+    for package in SOURCES:
+        for path in sorted((ROOT / package).rglob("*")):
+            if path.suffix in ENDINGS and path.is_file():
+                every[path.relative_to(ROOT).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return hashlib.sha256(json.dumps(every, sort_keys=True).encode()).hexdigest()

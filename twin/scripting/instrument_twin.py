@@ -17,6 +17,7 @@ from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import CENTROIDS, recover
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
 from scenes.specs.load import load_camera as read_camera
@@ -24,6 +25,7 @@ from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import spot_jacobian
@@ -33,6 +35,7 @@ from twin.run.reference_frames import frames_text
 from twin.scripting.motion_names import motion_named
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
+from twin.sensors.grey_steps import coarse_warnings
 
 if TYPE_CHECKING:
     from twin.camera.camera_view import CameraView
@@ -209,8 +212,20 @@ class InstrumentTwin:
         first = as_frames(before, "before", keys, path.shape)
         second = as_frames(after, "after", keys, path.shape)
         stated = experiment.disturbances
-        recovery = recover(first, second[None], experiment.calibration, method, disturbances=stated)
-        return found_table(recovery, list(self.cameras), keys, "" if stated is None else stated.name)
+        again = experiment.motion_models
+        recovery = recover(first, second[None], experiment.calibration, method, disturbances=stated, motions=again)
+        reading = MonitorReading(
+            channels=tuple((channel.camera, channel.side) for channel in path.channels),
+            cameras=experiment.cameras,
+            ground=experiment.ground,
+            disturbances=stated,
+            recovery=recovery,
+            crosstalk={},
+            frames=second.shape[1],
+            centroid=method,
+        )
+        given = (*blur_warnings(self.resolved, self._bench.backend), *coarse_warnings(self.resolved))
+        return found_table(reading, given)
 
     def jacobian(self, motions: Sequence[str]) -> xr.Dataset:
         """Exact derivatives by elementary motions, about the unperturbed instrument.

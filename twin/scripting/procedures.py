@@ -105,8 +105,9 @@ def perform(
     started, clock = time.time(), time.monotonic()
     run, given = procedure.performed(setup, load_backend(backend), number)
     program, command = name.split()
-    config = setup.with_seed(number).to_yaml()
-    facts = RunFacts(config, str(file), backend, number, started, time.monotonic() - clock, f"twin.{program}", command)
+    seeded, seconds = setup.with_seed(number), time.monotonic() - clock
+    told = (seeded.to_yaml(), str(file), backend, number, started, seconds, f"twin.{program}", command)
+    facts = RunFacts(*told, named=seeded.plain())
     shown = with_warnings(report(run), given)
     numbers = {**procedure.numbers(run), "verdict": shown.verdict}
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)

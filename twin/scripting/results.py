@@ -16,8 +16,9 @@ import xarray as xr
 from analysis.monitor.estimators import judged
 from analysis.monitor.ground_error import AXES
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import Recovery
 from optics.numerics.backend import Backend
+from twin.main_job.assumptions import contradicted
+from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge
@@ -112,6 +113,11 @@ class Found:
         ground: of two cameras of known altitude, ``along_m``, ``across_m``, ``height_m`` with their sigmas, likewise.
         disturbances: name of what is stated to move, on which the total sigmas rest; empty for nothing.
         spots: ``before`` and ``after`` (channel, axis), px, with ``before_sigma`` and ``after_sigma``.
+        sigma_holds: whether nothing that was measured contradicts the sigmas.
+        warnings: why they do not, and what else one should know before using the numbers.
+        from_statement: share of the ``posterior``'s variance of each reading that no spot constrains: that part of
+            sigma is from the statement, not from the spots; (row) with levels camera and parameter, empty where
+            nothing is stated.
     """
 
     values: xr.DataArray
@@ -121,6 +127,9 @@ class Found:
     ground: xr.Dataset
     spots: xr.Dataset
     disturbances: str
+    sigma_holds: bool = True
+    warnings: tuple[str, ...] = ()
+    from_statement: pd.Series = field(default_factory=lambda: pd.Series(dtype=float))
 
     @property
     def sigma(self) -> xr.DataArray:
@@ -178,10 +187,12 @@ class Found:
         return {"true": true, **own, **told}
 
     def _repr_html_(self) -> str:
-        return reading_frame(self).to_html(escape=True)
+        notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
+        return notes + reading_frame(self).to_html(escape=True)
 
     def __repr__(self) -> str:
-        return reading_frame(self).to_string()
+        notes = "".join(f"\nwarning: {text}" for text in self.warnings)
+        return reading_frame(self).to_string() + notes
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
@@ -251,15 +262,22 @@ def _truth(run: RenderRun) -> xr.Dataset:
     return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
 
 
-def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[str], disturbances: str = "") -> Found:
-    """What a script sees of the recovery of one state.
+def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
+    """What a script sees of the reading of one state.
 
     Args:
-        recovery: of it.
-        cameras: their names.
-        channels: names of the monitor's channels.
-        disturbances: name of what is stated to move, empty for nothing.
+        reading: of it.
+        warnings: of the instrument; those of the reading are added.
     """
+    recovery, cameras = reading.recovery, list(reading.cameras)
+    channels = [f"{camera}/{side}" for camera, side in reading.channels]
+    disturbances = "" if reading.disturbances is None else reading.disturbances.name
+    contradiction = contradicted(reading.disturbances, reading.consistency)
+    told = (*warnings, *reading.doubts, *reading.notes, *contradiction, *reading.unseen)
+    shares = {(group, key): v for group, own in reading.from_statement.items() for key, v in own.items()}
+    from_statement = pd.Series(shares, dtype=float, name="from_statement")
+    if shares:
+        from_statement.index = pd.MultiIndex.from_tuples(shares, names=["camera", "parameter"])
     estimators = list(recovery.parameters[cameras[0]])
     parts = [[recovery.parameters[camera][name] for name in estimators] for camera in cameras]
     values = [[np.asarray(p.vector)[0] * PER_SI for p in row] for row in parts]
@@ -298,6 +316,9 @@ def found_table(recovery: Recovery, cameras: Sequence[str], channels: Sequence[s
             attrs=about,
         ),
         disturbances=disturbances,
+        sigma_holds=reading.sigma_holds,
+        warnings=told,
+        from_statement=from_statement,
     )
 
 

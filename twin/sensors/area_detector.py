@@ -27,12 +27,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
 from analysis.spots.noise import NoiseModel
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
 from scenes.yaml.errors import Problem, names_text, nearest
 from twin.run.random_streams import stream
 from twin.sensors.noise_terms import NOISE_TERMS, FixedOffsets, NoiseTerm, ReadNoise
-from twin.sensors.poisson_numbers import poisson_numbers
+from twin.sensors.poisson_numbers import poisson_pieces
 
 __all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
 
@@ -40,6 +41,8 @@ Seed = int | np.random.SeedSequence
 
 # Beyond this the input is certainly in the wrong unit; NumPy's generator, which draws the largest, works up to 9e18.
 _MAX_PHOTONS = 1e12
+# Numbers of read noise that are drawn at once: 9 frames of a CCD of 682 x 682 pixels, 455 of one of 96 x 96.
+_FRAMES_PIXELS = 1 << 22
 # A pixel counts as saturated from this many read-noise sigmas below the clipped level, because read noise is added
 # after the well is clipped: half of all full wells would otherwise read below "full".
 _SATURATION_SIGMAS = 4.0
@@ -243,6 +246,8 @@ class EmvaDetector:
         root = _sequence(seed)
         scale = self.system_gain_dn_per_e
 
+        together = self.frames_at_once(int(frames), height * width)
+
         def image(index: tuple[int, ...], number: int) -> None:
             rng = np.random.Generator(np.random.SFC64(stream(root, number)))
             mean_e = light[index] * gain[index]
@@ -250,21 +255,47 @@ class EmvaDetector:
             mean_e += dark_e
             shift = offset_e[index] * scale
             shift += self.offset_dn
-            level = poisson_numbers(mean_e, int(frames), rng)
-            np.minimum(level, self.full_well_e, out=level)
-            collected = level.copy() if self.noise else level
-            for term in (ReadNoise(self.dark_noise_e), *self.noise):
-                added = term.temporal_e(collected, rng)
-                if added is not None:
-                    level += added
-            level *= scale
-            level += shift
-            np.rint(level, out=level)
-            np.clip(level, 0, self.max_dn, out=level)
-            out[index] = level
+            start = 0
+            for collected in poisson_pieces(mean_e, int(frames), rng, together):
+                out[index][start : start + together] = self._read_out(collected, shift, rng)
+                start += together
 
         _run(image, list(np.ndindex(*lead)), threads)
         return out
+
+    def frames_at_once(self, frames: int, pixels: int) -> int:
+        """Frames of an image whose further noise is drawn at once: all, or so many that memory stays bounded, where
+        only the read noise is drawn; the stream of numbers is the same.
+
+        Args:
+            frames: of the image.
+            pixels: of a frame.
+        """
+        several = any(not isinstance(term, FixedOffsets) for term in self.noise)
+        return frames if several else min(frames, max(1, _FRAMES_PIXELS // pixels))
+
+    def exposing_bytes(self, frames: int, pixels: int) -> int:
+        """Memory that the exposure of one image takes for a while, beside the frames that it gives, bytes.
+
+        Args:
+            frames: of the image.
+            pixels: of a frame.
+        """
+        # electrons, read noise, and electrons as they were collected for noise that depends on them
+        return pixels * self.frames_at_once(frames, pixels) * 8 * (3 if self.noise else 2)
+
+    def _read_out(self, level: np.ndarray, shift: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Grey values of frames (N, H, W) from electrons, whose array they take over."""
+        np.minimum(level, self.full_well_e, out=level)
+        before = level.copy() if self.noise else level
+        for term in (ReadNoise(self.dark_noise_e), *self.noise):
+            added = term.temporal_e(before, rng)
+            if added is not None:
+                level += added
+        level *= self.system_gain_dn_per_e
+        level += shift
+        np.rint(level, out=level)
+        return np.clip(level, 0, self.max_dn, out=level)
 
     def saturated(self, frames: NDArray[np.uint16]) -> SaturationReport:
         """Count saturated pixels in recorded frames (..., frames, H, W); counts have shape (...,).
@@ -276,7 +307,7 @@ class EmvaDetector:
             raise ValueError(f"detector: frames must be (..., frames, H, W), found shape {frames.shape}")
         well = self.offset_dn + self.system_gain_dn_per_e * (self.full_well_e - _SATURATION_SIGMAS * self._read_sigma_e)
         level = float(min(self.max_dn, well))
-        return SaturationReport(level_dn=level, pixels=np.sum(np.any(frames >= level, axis=-3), axis=(-2, -1)))
+        return SaturationReport(level_dn=level, pixels=np.sum(np.max(frames, axis=-3) >= level, axis=(-2, -1)))
 
     @property
     def _read_sigma_e(self) -> float:
@@ -322,7 +353,8 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
         raise ValueError(f"detector: photons must be (..., H, W), found shape {light.shape}")
     low, high = float(light.min()), float(light.max())
     if not (low >= 0 and high <= _MAX_PHOTONS):  # also catches NaN and infinity
-        raise ValueError(
+        too_bright = low >= 0 and np.isfinite(high)
+        raise (UnphysicalError if too_bright else ValueError)(
             f"detector: photons must be finite, >= 0 and <= {_MAX_PHOTONS:g} per pixel and frame, found {low} to {high}"
         )
     return light

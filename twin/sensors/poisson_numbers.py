@@ -23,13 +23,15 @@ grows with the mean: the same stream gives images of almost the same expectation
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 from scipy.special import gammainc, gammaincc, ndtri
 
-__all__ = ["SERIES_END", "TABLE_END", "poisson_numbers", "poisson_quantile"]
+__all__ = ["SERIES_END", "TABLE_END", "poisson_numbers", "poisson_pieces", "poisson_quantile"]
 
 TABLE_END = 32.0
 """Mean from which no table is used."""
@@ -97,18 +99,50 @@ def poisson_numbers(mean: np.ndarray, count: int, rng: np.random.Generator) -> n
     Returns:
         Whole numbers as float64, (count, ...).
     """
+    (out,) = poisson_pieces(mean, count, rng, count)
+    return out
+
+
+def poisson_pieces(mean: np.ndarray, count: int, rng: np.random.Generator, together: int) -> Iterator[np.ndarray]:
+    """The numbers of ``poisson_numbers`` some at a time, so that they need not all be held.
+
+    Args:
+        mean: as there.
+        count: as there.
+        rng: as there. When the first numbers have come, it stands where it would after all of them.
+        together: numbers of each mean in a piece.
+
+    Yields:
+        Whole numbers as float64, (together or fewer, ...).
+    """
     flat = np.ascontiguousarray(mean, dtype=np.float64).reshape(-1)
-    out = np.empty((count, flat.size))
-    plan = _Plan.of(flat)
-    step = max(1, _ROOM // max(flat.size, 1))
-    for start in range(0, count, step):
-        piece = out[start : start + step]
-        # not the raw words, which some bit generators have of 32 bits
-        plan.fill(piece, rng.integers(0, _LAST, piece.shape, dtype=np.uint64, endpoint=True))
-    huge = np.flatnonzero(flat >= SERIES_END)
-    if huge.size:
-        out[:, huge] = rng.poisson(flat[huge], (count, huge.size))
-    return out.reshape(count, *np.shape(mean))
+    plan, huge = _Plan.of(flat), np.flatnonzero(flat >= SERIES_END)
+    words = second = rng
+    if together < count:
+        words = deepcopy(rng)
+        for start, end in _steps(0, count, flat.size):
+            _words(rng, end - start, flat.size)
+        second = deepcopy(rng)
+        for start, end in _steps(0, count if huge.size else 0, huge.size):
+            rng.poisson(flat[huge], (end - start, huge.size))
+    for first in range(0, count, together):
+        out = np.empty((min(together, count - first), flat.size))
+        for start, end in _steps(0, len(out), flat.size):
+            plan.fill(out[start:end], _words(words, end - start, flat.size))
+        if huge.size:
+            out[:, huge] = second.poisson(flat[huge], (len(out), huge.size))
+        yield out.reshape(len(out), *np.shape(mean))
+
+
+def _steps(first: int, last: int, size: int) -> Iterator[tuple[int, int]]:
+    """Ranges of numbers that are drawn at once."""
+    step = max(1, _ROOM // max(size, 1))
+    return ((start, min(start + step, last)) for start in range(first, last, step))
+
+
+def _words(rng: np.random.Generator, count: int, size: int) -> np.ndarray:
+    """Words of 64 bits; not the raw ones, which some bit generators have of 32."""
+    return rng.integers(0, _LAST, (count, size), dtype=np.uint64, endpoint=True)
 
 
 def poisson_quantile(mean: np.ndarray, word: np.ndarray) -> np.ndarray:

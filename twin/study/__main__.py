@@ -30,8 +30,9 @@ from twin.run.cli import (
     time_text,
 )
 from twin.study.runs.cluster import ClusterError
-from twin.study.runs.engine import Estimate, IncompleteError
+from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
+from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_command import Broken, StudyOptions, StudyRun, run_study
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
@@ -75,7 +76,8 @@ def main(
     can be given in place of the file. The numbers do not depend on the number of workers.
 
     While it runs, finished pieces are kept below DIR/chunks. A study that was broken off, by Ctrl-C or a power
-    failure, is gone on with by the same command and --resume.
+    failure, is gone on with by the same command and --resume. With --force the folder that is to be replaced stands
+    until the new study is complete; meanwhile that grows in .NAME.next beside it.
 
     With --gradient it runs no design: the folder gets the Jacobian at the base's own values, gradient.json and
     gradient.csv, by automatic differentiation and beside it by differences.
@@ -83,11 +85,12 @@ def main(
     Examples: `python -m twin.study scenes/examples/study_smoke.yaml --workers 2` and
     `python -m twin.study scenes/examples/study_smoke.yaml --gradient`
 
-    Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else.
+    Exit codes: 0 success, 2 bad input (nothing is lost), 129, 130 or 143 interrupted, 1 anything else: all runs failed,
+    the program did, or a figure could not be drawn.
     """
     errors = Console(stderr=True)
     options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
-    place: list[Path] = []
+    place: list[StudyFolder] = []
     if gradient:
         # drawing libraries are not needed before
         from twin.study.gradient_command import run_gradient
@@ -102,6 +105,10 @@ def main(
         except Broken as broken:
             print_error(errors, f"{broken}{_how_to_go_on(file, place)}")
             raise typer.Exit(broken.code) from None
+        except ProgramFault as fault:
+            errors.print(fault.trace, markup=False, highlight=False, soft_wrap=True)
+            print_error(errors, f"{fault}{_how_to_go_on(file, place)}")
+            raise typer.Exit(FAILURE) from None
         except (IncompleteError, ClusterError) as error:
             print_error(errors, f"{error}{_how_to_go_on(file, place)}")
             raise typer.Exit(FAILURE) from None
@@ -113,12 +120,22 @@ def main(
             print_json(run.numbers)
         elif not quiet:
             _print_result(run)
+    if run.numbers["failed"] == run.numbers["runs"]:
+        print_error(errors, f"all {run.numbers['runs']} runs failed, see {run.folder / 'report.html'}")
+        raise typer.Exit(FAILURE)
+    if run.missing:
+        print_error(errors, f"{'; '.join(run.missing)}; all else is in {run.folder}")
+        raise typer.Exit(FAILURE)
+    if run.fault is not None:
+        # everything is written: only what the file says of a response is wrong
+        with explained(errors):
+            raise run.fault
 
 
-def _how_to_go_on(file: Path, place: list[Path]) -> str:
-    if not place:
-        return ""
-    return f"; what is done is kept, go on with: python -m twin.study {file} --out {place[0]} --resume"
+def _how_to_go_on(file: Path, place: list[StudyFolder]) -> str:
+    if not (place and place[0].resumable):
+        return "; nothing was kept"
+    return f"; what is done is kept, go on with: python -m twin.study {file} --out {place[0].target} --resume"
 
 
 class _Display:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -11,8 +12,10 @@ from scenes.kinds.file_kinds import read_for
 from scenes.models.camera_sharpness import blur_warnings
 from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
 from twin.run.command import WRITE, Result, Session, print_warnings, run_command
+from twin.run.provenance import inputs_in
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
+from twin.sensors.grey_steps import coarse_warnings
 from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
 from twin.study.gradient.gradient_report import response_table, verdict, write_report
 from twin.study.gradient.study_gradient import Gradient, study_gradient
@@ -57,9 +60,12 @@ def _work(setup: StudySetup, session: Session) -> Result:
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", whole_table(found).content())
-    warnings = blur_warnings(base_of(setup), session.backend)
+    base = base_of(setup)
+    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base))
     write_report(setup, found, folder, warnings)
-    entries = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    entries["again"] = [PROGRAM, "config.yaml", "--gradient", "--backend", session.backend.name]
+    entries["inputs"] = inputs_in(setup.tree)
     write_manifest(folder, PROGRAM, session.started, session.seconds, warnings=list(warnings), **entries)
     return Result(numbers, lambda console: _print_result(found, warnings, console))
 

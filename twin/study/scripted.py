@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import takewhile
@@ -16,10 +15,11 @@ import xarray as xr
 
 from analysis.monitor.monitoring import PARAMETERS
 from scenes.specs.resolved import ResolvedJob
-from scenes.specs.study import StudySpec
+from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
+from twin.run.unfinished import scratch
 from twin.study.runs.config_tree import Tree
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
@@ -81,8 +81,8 @@ def study(
         n: number of runs.
         seed: of the design; the noise of each run has a stream of its own.
         design: ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
-        responses: name -> ``{"key": [...], "sigma": [...]}`` as in a study's file; by default readings of the model and
-            true values of every camera's parameters and of the angle between two cameras.
+        responses: name -> ``{"key": [...], "sigma": [...], "noise": [...]}`` as in a study's file; by default readings
+            of the model and true values of every camera's parameters and of the angle between two cameras.
         workers: number of processes; one for each core if not given.
         out: folder of the study, with its report, which stays; none is kept if not given.
         quiet: show no progress.
@@ -96,8 +96,8 @@ def study(
         RuntimeError: the study could not be completed; the message says why.
     """
     config = config_text(instrument, vary, n, seed, design, responses)
-    with tempfile.TemporaryDirectory(prefix="twin-study-") as place:
-        file, target = Path(place) / "config.yaml", Path(place) / "study" if out is None else Path(out)
+    with scratch("twin-study") as place:
+        file, target = place / "config.yaml", place / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
         # A process of its own: workers started from here would run the caller's script once more, each of them.
         command = [sys.executable, "-m", "twin.study", str(file), "--out", str(target), "--yes", "--json"]
@@ -148,13 +148,18 @@ def _responses(resolved: ResolvedJob) -> Tree:
         for key in PARAMETERS:
             short = key.rpartition("_")[0]
             read = ["recovered", "cameras", camera, own, key]
-            out[f"{camera}_{short}"] = {"key": read, "sigma": [*read[:-1], f"{key}_sigma"]}
+            out[f"{camera}_{short}"] = _with_sigmas(read)
             out[f"{camera}_{short}_true"] = {"key": ["truth", "cameras", camera, key]}
     if len(resolved.instrument.cameras) == 2:
-        read = ["recovered", "intersection_angle", own]
-        out["angle_change"] = {"key": [*read, "change_arcsec"], "sigma": [*read, "change_arcsec_sigma"]}
+        out["angle_change"] = _with_sigmas(["recovered", "intersection_angle", own, "change_arcsec"])
         out["angle_change_true"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
     return out
+
+
+def _with_sigmas(read: Sequence[str]) -> Tree:
+    """A response of a reading of the monitor, with its total sigma and that of noise alone."""
+    *place, key = read
+    return {"key": [*read], **{name: [*place, f"{key}{end}"] for name, end in (("sigma", TOTAL), ("noise", NOISE))}}
 
 
 def _taken(value: Any, key: KeyPath, spreads: list[Spread]) -> Any:

@@ -14,8 +14,12 @@ from typing import Any
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
-from twin.run.cli import InputErrorText, check_backend, ending_signals
+from scenes.yaml.errors import InputError
+from twin.run.cli import InputErrorText, check_backend
+from twin.run.ending_signals import ending_signals
+from twin.run.provenance import inputs_in
 from twin.run.run_folder import RunFolderError, chosen, write_manifest
+from twin.run.versions import program_digest
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
 from twin.study.runs.engine import Engine, Progress, fit_workers
@@ -23,6 +27,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.sampling import run_count
 from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
+from twin.study.runs.study_memory import require_study_memory
 
 
 @dataclass(frozen=True)
@@ -70,6 +75,8 @@ class StudyRun:
         folder: where it is.
         plan: all its runs.
         warnings: what the user should know.
+        fault: what the study's file says of its responses and the runs contradict; None where they do not.
+        missing: figures and files that could not be made, a sentence each; all else is there.
     """
 
     numbers: dict[str, Any]
@@ -77,10 +84,12 @@ class StudyRun:
     folder: Path
     plan: Plan
     warnings: tuple[str, ...]
+    fault: InputError | None = None
+    missing: tuple[str, ...] = ()
 
 
 def run_study(
-    file: Path, options: StudyOptions, progress: Progress, opened: Callable[[Path], None] = lambda path: None
+    file: Path, options: StudyOptions, progress: Progress, opened: Callable[[StudyFolder], None] = lambda folder: None
 ) -> StudyRun:
     """Read a study, run what is missing of it, write its results.
 
@@ -88,11 +97,11 @@ def run_study(
         file: of the study, or a config.yaml.
         options: what the user chose.
         progress: what is told meanwhile.
-        opened: told the folder, once something in it is worth resuming.
+        opened: told the folder.
 
     Raises:
         InputError, InputErrorText, RunFolderError: bad input; nothing that was there is lost.
-        IncompleteError, ClusterError: not all runs could be done; the others stay for --resume.
+        IncompleteError, ProgramFault, ClusterError: not all runs could be done; the others stay for --resume.
         Broken: SIGINT, SIGTERM or SIGHUP; what is done stays.
     """
     check_backend(options.backend)
@@ -115,22 +124,25 @@ def run_study(
 
     progress.warn = remember
     started = time.time()
+    program_digest()  # of the files that compute, which may be others when the study ends
     with broken_by_signals():
         # a scheduler that cannot be reached is told before anything is written
         with (
             _workers(options, setup, remember) as start,
             StudyFolder(chosen(options.out, file.stem), setup, options.resume, options.force) as folder,
         ):
+            opened(folder)
             store = ChunkStore(folder.path, plan)
             store.open()
             for text in store.corrupt:
                 remember(text)
-            opened(folder.path)
             # nor is what judges cameras, before the study's file is known to be good
             from scenes.models.camera_sharpness import blur_warnings, cameras_of
+            from twin.sensors.grey_steps import coarse_warnings
 
-            blurred = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
-            for text in blurred:
+            given = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
+            given = (*given, *coarse_warnings(base))
+            for text in given:
                 remember(text)
             engine = Engine(plan, store, options.backend, progress)
             count = 0
@@ -143,21 +155,30 @@ def run_study(
             else:
                 progress.done(store.runs, plan.runs)
             # drawing libraries and the like are not needed before
+            from twin.study.report.stated_noise import impossible
             from twin.study.report.study_report import write_report
+            from twin.study.report.study_runs import StudyRuns
             from twin.study.study_files import write_data
 
             result = store.result()
             numbers = write_data(plan, result, engine.seconds, engine.computed, folder)
-            verdict = write_report(numbers.data, plan, folder.path, numbers.files, blurred)
+            if numbers.summary.get("doubted"):
+                remember(f"σ does not hold in {numbers.summary['doubted']} of {plan.runs} runs: see the report")
+            report = write_report(numbers.data, plan, folder, numbers.files, (*given, *numbers.unwritten))
+            missing = (*numbers.unwritten, *report.undrawn)
+            for text in missing:
+                remember(text)
+            fault = impossible(StudyRuns.of(numbers.data, setup.study))
             entries = {
                 "backend": options.backend,
                 "seed": setup.study.design.seed,
                 "workers": count,
-                "warnings": warnings,
+                "warnings": [*warnings, *(str(issue) for issue in (fault.issues if fault else ()))],
             }
-            entries |= {"runs": plan.runs, "failed": int(result.failed.sum())}
+            entries |= {"runs": plan.runs, "failed": int(result.failed.sum()), "inputs": inputs_in(setup.tree)}
+            entries["again"] = [PROGRAM, "config.yaml", "--backend", options.backend, "--yes"]
             write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
-    return StudyRun(numbers.summary, verdict, folder.path, plan, tuple(warnings))
+    return StudyRun(numbers.summary, report.verdict, folder.target, plan, tuple(warnings), fault, missing)
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:
@@ -169,6 +190,7 @@ def _check_size(setup: StudySetup, confirmed: bool) -> None:
             ("limits", "runs"),
             allowed="a larger limit, or the option --yes",
         )
+    require_study_memory(setup)
 
 
 @contextmanager

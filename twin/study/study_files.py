@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from scenes.specs.study import NOISE
 from twin.run.data_files import csv_table
 from twin.run.data_table import TABLE_FORMATS, DataColumn, DataTable, MissingPackage
 from twin.run.netcdf_file import netcdf
 from twin.run.reference_frames import described, frames_text
-from twin.run.run_folder import MANIFEST
+from twin.study.runs.base_job import one_line
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import StudyFolder
 
 RUN = "run"
 FAILED, MESSAGE, SEED = "failed", "message", "seed"
+DOUBT, MONITOR = "doubt", "render"
+"""A text of every run of this command."""
 ROLE = "role"
 """Attribute of every variable: factor, response, sigma or bookkeeping."""
 
@@ -51,14 +54,18 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         key = f"{_path(response.key)}{minus}"
         about = {"units": response.units, ROLE: "response", "key": key, "long_name": f"response {name}, {key}"}
         data[name] = (RUN, result.values[:, r], about)
-        if response.sigma is not None:
-            about = {"units": response.units, ROLE: "sigma", "key": _path(response.sigma), "of": name}
-            about["long_name"] = f"standard deviation of {name}"
-            data[f"{name}_sigma"] = (RUN, result.sigmas[:, r], about)
+        for ending, place in response.stated.items():
+            about = {"units": response.units, ROLE: "sigma", "key": _path(place), "of": name}
+            by = ", by noise alone" if ending == NOISE else ""
+            about["long_name"] = f"standard deviation of {name}{by}"
+            data[f"{name}{ending}"] = (RUN, (result.noises if by else result.sigmas)[:, r], about)
     flags: dict[str, Any] = {"flag_values": np.array([0, 1], np.int8), "flag_meanings": "completed failed"}
     kept = {"units": "", ROLE: "bookkeeping"}
     data[FAILED] = (RUN, result.failed.astype(np.int8), {**kept, "long_name": "1: failed", **flags})
     data[MESSAGE] = (RUN, np.array(result.messages, object), {**kept, "long_name": "why it failed"})
+    if study.base.command == MONITOR:
+        why = "why sigma does not hold, empty where it does"
+        data[DOUBT] = (RUN, np.array(result.doubts, object), {**kept, "long_name": why})
     if plan.seeds is not None:
         data[SEED] = (RUN, plan.seeds, {"units": "", ROLE: "bookkeeping", "long_name": "seed of the run's noise"})
     attributes = {
@@ -123,6 +130,7 @@ def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
         "name": study.name,
         "runs": plan.runs,
         "failed": int(failed.sum()),
+        **({"doubted": sum(map(bool, data[DOUBT].values.tolist()))} if DOUBT in data else {}),
         "seed": study.design.seed,
         "design": study.design.kind,
         "factors": {
@@ -168,11 +176,13 @@ class Numbers:
         data: of every run, as `make_dataset` makes it.
         summary: contents of study.json.
         files: names of the files that hold the data.
+        unwritten: files that could not be made, a sentence each; the others hold the same.
     """
 
     data: xr.Dataset
     summary: dict[str, Any]
     files: tuple[str, ...]
+    unwritten: tuple[str, ...] = ()
 
 
 def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, folder: StudyFolder) -> Numbers:
@@ -197,13 +207,17 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
             "worker_seconds": result.seconds,
         },
     )
-    (folder.path / MANIFEST).unlink(missing_ok=True)
+    folder.begin_results()
     folder.write("config.yaml", plan.setup.to_yaml().encode())
-    files = []
+    files, unwritten = [], []
     for ending, contents in FORMATS.items():
-        content = contents(data)
+        try:
+            content = contents(data)
+        except Exception as error:  # a format that does not take these numbers must not cost the others
+            unwritten.append(f"study.{ending} could not be made: {one_line(error)}")
+            continue
         if content is not None:
             files.append(f"study.{ending}")
             folder.write(files[-1], content)
     folder.write_json("study.json", numbers)
-    return Numbers(data, numbers, tuple(files))
+    return Numbers(data, numbers, tuple(files), tuple(unwritten))

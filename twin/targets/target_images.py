@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from optics.geometry.tree import State
+from optics.numerics.physical_error import PhysicalError, UnphysicalError
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import target_image
@@ -44,7 +45,7 @@ _FOCUS = 1e-6
 """Defocus to which the tables of the edges reach, metres; they are used at 0 only."""
 
 
-class TargetLostError(Exception):
+class TargetLostError(PhysicalError):
     """A target cannot be imaged in this state; the message says where and why."""
 
 
@@ -180,7 +181,7 @@ class TargetCamera:
         band = ccd.band
         usable = usable_pixels(band.pixels, region)
         if usable <= 0.0:
-            raise ValueError(f"windows of {region} pixels do not fit a line of {band.pixels} pixels")
+            raise UnphysicalError(f"windows of {region} pixels do not fit a line of {band.pixels} pixels")
         self.path = path
         self.ccd = ccd
         self.region = region

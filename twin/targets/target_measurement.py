@@ -45,6 +45,18 @@ _PATTERN, _EXPOSURE = 3, 4
 """Random streams of the job's seed, beside those of the monitor."""
 
 
+def target_pixels(resolved: ResolvedJob) -> int:
+    """Pixels of all frames of a job's test targets, before and after.
+
+    Args:
+        resolved: the job.
+    """
+    settings, names = resolved.targets, resolved.job.render.target_images
+    kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
+    each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
+    return each * (settings.frames or 1)
+
+
 def check_targets(resolved: ResolvedJob) -> None:
     """See before any work whether the targets can be recorded as the job says.
 
@@ -52,12 +64,11 @@ def check_targets(resolved: ResolvedJob) -> None:
         InputError: the windows do not fit the line, or there are too many frames.
     """
     job, settings = resolved.job, resolved.targets
-    names = job.render.target_images
-    if not names:
+    if not job.render.target_images:
         return
-    kinds = sum({"knife_edge": len(DIRECTIONS), "bars": len(DIRECTIONS) + len(EVEN_FIELDS)}.get(n, 1) for n in names)
-    each = len(resolved.instrument.cameras) * len(PLACES) * 2 * kinds * settings.region**2
-    if each * (settings.frames or 1) > LARGEST_FRAMES:
+    frames, pixels = settings.frames or 1, target_pixels(resolved)
+    each = pixels // frames
+    if pixels > LARGEST_FRAMES:
         raise job.error(
             "the frames of the test targets do not fit into memory",
             ("render", "targets", "frames"),
@@ -154,20 +165,28 @@ class _Shooter:
             for direction in DIRECTIONS:
                 imager = view.edge(direction, self.settings.angle)
                 mean = expose(f"knife_edge_{direction}", view.edge_image(imager))
-                edges[direction] = read_edge(view, imager.optics.normal, mean, self.count)
+                edges[direction] = read_edge(view, direction, imager.optics.normal, mean, self.count)
         if self.bars:
             means = {d: expose(f"bars_{d}", view.image(design.target)) for d, design in self.bars.items()}
             # the levels as a bench takes them: shutter closed, and the source without a target
             even = np.ones((view.region, view.region))
             dark, bright = (expose(f"bars_{name}", level * even) for name, level in EVEN_FIELDS.items())
-            bars = {d: read_bars(view, design, means[d], dark, bright, self.count) for d, design in self.bars.items()}
+            bars = {
+                d: read_bars(view, d, design, means[d], dark, bright, self.count) for d, design in self.bars.items()
+            }
         for name in self.images:
             if name in TARGETS:
                 expose(name, view.image(TARGETS[name](view.band.pitch, view.region)))
         return TargetShots(frames, view.column, edges, bars, 1.0 - view.pupil.light)
 
 
-def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
+def on_axis(view: View, direction: str) -> float:
+    """MTF of the traced pupil and the detector at the Nyquist frequency along the line or along the track."""
+    axis = np.eye(2)[DIRECTIONS.index(direction)]
+    return float(np.abs(view.transfer(NYQUIST / view.band.pitch * axis[None]))[0])
+
+
+def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, frames: int) -> EdgeReading:
     """Measure the mean (H, W) of some frames of a knife edge with this normal, and trace the truth."""
     frequency = CURVE / view.band.pitch
     wanted = np.append(frequency, NYQUIST / view.band.pitch)
@@ -178,23 +197,27 @@ def read_edge(view: View, normal: np.ndarray, mean: np.ndarray, frames: int) -> 
         found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE)
     except EdgeError as error:
         reason = str(error)
-    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]))
+    way = float(normal[0]), float(normal[1])
+    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]), way, on_axis(view, direction))
 
 
 def read_bars(
-    view: View, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
+    view: View, direction: str, design: BarDesign, mean: np.ndarray, dark: np.ndarray, bright: np.ndarray, frames: int
 ) -> BarReading:
     """Measure the mean (H, W) of some frames of a bar target, and trace the truth.
 
     Args:
         view: the place.
+        direction: that they measure.
         design: the bars.
         mean: (H, W) of their frames, grey values.
         dark: (H, W) of as many frames with the shutter closed.
         bright: (H, W) of as many frames of an even field, as bright as the bars.
         frames: how many.
     """
-    true = float(np.abs(view.transfer(design.seen(view)[None]))[0])
+    frequency = design.seen(view)
+    true = float(np.abs(view.transfer(frequency[None]))[0])
+    along, track = (frequency * view.band.pitch).tolist()
     found: BarMtf | None = None
     reason = ""
     try:
@@ -204,4 +227,4 @@ def read_bars(
         )  # fmt: skip
     except BarError as error:
         reason = str(error)
-    return BarReading(found, reason, true)
+    return BarReading(found, reason, true, (along, track), on_axis(view, direction))

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry.aperture import Circle
+from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.line_of_sight import chief_directions
@@ -22,8 +24,9 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
-from optics.waves.imaging import aim_collimated, imaging_rays, pupil_field
+from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_function import PupilFunction, fit_pupils
+from optics.waves.pupil_shadow import SMALLEST
 from scenes.models.camera_assembly import line_body
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel
 from scenes.models.shadow import ImagingShadows, TracedBeams
@@ -163,7 +166,7 @@ class TargetPath:
             state: of the assembly.
             directions: of the light.
             points: of the stop.
-            edges: whether edges of the camera's surfaces stop rays.
+            edges: whether edges of the camera's surfaces and bodies in the beams stop rays.
 
         Raises:
             AimError: a beam does not reach the stop.
@@ -184,8 +187,32 @@ class TargetPath:
                 return np.asarray(traced.hit(cut[name]) / size)
 
             valid = valid & self.model.uncut(met)
+        if edges and self.shadows is not None:
+            valid = valid & ~covered(self.shadow_pieces(state, directions), points, SMALLEST)
         require_some(valid, "the imaging path")
         return LineRays(position, leaving, path, valid, float(systems.size[0]))
+
+    def shadow_pieces(self, state: State, directions: np.ndarray) -> np.ndarray:
+        """What bodies take of beams of directions (F, 3): convex polygons on the stop's unit disk, (F, K, V, 2).
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+        """
+        if self.shadows is None:
+            return np.zeros((len(directions), 0, 3, 2))
+        placed, systems, rays = self._imaging(state, directions)
+        owner = np.zeros(len(directions), dtype=int)
+        return self.shadows.cast(
+            TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+        ).pieces
+
+    def _imaging(self, state: State, directions: np.ndarray) -> tuple[PlacedBodies, SystemBatch, ImagingRays]:
+        """Beams through the nodes of the stop to the line CCD."""
+        placed = self.assembly.place([state])
+        systems, to_stop = self._systems(state, len(directions), placed)
+        start, first = self._launch(directions), self._axes[:, 1]
+        rays = imaging_rays(self.backend, systems, to_stop, directions, start, self.stop, self.nodes, first)
+        return placed, systems, rays
 
     def pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
@@ -205,22 +232,12 @@ class TargetPath:
             ValueError: it is vignetted.
         """
         if self.model.edges:
-            raise ValueError("a pupil that edges of surfaces cut is no smooth function: such a camera has no MTF here")
-        placed = self.assembly.place([state])
-        systems, to_stop = self._systems(state, len(directions), placed)
+            raise UnphysicalError(
+                "a pupil that edges of surfaces cut is no smooth function: such a camera has no MTF here"
+            )
+        placed, systems, rays = self._imaging(state, directions)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
-        # the collimator's own axes: the first along the line, the second along the flight direction
-        rays = imaging_rays(
-            self.backend,
-            systems,
-            to_stop,
-            directions,
-            self._launch(directions),
-            self.stop,
-            self.nodes,
-            self._axes[:, 1],
-        )
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)

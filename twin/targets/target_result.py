@@ -26,6 +26,9 @@ class EdgeReading:
         frequency: (F,) along the edge's normal, cycles/m.
         true: (F,) MTF of the traced pupil and the detector there.
         true_nyquist: the same at the Nyquist frequency.
+        normal: of the edge on the image, (along, track), unit.
+        true_axis: what ``true_nyquist`` would be without the edge's tilt, at the Nyquist frequency along the line or
+            along the track: that of image quality at this place.
     """
 
     measured: EdgeMtf | None
@@ -33,6 +36,13 @@ class EdgeReading:
     frequency: np.ndarray
     true: np.ndarray
     true_nyquist: float
+    normal: tuple[float, float]
+    true_axis: float
+
+    @property
+    def at_nyquist(self) -> tuple[float, float]:
+        """Frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel."""
+        return NYQUIST * self.normal[0], NYQUIST * self.normal[1]
 
     @property
     def nyquist(self) -> tuple[float, float] | None:
@@ -54,11 +64,15 @@ class BarReading:
         measured: from the frames, None if they cannot be measured.
         reason: why not.
         true_nyquist: MTF of the traced pupil and the detector at the bars' frequency.
+        at_nyquist: that frequency, (along, track), cycles/pixel.
+        true_axis: what ``true_nyquist`` would be without the bars' tilt, as of ``EdgeReading``.
     """
 
     measured: BarMtf | None
     reason: str
     true_nyquist: float
+    at_nyquist: tuple[float, float]
+    true_axis: float
 
     @property
     def reading(self) -> tuple[float, float] | None:
@@ -168,7 +182,9 @@ class TargetRun:
         return tuple(out)
 
     def to_dict(self) -> dict[str, Any]:
-        """Contents of mtf.json. What could not be measured is null; ``truth`` has the shape of ``cameras``."""
+        """Contents of mtf.json. What could not be measured is null; ``truth`` has the shape of ``cameras``, and the MTF
+        on the axes, which tilted edges and bars do not see, beside it.
+        """
         cameras, truth = {}, {}
         for name, camera in self.cameras.items():
             places, true_places = {}, {}
@@ -217,8 +233,10 @@ def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if edge is not None:
         out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
+        out |= {"mtf_nyquist_cycles_per_pixel": list(edge.at_nyquist), "mtf_nyquist_axis": edge.true_axis}
     if bars is not None:
-        out["bars_mtf"] = bars.true_nyquist
+        out |= {"bars_mtf": bars.true_nyquist, "bars_cycles_per_pixel": list(bars.at_nyquist)}
+        out["mtf_nyquist_axis"] = bars.true_axis
     return out
 
 

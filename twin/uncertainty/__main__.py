@@ -78,7 +78,8 @@ def main(
         return resolved.with_render(resolved.frames, chosen)
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
-        from twin.run.page import RunFacts, reproduce, write_test
+        from twin.run.page import RunFacts, write_test
+        from twin.run.provenance import checks_in
         from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
         from twin.uncertainty.uncertainty_report import uncertainty_report
         from twin.uncertainty.uncertainty_run import run_uncertainty
@@ -87,11 +88,11 @@ def main(
         shown = uncertainty_report(run)
         numbers = {**uncertainty_numbers(run), "verdict": shown.verdict}
         name, drawn = session.backend.name, run.seed if states else None
-        options = f"--states {states} --seed {run.seed}" if states else ""
-        again = reproduce(PROGRAM, "config.yaml", options, f"--backend {name}")
-        facts = RunFacts(
-            resolved.to_yaml(), str(file), name, drawn, session.started, session.seconds, PROGRAM, "", again
-        )
+        options = ("--states", str(states), "--seed", str(run.seed)) if states else ()
+        again = (PROGRAM, "config.yaml", *options, "--backend", name)
+        times = session.started, session.seconds
+        told = (resolved.to_yaml(), str(file), name, drawn, *times, PROGRAM, "", again, resolved.plain())
+        facts = RunFacts(*told, checks=(*run.images.told(), *checks_in(numbers)))
         write_test(KIND, numbers, shown, facts, session.folder)
         return Result(described(KIND, numbers), lambda console: print_report(shown, console))
 

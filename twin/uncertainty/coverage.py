@@ -54,6 +54,7 @@ class Coverage:
             errors that go with the spots smaller; of the posterior none do.
         chi_square: (N,) predictive chi-square of the shifts.
         alarms: in how many states it was beyond its limit.
+        doubted: in how many the spots were not as calibrated, or the readings not linear and not worked out anew.
     """
 
     quantities: tuple[Quantity, ...]
@@ -64,6 +65,7 @@ class Coverage:
     expected: Mapping[str, np.ndarray]
     chi_square: np.ndarray
     alarms: int
+    doubted: int = 0
 
     @property
     def measured(self) -> int:
@@ -153,7 +155,7 @@ def run_states(
     sigma: dict[str, list[np.ndarray]] = {}
     chances: dict[str, list[np.ndarray]] = {}
     squares: list[float] = []
-    alarms = 0
+    alarms = doubted = 0
     for first in range(0, count, CHUNK):
         advance(STATES, first, count)
         states = [state_of(row, stated.components, experiment.thermal) for row in amounts[first : first + CHUNK]]
@@ -179,6 +181,8 @@ def run_states(
             told = found.consistency(disturbances, k)
             squares.append(told.chi_square)
             alarms += not told.agrees
+            fits = found.evidence is None or bool(found.evidence.holds[k])
+            doubted += not (fits and all(curvature.holds[k] for curvature in found.curvature.values()))
     advance(STATES, count, count)
     truth = np.concatenate(true) if true else np.empty((0, len(quantities)))
     readings = {name: np.concatenate(parts) for name, parts in read.items()}
@@ -195,6 +199,7 @@ def run_states(
         },
         chi_square=np.array(squares),
         alarms=alarms,
+        doubted=doubted,
     )
 
 
@@ -208,7 +213,13 @@ def _recovered(
         try:
             with one_blas_thread():
                 found = recover(
-                    before[good], after[good], experiment.calibration, centroid, cores(), experiment.disturbances
+                    before[good],
+                    after[good],
+                    experiment.calibration,
+                    centroid,
+                    cores(),
+                    experiment.disturbances,
+                    motions=experiment.motion_models,
                 )
             return found, good
         except SpotError as error:

@@ -12,7 +12,8 @@ from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import LeastSeen, Quantity, Split
-from analysis.monitor.recovery import joint, measure_spots
+from analysis.monitor.recovery import joint, judged_spots
+from analysis.monitor.stated_numbers import Elasticity, HeavyTail, elasticities, heavy_tails
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.units import ARCSEC
@@ -39,6 +40,7 @@ UNMOVED = 1e-8
 stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
 _STATES = 6
+_PIXELS = 1 << 21  # of the images of these states that are worked on at once
 """Of which the covariance of a shift is averaged; it differs by some per cent from one to another."""
 
 
@@ -104,6 +106,29 @@ class MonitorLimits:
         return sorted(((name, float(value[quantity] / total)) for name, value in found.items()), key=lambda x: -x[1])
 
     @cached_property
+    def gain(self) -> np.ndarray:
+        """(4 K, D) of the posterior."""
+        return self.stated.best_gain(self.noise)
+
+    @cached_property
+    def elasticities(self) -> tuple[Elasticity, ...]:
+        """How every quantity's sigma follows each stated number."""
+        return elasticities(self.rows, self.stated, self.noise, self.gain)
+
+    @cached_property
+    def heavy_tail(self) -> HeavyTail:
+        """What a statement with heavy tails would leave."""
+        return heavy_tails(self.rows, self.stated, self.noise, self.gain)
+
+    @cached_property
+    def from_statement(self) -> np.ndarray:
+        """(Q,) shares of the posterior's variances that no spot constrains, however little noise it has."""
+        left, alone = (
+            limits.posterior_sigma(self.rows, self.stated, noise) for noise in (self.noise, 0.0 * self.noise)
+        )
+        return np.minimum(np.square(alone / np.where(left > 0.0, left, np.inf)), 1.0)
+
+    @cached_property
     def known(self) -> Mapping[str, np.ndarray]:
         """Label -> (Q,) what would be left if that motion were known, of all that the posterior's first lines name."""
         names = {name for q in range(len(self.quantities)) for name, _ in self.lines(BEST, q)[:LINES]}
@@ -124,18 +149,23 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
         frames: of each.
     """
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
-    before = measure_spots(experiment.expected_frames(experiment.nominal_photons), frames, calibration, centroid)
-    after = before
-    if experiment.stated is not None:
+    nominal = experiment.expected_frames(experiment.nominal_photons)
+    before, _ = judged_spots(nominal, frames, calibration, centroid)
+    if experiment.stated is None:
+        spread = difference_covariance(before, before, calibration.noise)
+    else:
         amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
         states = [state_of(row, experiment.stated.components, experiment.thermal) for row in amounts]
-        try:
-            photons = experiment.path.expected_photons(states)
-            moved = experiment.expected_frames(photons).reshape(-1, *experiment.path.shape)
-            after = measure_spots(moved, frames, calibration, centroid)
-        except (AimError, BeamMissedError, SpotError):
-            return np.asarray(joint(2.0 * before.covariance[None])[0])
-    spread = difference_covariance(before, after, calibration.noise)
+        together, parts = max(1, _PIXELS // nominal.size), []
+        for start in range(0, _STATES, together):
+            try:
+                photons = experiment.path.expected_photons(states[start : start + together])
+                moved = experiment.expected_frames(photons).reshape(-1, *experiment.path.shape)
+                after, _ = judged_spots(moved, frames, calibration, centroid)
+            except (AimError, BeamMissedError, SpotError):
+                return np.asarray(joint(2.0 * before.covariance[None])[0])
+            parts.append(difference_covariance(before, after, calibration.noise))
+        spread = np.concatenate(parts)
     return np.asarray(joint(spread.reshape(-1, calibration.spots, 2, 2)).mean(axis=0))
 
 

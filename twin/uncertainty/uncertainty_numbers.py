@@ -80,20 +80,74 @@ class SeenNumbers:
 
 
 @dataclass(frozen=True)
+class ElasticityNumbers:
+    """How sigma of the posterior follows a stated number of some bodies: relative change per relative change, and sigma
+    if the number is twice as large, unknown to the estimator (``doubled``) and stated so (``doubled_stated``).
+    """
+
+    number: str
+    stated: float
+    unit: str
+    bodies: int
+    elasticity: float
+    doubled: float
+    doubled_stated: float
+
+
+@dataclass(frozen=True)
+class HeavyTailNumbers:
+    """What the posterior leaves if each stated number is the scale of Student's distribution: rms of the error, half
+    widths that hold 68.3, 95.4 and 99.7 % of the errors, and the chance of one beyond 3 sigma (0.0027 if normal).
+    """
+
+    degrees: float
+    rms: float
+    held_68: float
+    held_95: float
+    held_997: float
+    beyond_3_sigma: float
+
+
+@dataclass(frozen=True)
 class QuantityNumbers:
-    """What limits one quantity, in the unit that its key ends in; ``known``: what is left if that motion is known."""
+    """What limits one quantity, in the unit that its key ends in; ``known``: what is left if that motion is known;
+    ``from_statement``: share of the posterior's variance that no spot constrains.
+    """
 
     before: SplitNumbers
     after: Mapping[str, SplitNumbers]
     known: Mapping[str, float]
     least_seen: SeenNumbers
+    from_statement: float
+    elasticities: tuple[ElasticityNumbers, ...]
+    student_t: HeavyTailNumbers
 
     @classmethod
     def of(cls, limits: MonitorLimits, q: int) -> QuantityNumbers:
         """Of one quantity."""
         after = {name: SplitNumbers.of(limits, name, q) for name in limits.splits}
         known = {line.motion: float(limits.known[line.motion][q]) for line in after[BEST].lines}
-        return cls(SplitNumbers.of(limits, "", q), after, known, SeenNumbers.of(limits, q))
+        seen, share, tail = SeenNumbers.of(limits, q), float(limits.from_statement[q]), limits.heavy_tail
+        one, two, three = (float(width) for width in tail.held[:, q])
+        heavy = HeavyTailNumbers(tail.degrees, float(tail.rms[q]), one, two, three, float(tail.beyond[q]))
+        return cls(SplitNumbers.of(limits, "", q), after, known, seen, share, _followed(limits, q), heavy)
+
+
+def _followed(limits: MonitorLimits, q: int) -> tuple[ElasticityNumbers, ...]:
+    """The stated numbers that make most of a quantity's variance."""
+    found = sorted(limits.elasticities, key=lambda one: -float(one.elasticity[q]))[:LINES]
+    return tuple(
+        ElasticityNumbers(
+            one.number,
+            one.size,
+            one.unit,
+            len(one.bodies),
+            float(one.elasticity[q]),
+            float(one.doubled[q]),
+            float(one.told[q]),
+        )
+        for one in found
+    )
 
 
 @dataclass(frozen=True)
@@ -158,6 +212,7 @@ class StatesNumbers:
     chi_square_mean: float
     alarms: int
     alarms_limit: int
+    doubted: int
 
     @classmethod
     def of(cls, coverage: Coverage) -> StatesNumbers:
@@ -185,6 +240,7 @@ class StatesNumbers:
             chi_square_mean=float(np.mean(coverage.chi_square)),
             alarms=coverage.alarms,
             alarms_limit=coverage.alarm_limit,
+            doubted=coverage.doubted,
         )
 
 
@@ -210,6 +266,7 @@ def limits_numbers(limits: MonitorLimits) -> dict[str, Any]:
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
     """uncertainty.json of the command: the same, and under ``states`` what random states gave."""
     out = limits_numbers(run.limits)
+    out["warnings"] = list(run.warnings)
     if run.coverage is not None:
         out["states"] = {"seed": run.seed, **plain_data(StatesNumbers.of(run.coverage))}
     return out

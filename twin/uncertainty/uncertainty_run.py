@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from optics.numerics.backend import Backend
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue
+from twin.monitor.image_sampling import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.procedure import Advance, silent
+from twin.sensors.grey_steps import coarse_warnings
 from twin.uncertainty.coverage import Coverage, run_states
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
+from twin.uncertainty.words import unseen_texts
 
 SPREAD = "what is stated to move"
 """A part of the work."""
@@ -25,12 +29,16 @@ class UncertaintyRun:
         limits: of its instrument under its disturbances.
         seed: of the random states.
         coverage: of the random states, None if none were asked for.
+        warnings: blurred cameras, coarse grey values, and stated motions that no spot sees.
+        images: what the checks of its images found.
     """
 
     resolved: ResolvedJob
     limits: MonitorLimits
     seed: int
     coverage: Coverage | None = None
+    warnings: tuple[str, ...] = ()
+    images: ImageChecks = field(default_factory=ImageChecks)
 
 
 def run_uncertainty(
@@ -70,4 +78,6 @@ def run_uncertainty(
     seed, coverage = resolved.job.render.seed, None
     if states:
         coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)
-    return UncertaintyRun(resolved, limits, seed, coverage)
+    hidden = unseen_texts(limits.stated, noise, limits.quantities, limits.gain)
+    given = (*blur_warnings(resolved, backend), *coarse_warnings(resolved))
+    return UncertaintyRun(resolved, limits, seed, coverage, (*given, *hidden), experiment.path.checked)

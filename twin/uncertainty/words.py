@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, LeastSeen, Quantity
+from analysis.monitor.stated_numbers import unseen
 from scenes.specs.channel import BASE
 from twin.run.artefact import SYMBOLS, shown_unit, significant
 from twin.uncertainty.monitor_limits import MonitorLimits
@@ -26,6 +32,29 @@ def short_text(quantity: Quantity) -> str:
 def unit_text(quantity: Quantity) -> str:
     """Its unit."""
     return shown_unit(quantity.key.rpartition("_")[2])
+
+
+def unseen_texts(
+    stated: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
+) -> tuple[str, ...]:
+    """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma.
+
+    Args:
+        stated: what moves.
+        noise: (D, D) of the shifts, px^2.
+        quantities: Q of them.
+        gain: (4 K, D) of the estimator that is judged by.
+    """
+    rows = np.stack([quantity.row for quantity in quantities])
+    out = []
+    for body, shares in unseen(rows, stated, noise, gain).items():
+        worst = int(np.argmax(shares))
+        out.append(
+            f"{body}: its motions that are stated move no spot; {100.0 * float(shares[worst]):.0f} % of the variance "
+            f"of {short_text(quantities[worst])} are from the statement, not from the spots, and nothing that is "
+            "measured can contradict it"
+        )
+    return tuple(out)
 
 
 def body_text(body: str) -> str:

@@ -69,8 +69,9 @@ def _head(validation: Validation) -> Iterator[str]:
         "**Claim**: what the paper prints, or in brackets what its statement implies. **Tolerance**: how far claim and "
         "measurement may be apart without the noise, and why. **Finds**: the smallest error of the statement that the "
         "row would have found, tolerance plus three sigma, and its share of the claim; an error just so large is found "
-        "half the time. **To be told from**: the nearest other statement and how far away it is; a row that finds less "
-        "than that is undecided."
+        "half the time. **Sides**: two-sided where a measurement can disagree on both sides of the claim; at most and "
+        "at least where it agrees however far below or above it lies. **To be told from**: the nearest other statement "
+        "and how far away it is; a row that finds only errors larger than that is undecided."
     )
     yield ""
 
@@ -82,12 +83,12 @@ def _tables(validation: Validation) -> Iterator[str]:
             continue
         yield f"## Paper {number}: {title}"
         yield ""
-        yield "| check | what is compared | claim | measured | tolerance | finds | to be told from | verdict |"
-        yield "|---|---|---:|---:|---|---|---|---|"
+        yield "| check | what is compared | claim | sides | measured | tolerance | finds | to be told from | verdict |"
+        yield "|---|---|---:|---|---:|---|---|---|---|"
         for r in rows:
             names, about = " = ".join(f"`{name}`" for name in (r.id, *r.also)), f"{r.equation}: {r.statement}"
             about += f". Theory: {r.theory}" if r.theory else ""
-            cells = (names, about, claim_text(r), _measured(r), *_limits(r), r.verdict)
+            cells = (names, about, claim_text(r), comparison_text(r), _measured(r), *_limits(r), r.verdict)
             yield "| " + " | ".join(_cell(cell) for cell in cells) + " |"
         yield ""
 
@@ -207,9 +208,12 @@ def verdict(validation: Validation) -> str:
 
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
     """The rows of a paper with all digits."""
-    heads = ("id", "equation", "statement", "printed", "measured", "sigma", "unit", "verdict", "finds", "how")
+    heads = ("id", "equation", "statement", "printed", "sides", "measured", "sigma", "unit", "verdict", "finds", "how")
     rows = [
-        (r.id, r.equation, r.statement, r.printed, r.measured, r.sigma, r.unit, str(r.verdict), r.power, r.how)
+        (
+            *(r.id, r.equation, r.statement, r.printed, comparison_text(r)),
+            *(r.measured, r.sigma, r.unit, str(r.verdict), r.power, r.how),
+        )
         for r in results
     ]
     return Table(f"paper-{paper}", f"Paper {paper}", "", heads, rows)
@@ -227,9 +231,13 @@ def duration_text(seconds: float) -> str:
 
 def command(validation: Validation) -> str:
     """What repeats this validation."""
-    only = "" if validation.only is None else f"--only {validation.only.replace(' ', '')}"
-    fast = "--fast" if validation.fast else ""
-    return reproduce(PROGRAM, only, fast, f"--seed {validation.seed} --backend {validation.backend}")
+    return reproduce(_words(validation))
+
+
+def _words(validation: Validation) -> list[str]:
+    only = [] if validation.only is None else ["--only", validation.only.replace(" ", "")]
+    fast = ["--fast"] if validation.fast else []
+    return [PROGRAM, *only, *fast, "--seed", str(validation.seed), "--backend", validation.backend]
 
 
 def measured_text(result: CheckResult) -> str:
@@ -258,6 +266,11 @@ def claim_text(result: CheckResult) -> str:
     return printed_text(result)
 
 
+def comparison_text(result: CheckResult) -> str:
+    """To which sides of the claim a measurement can disagree; nothing where nothing is compared."""
+    return result.comparison if result.power is not None else ""
+
+
 def power_text(result: CheckResult) -> str:
     """The smallest error of the statement that the row would have found, in its unit and of the claim."""
     if result.power is None:
@@ -277,6 +290,7 @@ def _row(result: CheckResult) -> dict[str, Any]:
         "also": list(result.also),
         "theory": result.theory,
         "printed": claim_text(result),
+        "comparison": comparison_text(result),
         "power": power_text(result),
         "tells": "" if result.tells is None or result.power is None else significant(result.tells, 3, floor=0.0),
         "against": result.against,
@@ -321,4 +335,5 @@ def write_validation(validation: Validation, folder: RunFolder) -> None:
     for name, content in summary_files(validation).items():
         folder.write_bytes(f"{SUMMARY}/{name}", content)
     entries = {"backend": validation.backend, "seed": validation.seed, "only": validation.only, "fast": validation.fast}
-    write_manifest(folder, PROGRAM, validation.started, validation.seconds, **entries)
+    again = _words(validation)
+    write_manifest(folder, PROGRAM, validation.started, validation.seconds, **entries, again=again)

@@ -23,7 +23,7 @@ from scenes.specs.measured.monitor_frames import (
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.units import MOMENT, parse_quantity
@@ -146,7 +146,7 @@ def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[
     for file in files:
         place = base / file
         if not is_file(place):
-            raise spec.error(f"no such file: {place}", key, allowed=_allowed(place), suggestion=_beside(place))
+            raise spec.error(unusable(place), key, allowed=_allowed(place), suggestion=_beside(place))
         out.append(str(place.absolute()))
     return tuple(out)
 
@@ -276,9 +276,7 @@ class _FrameTable:
             raise InputError(Issue("no such state", file, line, (head,), shown(row[head]), f"{BEFORE}, {AFTER}"))
         place = self.path.parent / row["file"]
         if not is_file(place):
-            raise InputError(
-                Issue(f"no such file: {place}", file, line, ("file",), None, _allowed(place), _beside(place))
-            )
+            raise InputError(Issue(unusable(place), file, line, ("file",), None, _allowed(place), _beside(place)))
         seen.setdefault(channel, {}).setdefault(when, []).append(str(place.absolute()))
         if "row" in row:
             corner = []

@@ -140,11 +140,16 @@ class AttitudeReadingsSpec(Spec):
     Attributes:
         noise: standard deviation of a reading, independent from reading to reading, radians.
         slow: what changes within a pass.
+        drift: standard deviation of the rate of each pass, by what it changes in a second, radians; zeros where there
+            is none, None where nobody knows.
+        walk: standard deviation of what a random walk gains in a second, radians.
         interval: between readings that are independent, seconds; None for the median of the table.
     """
 
     noise: AngleSigmas
     slow: SlowErrorsSpec = SlowErrorsSpec()
+    drift: AngleSigmas | None = None
+    walk: AngleSigmas = (0.0, 0.0, 0.0)
     interval: Interval | None = None
 
 
@@ -259,3 +264,11 @@ class MeasuredAngleSpec(MeasuredTestSpec):
     angles: Angles = None
     time: Moment | None = None
     errors: ReadingErrorsSpec
+
+    @model_validator(mode="after")
+    def _knows_these_errors(self) -> "MeasuredAngleSpec":
+        tracker = self.errors.star_tracker
+        if any(tracker.drift or ()) or any(tracker.walk):
+            problem = "angles know of readings and slow errors of the attitude, not of a drift or a walk"
+            raise Problem(problem, None, "`slow:`", within=("errors", "star_tracker"))
+        return self

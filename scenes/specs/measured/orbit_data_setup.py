@@ -18,6 +18,7 @@ from scenes.specs.orbit.setup import AngleSetup, CalibrationSetup, resolve_angle
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.errors import Problem, nearest
+from scenes.yaml.input_file import MISSING, no_file
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import read_yaml
@@ -141,9 +142,11 @@ def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
         return _with_quaternions_said(test, data)
     place = folder / test.data
     file = place / DATA_FILE if place.is_dir() else place
-    if not file.is_file():
+    wrong = no_file(file)
+    if wrong is not None:
         allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
-        raise test.error("no such measurements", ("data",), found=str(place), allowed=allowed)
+        problem = "no such measurements" if wrong == MISSING else f"no measurements: {wrong}"
+        raise test.error(problem, ("data",), found=str(place), allowed=allowed)
     data = validate(OrbitDataSpec, read_yaml(file))
     return _with_quaternions_said(data, data.model_copy(update={"passes": _placed(data, data.passes, file.parent)}))
 
@@ -172,12 +175,15 @@ def _placed(owner: Spec, passes: Mapping[str, PassFilesSpec], folder: Path) -> F
 def _present(owner: Spec, key: tuple[str, ...], folder: Path, value: str, what: str = "a CSV file") -> str:
     """The absolute path of a file. InputError, at the key of the owner, where it is not there."""
     place = folder / value
-    if not _is_there(place):
+    wrong = no_file(place)
+    if wrong is not None and wrong != MISSING:
+        raise owner.error(wrong, key, found=value, allowed=f"{what}, its path relative to this one")
+    if wrong is not None:
         beside = [place.with_name(other.name) for other in _beside(place)]
         meant = nearest(str(place), [str(other) for other in beside])
         told = None if meant is None else str(Path(value).with_name(Path(meant).name))
         allowed = f"{what}, its path relative to this one"
-        raise owner.error("no such file", key, found=value, allowed=allowed, suggestion=told)
+        raise owner.error(MISSING, key, found=value, allowed=allowed, suggestion=told)
     return str(place.absolute())
 
 
@@ -189,13 +195,6 @@ def _with_quaternions_said(owner: Spec, data: OrbitDataSpec) -> OrbitDataSpec:
             problem = f"{key} is missing: a table of an attitude does not say how it is to be read"
             raise owner.error(problem, ("conventions",), allowed=f"`{key}:`")
     return data
-
-
-def _is_there(place: Path) -> bool:
-    try:
-        return place.exists()
-    except (OSError, ValueError):  # no name that a file can have
-        return False
 
 
 def _beside(place: Path) -> list[Path]:

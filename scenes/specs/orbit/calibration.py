@@ -219,11 +219,12 @@ class CalibrationErrorsSpec(ErrorsSpec):
 
 
 class LaunchSpec(Spec):
-    """How much a launch may change, one standard deviation. The adjustment does not use it; an estimate far beyond it
-    is a sign of wrong ground coordinates or of a wrong camera file, which the fit alone does not show.
+    """How much a launch may change, one standard deviation. The adjustment uses it for what the points tell less well,
+    and for nothing else; an estimate far beyond it is a sign of wrong ground coordinates or of a wrong camera file,
+    which the fit alone does not show.
 
     Attributes:
-        bias: angle between star trackers and cameras about body X, Y, Z, radians.
+        bias: angle between star trackers and cameras about body X, Y, Z, radians; 0 where nothing is known of it.
         interior: principal distances and principal points, metres.
     """
 

@@ -244,6 +244,8 @@ class StarTrackerErrorsSpec(Spec):
         bias: constant, radians.
         thermal: changes with latitude.
         slow: changes within a pass.
+        drift: standard deviation of a rate that each pass has, by what it changes in a second, radians.
+        walk: standard deviation of what a random walk gains in a second, radians.
     """
 
     interval: Interval = 0.125
@@ -251,6 +253,8 @@ class StarTrackerErrorsSpec(Spec):
     bias: AngleErrors = _ZERO
     thermal: ThermalDriftSpec = ThermalDriftSpec()
     slow: SlowErrorsSpec = SlowErrorsSpec()
+    drift: AngleSigmas = _ZERO
+    walk: AngleSigmas = _ZERO
 
 
 class ErrorsSpec(Spec):

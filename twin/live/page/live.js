@@ -8,6 +8,7 @@ const byId = (id) => document.getElementById(id);
 const IN_FLIGHT = 2; // states that are asked for at once: one is computed while the other waits its turn
 const MOST_UNDO = 200;
 const AFTER_QUIET = 350; // ms without a change before a picture is asked for
+const SLOW = 2000; // ms without an answer, after which that is said
 
 class Live {
   constructor() {
@@ -15,6 +16,7 @@ class Live {
     this.ws = null;
     this.n = 0;
     this.waiting = new Map(); // number of a state -> when it was asked for
+    this.trouble = ''; // what is wrong with the process that computes
     this.dirty = false;
     this.touched = 0;
     this.wait = 500;
@@ -32,6 +34,7 @@ class Live {
     this.scene = new Scene(byId('scene'));
     this.listen();
     this.connect();
+    setInterval(() => this.silence(), 500);
   }
 
   // --- what the user does ------------------------------------------------------------------------------------------
@@ -109,7 +112,7 @@ class Live {
     this.dirty = false;
     this.n += 1;
     const state = this.state();
-    this.waiting.set(state.n, state.t);
+    this.waiting.set(state.n, performance.now());
     this.touched = 0;
     this.say(state);
   }
@@ -147,8 +150,16 @@ class Live {
     ws.onclose = (event) => this.lost(event.reason);
   }
 
+  // an answer that does not come is said, too, and so is a server that was stopped
+  silence() {
+    const [asked] = this.waiting.values();
+    const seconds = (performance.now() - asked) / 1000;
+    if (1000 * seconds > SLOW && !this.trouble) this.status(`no answer for ${Math.floor(seconds)} s`, true);
+  }
+
   async lost(reason) {
     this.waiting.clear();
+    this.trouble = '';
     this.status(reason || 'no connection, trying again', true);
     await new Promise((done) => setTimeout(done, this.wait));
     this.wait = Math.min(5000, 1.5 * this.wait);
@@ -181,13 +192,27 @@ class Live {
       case 'blind': this.setBlind(message.on); break;
       case 'revealed': this.reveal(message); break;
       case 'record': this.recording(message); break;
-      case 'lost':
+      case 'computing': this.computing(message); break;
       case 'refused':
         this.note(message.problem);
         this.waiting.clear();
-        if (message.type === 'lost') this.changed();
         break;
     }
+  }
+
+  // the process that computes does, or does not; what was asked for is kept and answered when it does again
+  computing({ state, problem }) {
+    const shown = byId('problem').textContent === this.trouble;
+    this.trouble = problem;
+    if (problem) {
+      this.note(problem);
+      this.status(state === 'stopped' ? 'computing is stopped' : 'computing is started again', true);
+      return;
+    }
+    if (shown) byId('problem').hidden = true;
+    const now = performance.now();
+    for (const n of this.waiting.keys()) this.waiting.set(n, now);
+    this.status('connected');
   }
 
   greet(hello) {

@@ -13,8 +13,10 @@ from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from twin.orbit.calibration.attitude_drift import DriftNumbers
 from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
 from twin.orbit.calibration.campaign import FieldPass, Rejected, interior_names
+from twin.orbit.calibration.chip_steps import StepNumbers
 from twin.orbit.calibration.image_numbers import ImageNumbers
 from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise
 from twin.orbit.calibration.latitude import LatitudeFit
@@ -36,18 +38,21 @@ Array = NDArray[np.float64]
 
 def unit(name: str) -> str:
     """SI unit of an unknown."""
-    if name in RATE:
+    if name.endswith(RATE):
         return "rad/s"
     return "rad" if name.split()[-1] in BIAS else "m"
 
 
 @dataclass(frozen=True)
 class ParameterNumbers:
-    """An unknown of the adjustment of all fields; held: by the gauge."""
+    """An unknown of the adjustment of all fields; held: by the gauge. share_from_launch: of its variance, what comes
+    from the sigmas of launch and season and not from the points, 0 to 1.
+    """
 
     value: float
     sigma: float
     sigma_with_gauge: float
+    share_from_launch: float
     held: bool
     truth: float | None
     unit: str
@@ -60,8 +65,8 @@ class ParameterNumbers:
         whole = found.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
         truth = [None] * len(found.names) if run.truth is None else run.truth.tolist()
         return {
-            name: cls(float(value), sigma[name], whole[name], name in held, true, unit(name))
-            for name, value, true in zip(found.names, found.values, truth, strict=True)
+            name: cls(float(value), sigma[name], whole[name], float(share), name in held, true, unit(name))
+            for name, value, share, true in zip(found.names, found.values, found.from_start, truth, strict=True)
         }
 
 
@@ -78,9 +83,11 @@ class SigmaNotes:
     def of(cls, run: CalibrationRun) -> Self:
         """Of a run."""
         rates = any(name in RATE for name in run.together.names)
+        own = any(name.endswith(RATE) for name in run.together.names) and not rates
         return cls(
             sigma="with the gauge's held unknowns exact"
-            + (", and with the drift of the biases during the passes as the latitude fit tells it" if rates else ""),
+            + (", and with the drift of the biases during the passes as the latitude fit tells it" if rates else "")
+            + (", and with a drift of the attitude in each pass as it is stated or was found" if own else ""),
             sigma_with_gauge="with what launch leaves to expect of the held unknowns, and all that follows them",
             held_start_sigma_m=run.campaign.spec.launch.interior,
             fields="of each field by itself: without the drift of the biases during the pass",
@@ -127,6 +134,7 @@ class FitNumbers:
     degrees_of_freedom: int
     p_value: float
     iterations: int
+    attitude_drift: DriftNumbers
 
 
 @dataclass(frozen=True)
@@ -273,12 +281,28 @@ class LightNumbers:
 
 @dataclass(frozen=True)
 class DatumNumbers:
-    """What a datum does that is off by a shift."""
+    """What a datum does that is off by a shift, or a clock of the lines that is late.
+
+    Attributes:
+        shift_east_north_up_m, late_s: the shift, or by how much the clock is late.
+        bias_change_rad, interior_change_m, offset_change_m: of the parameters.
+        most: the element of the interior that moves by the most of its sigmas.
+        most_sigmas: by how many.
+        one_sigma_at: shift or time that moves it by one sigma, metres or seconds.
+        warned_from: from which on an unknown is beyond what is expected, metres or seconds; None for never.
+        chi_square_change, p_value: of the fit.
+        after: errors at check points.
+    """
 
     shift_east_north_up_m: Sequence[float]
+    late_s: float
     bias_change_rad: Mapping[str, float]
     interior_change_m: Mapping[str, float]
     offset_change_m: Mapping[str, float]
+    most: str
+    most_sigmas: float
+    one_sigma_at: float | None
+    warned_from: float | None
     chi_square_change: float
     p_value: float
     after: ErrorNumbers
@@ -288,9 +312,14 @@ class DatumNumbers:
         """Of one shift."""
         return cls(
             shift_east_north_up_m=row.shift,
+            late_s=row.late,
             bias_change_rad=dict(zip(BIAS, row.bias.tolist(), strict=True)),
             interior_change_m=row.interior,
             offset_change_m=dict(zip(OFFSET, row.offset.tolist(), strict=True)),
+            most=row.most_sigmas[0],
+            most_sigmas=row.most_sigmas[1],
+            one_sigma_at=row.size / row.most_sigmas[1] if row.most_sigmas[1] else None,
+            warned_from=row.warned,
             chi_square_change=row.fit,
             p_value=row.p_value,
             after=ErrorNumbers(*row.after),
@@ -317,8 +346,8 @@ class SurpriseNumbers:
 class MeasuredNumbers:
     """A measured pass: its points, what screening left out, ground sample distance.
 
-    sigma_factor: on the sigmas of image points, by the residuals. check_chi_square: of the check points' rays by the
-    pass's own parameters, with check_degrees_of_freedom.
+    sigma_factor: line -> on the sigmas of its image points, by the residuals. check_chi_square: of the check points'
+    rays by the pass's own parameters, with check_degrees_of_freedom.
     """
 
     control_points: int
@@ -328,7 +357,7 @@ class MeasuredNumbers:
     gsd_m: Mapping[str, Sequence[float]]
     rejected: Sequence[Sequence[str]]
     rejected_check_points: Sequence[str]
-    sigma_factor: float | None
+    sigma_factor: Mapping[str, float] | None
     check_chi_square: float
     check_degrees_of_freedom: int
 
@@ -344,7 +373,7 @@ class MeasuredNumbers:
             gsd_m={name: ground_sample(one, name) for name in one.data.sensors},
             rejected=[] if rejected is None else rejected.points,
             rejected_check_points=[] if rejected is None else rejected.check_points,
-            sigma_factor=None if rejected is None else rejected.factor,
+            sigma_factor=None if rejected is None else rejected.factors,
             check_chi_square=meeting.chi_square,
             check_degrees_of_freedom=meeting.degrees_of_freedom,
         )
@@ -364,6 +393,7 @@ class CalibrationNumbers:
     images: ImageNumbers | None
     measured: Mapping[str, MeasuredNumbers] | None
     fit: FitNumbers
+    chip_steps: Sequence[StepNumbers]
     stepwise: StepwiseNumbers
     fields: Mapping[str, FieldNumbers]
     schemes: Mapping[str, Mapping[str, ErrorNumbers]]
@@ -403,7 +433,14 @@ class CalibrationNumbers:
                 )
                 for p in campaign.passes
             },
-            fit=FitNumbers(found.chi_square, found.degrees_of_freedom, found.p_value, found.iterations),
+            fit=FitNumbers(
+                found.chi_square,
+                found.degrees_of_freedom,
+                found.p_value,
+                found.iterations,
+                DriftNumbers.of(campaign, found),
+            ),
+            chip_steps=StepNumbers.of(campaign, found),
             stepwise=StepwiseNumbers(spec.schemes[0][0], way.rounds, way.rate, way.converged),
             fields={p.name: FieldNumbers.of(p, run.fields[p.name]) for p in campaign.passes},
             schemes={scheme: ErrorNumbers.by_field(errors) for scheme, errors in run.schemes.items()},

@@ -7,9 +7,18 @@ from typing import TYPE_CHECKING
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.attitude_drift import DriftNumbers, drift_warnings
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.calibration_sections import monitor_gain, scheme_names, scheme_summary, sections, strip_gain
+from twin.orbit.calibration.calibration_sections import (
+    monitor_gain,
+    rests_on_launch,
+    scheme_names,
+    scheme_summary,
+    sections,
+    strip_gain,
+)
+from twin.orbit.calibration.chip_steps import StepNumbers, step_warnings
 from twin.orbit.calibration.influences import SURPRISE
 from twin.orbit.calibration.measured_sections import measured_facts, measured_warnings
 from twin.orbit.calibration.observations import any_effect, light_effects
@@ -132,6 +141,13 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             f"{first.name} has changed by {first.change / scale:.3g} {shown}, {first.ratio:.1f} times what is "
             f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
             "the times, for the fit need not show such an error"
+        )
+    assumptions += drift_warnings(run.campaign, DriftNumbers.of(run.campaign, found))
+    assumptions += step_warnings(StepNumbers.of(run.campaign, found))
+    if resting := rests_on_launch(found):
+        assumptions.append(
+            f"{', '.join(resting)}: known from launch.bias and launch.interior, not from the points; these sigmas are "
+            "as good as that statement. More points, or a longer and wider field, would tell them"
         )
     if any_effect(run.campaign.effects) and not spec.effects.corrected:
         assumptions.append(

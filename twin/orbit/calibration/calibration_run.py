@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.calibration_parameters import OFFSET, RATE
+from analysis.orbit.calibration_parameters import OFFSET, RATE, CalibrationError
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import RankError
+from analysis.orbit.plausibility import FarPointsError, NoiseError
 from analysis.orbit.stepwise import Stepwise, stepwise
 from analysis.orbit.third_difference import ThirdDifference, third_difference
 from analysis.orbit.three_line_model import BIAS, INTERIOR
@@ -22,7 +23,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
-from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
+from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise, datum_rows, light_rows, surprises
 from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
@@ -112,12 +113,37 @@ def run_calibration(
     """
     try:
         return _run(setup, seed, advance)
-    except RankError as error:
-        remedy = "a field with width and length, and more points"
-        key = "data" if isinstance(setup, MeasuredCalibrationSetup) else "points"
-        raise BenchError(str(error), (key,), remedy) from error
-    except ValueError as error:  # a CalibrationError, or too few readings for third differences
+    except CalibrationError as error:
+        measured = isinstance(setup, MeasuredCalibrationSetup)
+        key, remedy = _what_to_do(error, measured)
+        raise BenchError(str(error), key, remedy) from error
+    except ValueError as error:  # too few readings for third differences
         raise BenchError(str(error), ("errors",), "errors that an adjustment can take, and more points") from error
+
+
+_NOISE_KEYS = {
+    "attitude": ("errors", "star_tracker", "noise"),
+    "slow attitude": ("errors", "star_tracker", "slow"),
+    "station": ("errors", "gps", "noise"),
+}
+"""Source of noise -> its key; image and control points have keys of their own in a simulation, sigmas in tables."""
+
+
+def _what_to_do(error: CalibrationError, measured: bool) -> tuple[tuple[str, ...], str]:
+    """Key and remedy of an error of the adjustment, in a test on measurements or in a simulation."""
+    if isinstance(error, RankError):
+        return ("data" if measured else "points",), "a field with width and length, and more points"
+    if isinstance(error, NoiseError):
+        tables = {"image": "image_points", "control": "ground"}
+        own = ("data",) if measured else ("errors", error.largest)
+        table = f"in the table {tables[error.largest]}" if measured and error.largest in tables else "there"
+        return _NOISE_KEYS.get(error.largest, own), f"smaller sigmas {table}; are their units right?"
+    if isinstance(error, FarPointsError):
+        if measured:
+            remedy = "the points of these images: check their datum, the epoch, the conventions (`twin.orbit check`)"
+            return ("data",), f"{remedy}, or state a larger launch.bias"
+        return ("errors",), "a datum and biases within what launch.bias leaves to expect"
+    return ("errors",), "errors that an adjustment can take, and more points"
 
 
 def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
@@ -127,7 +153,8 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
     advance("calibration", 1, parts)
     latitude = latitude_fits(campaign, simultaneous(campaign))
     rates = rate_priors(campaign, latitude)
-    together = simultaneous(campaign, rates, rate=bool(rates))
+    campaign = drift_looked_for(campaign, rates)
+    together = simultaneous(campaign, rates)
     advance("calibration", 2, parts)
     fields = {}
     for k, one in enumerate(campaign.passes):
@@ -201,6 +228,8 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
         known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
     rates = [(one.truth.bias_at(1.0) - one.truth.bias_at(-1.0)) / 2.0 for one in campaign.passes]
     known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
+    for one, own in zip(campaign.passes, rates, strict=True):
+        known |= {f"{one.name} {name}": v for name, v in zip(RATE, own, strict=True)}
     return np.array([known[name] for name in names])
 
 

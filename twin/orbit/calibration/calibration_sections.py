@@ -6,14 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.attitude_drift import DriftNumbers
 from twin.orbit.calibration.calibration_numbers import unit
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
 from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
+from twin.orbit.calibration.chip_steps import StepNumbers, steps_table
 from twin.orbit.calibration.field_sections import (
     biases_section,
     datum_section,
@@ -337,6 +340,8 @@ def _parameters(run: CalibrationRun) -> Section:
     inner = run.campaign.inner
     start = dict(zip(inner, np.ravel([laboratory[line].interior for line in run.campaign.lines]), strict=True))
     truth = None if run.truth is None else dict(zip(found.names, run.truth.tolist(), strict=True))
+    numbers = DriftNumbers.of(run.campaign, found)
+    drift = numbers.sigmas_per_arcsec or {}
     rows: list[tuple[Cell, ...]] = []
     for name in inner:
         held = sigma[name] == 0.0
@@ -344,7 +349,8 @@ def _parameters(run: CalibrationRun) -> Section:
         if truth is not None:
             z = None if held else float((found.value(name) - truth[name]) / sigma[name])
             cells = (1e6 * (truth[name] - start[name]), z)
-        rows.append((name, 1e6 * (found.value(name) - start[name]), None if held else 1e6 * sigma[name], *cells))
+        change = 1e6 * (found.value(name) - start[name])
+        rows.append((name, change, None if held else 1e6 * sigma[name], drift.get(name), *cells))
     others: list[tuple[Cell, ...]] = []
     for name in (n for n in found.names if n not in inner):
         scale, shown = {"rad": (ARCSEC, "arcsec"), "rad/s": (1e-3 * ARCSEC, "mas/s"), "m": (1.0, "m")}[unit(name)]
@@ -357,7 +363,12 @@ def _parameters(run: CalibrationRun) -> Section:
     ]
     known = 0 if truth is None else 2
     apart = f"up to {run.campaign.passes[0].seconds_apart:.0f} s apart"
-    if any(name in RATE for name in found.names):
+    if any(name.endswith(RATE) for name in found.names) and not any(name in RATE for name in found.names):
+        text.append(
+            f"The lines see a field {apart}, and a rate of the attitude in each pass is solved for, with the sigma "
+            "that is stated or was found as its prior."
+        )
+    elif any(name in RATE for name in found.names):
         text.append(
             f"A bias that varies with latitude also varies during a pass, while the lines see the field {apart}. "
             "The fit of the biases against latitude tells the drift, with its sigma, and the outer lines' principal "
@@ -373,10 +384,12 @@ def _parameters(run: CalibrationRun) -> Section:
         Table(
             "interior",
             "Interior orientation",
-            "Micrometres, changes from the laboratory. Without sigma: held (gauge).",
-            ("element", "change", "σ", *("true change", "z")[:known]),
+            "Micrometres, changes from the laboratory. Without sigma: held (gauge). Drift: by how many of its sigmas "
+            f"an element moves where the attitude drifts by 1 arcsec in {numbers.seconds:.0f} s and the adjustment "
+            "does not know of it; empty where rates are unknowns.",
+            ("element", "change", "σ", "σ per arcsec of drift", *("true change", "z")[:known]),
             rows,
-            (None, *(2,) * (2 + known)),
+            (None, *(2,) * (3 + known)),
         ),
         Table(
             "biases",
@@ -394,7 +407,18 @@ def _parameters(run: CalibrationRun) -> Section:
         "RMS of x and y in each line's title. What is left is noise of the image and of the attitude.",
         figure_svg("residuals", run),
     )
-    return Section("Parameters", tuple(text), (*tables, figure))
+    steps = steps_table(StepNumbers.of(run.campaign, found))
+    return Section("Parameters", tuple(text), (*tables, steps, figure))
+
+
+MOSTLY = 0.5
+"""Share of a variance from which on an unknown is said to rest on the launch's sigmas."""
+
+
+def rests_on_launch(found: Adjustment) -> dict[str, float]:
+    """Unknowns whose sigma is more that of launch than that of the points, with the share of the variance."""
+    shares = zip(found.names, found.from_start.tolist(), strict=True)
+    return {name: share for name, share in shares if share > MOSTLY}
 
 
 def _rank(run: CalibrationRun) -> Section:
@@ -408,6 +432,9 @@ def _rank(run: CalibrationRun) -> Section:
     text = [f"Gauge: {found.gauge}."]
     text += [f"The points cannot tell: {c}." for c in found.open]
     text += [f"Weak, but solved for: {c}." for c in found.weak]
+    if resting := rests_on_launch(found):
+        listed = ", ".join(f"{name} ({100.0 * share:.0f}% of its variance)" for name, share in resting.items())
+        text.append(f"From what launch leaves to expect, not from the points: {listed}.")
     state = "converges" if way.converged else "does not converge"
     text.append(
         f"The stepwise solution, bias and interior in turn, {state} for {run.campaign.spec.schemes[0][0]} in "

@@ -172,7 +172,7 @@ def with_monitor(campaign: Campaign) -> Treatment:
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
     """All fields at once, with the drift of every camera in every field as unknowns that the readings tell."""
     return simultaneous(
-        campaign, tuple(p for one in campaign.passes for p in _reading_priors(campaign, one)), drift=True
+        campaign, drift=True, monitor=tuple(p for one in campaign.passes for p in _reading_priors(campaign, one))
     )
 
 

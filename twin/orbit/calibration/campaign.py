@@ -58,7 +58,9 @@ class PassTruth:
     def bias_at(self, time: float) -> np.ndarray:
         """(3,) true roll, pitch, yaw at a time, seconds from the field's middle, radians, without slow errors."""
         latitude = self.trajectory.orbit.earth.geodetic(self.trajectory.position(time))[1]
-        turn = self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal
+        turn = (
+            self.errors.bias + np.sin(latitude - self.errors.reference) * self.errors.thermal + time * self.errors.rate
+        )
         return np.asarray(Rotation.from_rotvec(turn).inv().as_euler("XYZ"))
 
 
@@ -166,6 +168,21 @@ class FieldPass:
         ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
+    def later(self, seconds: float) -> FieldPass:
+        """With rays of the station and attitude so many seconds later; image points stay as they are."""
+
+        def moved(rays: Mapping[str, Rays]) -> FrozenMap[str, Rays]:
+            found = {}
+            for name, row in rays.items():
+                path = self.data.sensors[name].trajectory
+                assert row.time is not None
+                time = row.time + self.data.phase + seconds
+                found[name] = replace(row, station=path.position(time), attitude=path.body_to_itrs(time))
+            return FrozenMap(found)
+
+        control = replace(self.control, rays=moved(self.control.rays))
+        return replace(self, control=control, check=moved(self.check), ties=moved(self.ties))
+
 
 @dataclass(frozen=True, eq=False)
 class Campaign:
@@ -179,6 +196,7 @@ class Campaign:
         images: what became of points measured in simulated images, by field; None otherwise.
         known_truth: line -> camera as it is, without the drift of single fields; None where nobody knows.
         rejected: field -> what the adjustment has left out; empty where nothing was looked for.
+        drifts: what residuals showed of a drift of the attitude that nobody stated; None where they show none.
     """
 
     spec: OrbitCalibrationSpec | MeasuredCalibrationSpec
@@ -188,6 +206,7 @@ class Campaign:
     images: tuple[FieldImages, ...] | None = None
     known_truth: Mapping[str, LineModel] | None = None
     rejected: Mapping[str, Rejected] = FrozenMap({})
+    drifts: FoundDrift | None = None
 
     @property
     def truth(self) -> Mapping[str, LineModel]:
@@ -254,9 +273,29 @@ class Campaign:
         )
         return replace(self, passes=passes)
 
+    def later(self, seconds: float) -> Campaign:
+        """All lines exposed so many seconds later than they were."""
+        return replace(self, passes=tuple(p.later(seconds) for p in self.passes))
+
     def shifted(self, datum: tuple[float, float, float]) -> Campaign:
         """All control points given farther east, north and up, metres."""
         return replace(self, passes=tuple(p.shifted(datum) for p in self.passes))
+
+
+@dataclass(frozen=True)
+class FoundDrift:
+    """A drift of the attitude during the passes that nobody stated and residuals show.
+
+    Attributes:
+        rate: standard deviation of the rates about body X, Y, Z that is assumed since, radians per second.
+        walk: likewise of a random walk, what it gains in a second, radians.
+        rate_p_value, course_p_value: chance of such residuals without rates, and without errors that change slowly.
+    """
+
+    rate: tuple[float, float, float]
+    walk: float
+    rate_p_value: float
+    course_p_value: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +307,8 @@ class Rejected:
         points: names of control and tie points with a rejected image point, and its line camera.
         check_entered, check_left: check points before and after the test of their intersection.
         check_points: names of those that were left out.
-        factor: on the sigmas of the image points, by the residuals of those that remain; 1 where they are right.
+        factors: line -> on the sigmas of its image points, by the residuals of those that remain; 1 where they are
+            right.
     """
 
     entered: int
@@ -277,7 +317,7 @@ class Rejected:
     check_entered: int
     check_left: int
     check_points: tuple[str, ...]
-    factor: float
+    factors: Mapping[str, float]
 
 
 def interior_names(lines: Sequence[str]) -> tuple[str, ...]:
@@ -289,7 +329,8 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     """A line of the payload as the analysis models it."""
     line = payload.lines[name]
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
-    return LineModel.of(to_body, (line.focal_length, *line.principal_point), line.position, line.k1, line.k2)
+    half = 0.5 * payload.pixels_of(name) * payload.pitch_of(name)
+    return LineModel.of(to_body, (line.focal_length, *line.principal_point), line.position, line.k1, line.k2, half)
 
 
 def campaign_of(
@@ -337,7 +378,8 @@ def noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequen
         tracker.interval or float(np.median([p.attitude_interval for p in paths])),
         gps.interval or float(np.median([p.orbit_interval for p in paths])),
     )
-    return Noise(image, attitude, station, *between, slow, tracker.slow.interval)
+    walk = float(np.sqrt(np.mean(np.square(tracker.walk))))
+    return Noise(image, attitude, station, *between, slow, tracker.slow.interval, walk, between[0])
 
 
 def _field_pass(

@@ -5,26 +5,68 @@ known beforehand.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
 
 from analysis.orbit.adjustment import Adjustment, Robust, adjust
-from analysis.orbit.calibration_parameters import OFFSET, Prior, Unknowns
+from analysis.orbit.calibration_parameters import OFFSET, RATE, Prior, Unknowns
+from analysis.orbit.hidden_terms import FALSE_ALARM
 from analysis.orbit.null_space import Gauge
-from twin.orbit.calibration.campaign import Campaign, FieldPass
+from analysis.orbit.three_line_model import BIAS
+from optics.numerics.frozen_map import FrozenMap
+from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))
 """Of three lines. The nadir line's principal point stays as the laboratory has it: x is not observable against pitch,
 y against roll so weakly that a field would not know it to a pixel."""
 _LEAST_OFFSET = 1e-3
 """Metres; sigma of an orbit without a drift along one axis."""
+_LEAST_RATE = 1e-11
+"""Radians per second; sigma of a rate about an axis that has none, where another one has: 1e-4 arcsec in a minute."""
 
 
 def gauge_of(campaign: Campaign) -> Gauge:
-    """The principal point of one line is held; see `GAUGE`."""
-    return Gauge(held=(f"{campaign.reference} x", f"{campaign.reference} y"))
+    """The principal point of one line is held; see `GAUGE`. What the points know less well than launch leaves to expect
+    keeps near the laboratory's values, to the sigmas of launch and season.
+    """
+    launch, season = campaign.spec.launch, np.array(campaign.spec.errors.season)
+    start = dict.fromkeys(campaign.inner, launch.interior)
+    turns = np.hypot(launch.bias, season).tolist()
+    start |= {f"{p.name} {axis}": s for p in campaign.passes for axis, s in zip(BIAS, turns, strict=True) if s > 0.0}
+    return Gauge(held=(f"{campaign.reference} x", f"{campaign.reference} y"), start=FrozenMap(start))
+
+
+def rates_of(campaign: Campaign) -> np.ndarray:
+    """(3,) standard deviations of the attitude's rate in each pass, stated or found in residuals, rad/s."""
+    stated = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
+    found = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
+    return np.asarray(np.hypot(stated or (0.0, 0.0, 0.0), found))
+
+
+def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequence[Prior] = ()) -> tuple[Prior, ...]:
+    """Of the rate of each pass; empty where none drifts by itself.
+
+    Args:
+        campaign: for what is stated.
+        passes: that are adjusted.
+        common: what is known of a rate that all of them have; its error then counts as one of each.
+    """
+    sigma = rates_of(campaign)
+    if not np.any(sigma):
+        return tuple(common)
+    known = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
+    found = []
+    for one in passes:
+        for name, own in zip(RATE, np.maximum(sigma, _LEAST_RATE).tolist(), strict=True):
+            value, error = known.get(name, (0.0, 0.0))
+            found.append(Prior({f"{one.name} {name}": 1.0}, value, float(np.hypot(own, error)), "bias rate"))
+    return tuple(found)
 
 
 def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior] = ()) -> Adjustment:
-    """A field by itself, with paper 003's twelve unknowns less the gauge.
+    """A field by itself, with paper 003's twelve unknowns less the gauge, and its rate where the attitude drifts.
 
     Args:
         campaign: for the laboratory's camera and the noise.
@@ -34,24 +76,63 @@ def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior]
     Raises:
         CalibrationError: it cannot be solved.
     """
-    return adjust([one.control], campaign.laboratory, campaign.noise, priors=priors, gauge=gauge_of(campaign))
+    rates = _rate_priors(campaign, [one])
+    return adjust(
+        [one.control],
+        campaign.laboratory,
+        campaign.noise,
+        unknowns=Unknowns(rate="field" if rates else "none"),
+        priors=(*priors, *rates),
+        gauge=gauge_of(campaign),
+    )
+
+
+def drift_looked_for(campaign: Campaign, rates: tuple[Prior, ...] = ()) -> Campaign:
+    """The campaign, or where residuals show a drift of the attitude that nobody stated, with this among its noise: a
+    random walk by its variance component, and a rate of each pass. False alarms: `FALSE_ALARM` for either test.
+
+    Args:
+        campaign: as it is stated.
+        rates: what is known of a rate that all passes have.
+
+    Raises:
+        CalibrationError: it cannot be solved.
+    """
+    found = simultaneous(campaign, rates)
+    rate_chance = 1.0 if found.rates is None else found.rates.p_value
+    if min(rate_chance, found.courses.p_value) >= FALSE_ALARM:
+        return campaign
+    sigma = np.zeros(3)
+    if found.rates is not None:
+        size = np.where(np.isfinite(found.rates.sigma), np.hypot(found.rates.estimate, found.rates.sigma), 0.0)
+        sigma = size.reshape(-1, 3).max(axis=0)
+    focal = min(float(m.interior[0]) for m in campaign.laboratory.values())
+    trial = max(campaign.noise.image / focal, campaign.noise.attitude_walk)
+    walking = replace(campaign, noise=replace(campaign.noise, attitude_walk=trial))
+    factor = simultaneous(walking, rates, components=("attitude walk",)).factors["attitude walk"]
+    walk = float(trial * np.sqrt(factor))
+    roll, pitch, yaw = sigma.tolist()
+    drifts = FoundDrift((roll, pitch, yaw), walk, rate_chance, found.courses.p_value)
+    return replace(walking, noise=replace(walking.noise, attitude_walk=walk), drifts=drifts)
 
 
 def simultaneous(
     campaign: Campaign,
-    priors: tuple[Prior, ...] = (),
+    rates: tuple[Prior, ...] = (),
     robust: Robust | None = None,
     drift: bool = False,
-    rate: bool = False,
+    monitor: tuple[Prior, ...] = (),
+    components: Sequence[str] = (),
 ) -> Adjustment:
     """All fields at once: one interior, a bias and, where the orbit drifts, an offset with its prior for each field.
 
     Args:
         campaign: the fields.
-        priors: what else is known of the unknowns, for example by an on-board monitor in each pass.
+        rates: what is known of a drift of the bias that all passes have.
         robust: weights of the image points.
-        drift: whether the cameras' changes in each pass are unknowns, too; priors must tell them.
-        rate: whether a drift of the bias during the passes is; priors must tell it.
+        drift: whether the cameras' changes in each pass are unknowns, too; `monitor` must tell them.
+        monitor: what an on-board monitor tells of these.
+        components: groups whose variance is estimated.
 
     Raises:
         CalibrationError: it cannot be solved.
@@ -63,6 +144,10 @@ def simultaneous(
         for p in campaign.passes
         for axis, sigma in zip(OFFSET, errors.gps.drift, strict=True)
     )
+    rated = _rate_priors(campaign, campaign.passes, rates)
+    kind: Literal["common", "field", "none"] = "none"
+    if rated:
+        kind = "field" if np.any(rates_of(campaign)) else "common"
     return adjust(
         [p.control for p in campaign.passes],
         campaign.laboratory,
@@ -70,9 +155,10 @@ def simultaneous(
         unknowns=Unknowns(
             offset="field" if offsets else "none",
             drift="field" if drift else "none",
-            rate="common" if rate else "none",
+            rate=kind,
         ),
-        priors=(*(drifts if offsets else ()), *priors),
+        priors=(*(drifts if offsets else ()), *rated, *monitor),
         gauge=gauge_of(campaign),
         robust=robust,
+        variance_components=components or False,
     )

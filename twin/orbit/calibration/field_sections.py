@@ -13,7 +13,7 @@ from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
-from twin.orbit.calibration.influences import SURPRISE, LightRow
+from twin.orbit.calibration.influences import SURPRISE, DatumRow, LightRow
 from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.imaged_ground import BEYOND
 from twin.orbit.images.point_judgement import WRONG
@@ -338,21 +338,36 @@ def datum_section(run: CalibrationRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for row in run.datum:
         name, change = row.most
-        where = ", ".join(f"{v:g} {axis}" for v, axis in zip(row.shift, ("east", "north", "up"), strict=True) if v)
+        where = ", ".join(f"{v:g} m {axis}" for v, axis in zip(row.shift, ("east", "north", "up"), strict=True) if v)
+        where = f"lines {1e3 * row.late:g} ms late" if row.late else where
         bias = [float(v / ARCSEC) for v in row.bias]
         rows.append(
-            (where, *bias, f"{name} {1e6 * change:+.1f} µm", *map(float, row.offset), row.fit, row.p_value, *row.after)
+            (
+                where,
+                *bias,
+                f"{name} {1e6 * change:+.1f} µm",
+                *_sizes(row),
+                *map(float, row.offset),
+                row.fit,
+                row.p_value,
+                *row.after,
+            )
         )
     table = Table(
         "datum",
         "All control points in a wrong datum",
-        "Shift in metres; mean changes of the fields' biases, arcseconds; the element of the interior that changes "
-        "most; mean changes of the orbit's offsets, metres; change of the chi-square and chance of the fit; RMS at "
-        "check points in the right datum, each field with its own parameters, metres.",
+        "Mean changes of the fields' biases, arcseconds; the element of the interior that changes most; the one that "
+        "changes by the most of its sigmas, what makes one sigma of it, and from what on an unknown is beyond what "
+        "launch leaves to expect, which gives a warning; mean changes of the orbit's offsets, metres; change of the "
+        "chi-square and chance of the fit; RMS at check points in the right datum, each field with its own parameters, "
+        "metres.",
         (
-            "shift [m]",
+            "wrong by",
             *BIAS,
             "interior",
+            "in sigmas",
+            "one sigma at",
+            "warned from",
             *OFFSET,
             "Δ chi-square",
             "chance of the fit",
@@ -360,7 +375,7 @@ def datum_section(run: CalibrationRun) -> Section:
             "height after [m]",
         ),
         rows,
-        (None, 2, 2, 2, None, 3, 3, 3, 1, 3, 2, 2),
+        (None, 2, 2, 2, None, None, None, None, 3, 3, 3, 1, 3, 2, 2),
     )
     launch = run.campaign.spec.launch
     roll, inner = (format_quantity(v, k) for v, k in ((launch.bias[0], ANGLE), (launch.interior, LENGTH)))
@@ -369,7 +384,7 @@ def datum_section(run: CalibrationRun) -> Section:
         "A shift that all control points share in plan is a turn of the camera by shift over altitude, and one in "
         "height a change of all principal distances and of the outer lines' x. Biases and interior take it up, the "
         "orbit's offsets, which their prior holds, hardly do, and the fit need not show it. Check points of the same "
-        "wrong datum would not show it either.",
+        "wrong datum would not show it either. Lines whose clock is late move everything along the track.",
         f"What remains is to ask whether the parameters are believable. The file expects {roll} (roll) and {inner} "
         f"(interior) of a launch; beyond {SURPRISE:g} times this there is a warning, which is {metres:.0f} m of "
         "shift across the track.",
@@ -380,6 +395,14 @@ def datum_section(run: CalibrationRun) -> Section:
     else:
         text.append("Nothing is beyond what is expected here.")
     return Section("Datum of the control points", tuple(text), (table,))
+
+
+def _sizes(row: DatumRow) -> tuple[str, str, str]:
+    """The element of the interior that moves most in sigmas, what moves it by one, what gives a warning."""
+    name, sigmas = row.most_sigmas
+    scale, unit = (1e3, "ms") if row.late else (1.0, "m")
+    warned = "never" if row.warned is None else f"{scale * row.warned:.3g} {unit}"
+    return f"{name} {sigmas:.1f} σ", f"{scale * row.size / max(sigmas, 1e-9):.3g} {unit}", warned
 
 
 def _left(row: LightRow) -> str:

@@ -24,6 +24,8 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 INNER = interior_names(LINES)
 SURPRISE = 4.0
 """Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""
+_TRIAL_TIME = 0.01
+"""Seconds; by which the lines are late, 70 m on the ground."""
 _TRIAL_SHIFT = 100.0
 """Metres; of a wrong datum where the file has none."""
 
@@ -69,6 +71,9 @@ class DatumRow:
         fit: change of the chi-square of the simultaneous adjustment.
         p_value: of the adjustment with the shift.
         after: mean of the fields' RMS against the right datum, each field with its own parameters, plan and height.
+        late: seconds by which the times of the lines are too late, in place of a shift.
+        sigma: name -> of the elements of the interior.
+        warned: shift in metres, or time in seconds, from which on `surprises` tells of it; None where it never does.
     """
 
     shift: tuple[float, float, float]
@@ -78,6 +83,21 @@ class DatumRow:
     fit: float
     p_value: float
     after: tuple[float, float]
+    late: float
+    sigma: Mapping[str, float]
+    warned: float | None
+
+    @property
+    def size(self) -> float:
+        """Of the shift, metres, or of the time, seconds."""
+        return abs(self.late) or float(np.linalg.norm(self.shift))
+
+    @property
+    def most_sigmas(self) -> tuple[str, float]:
+        """The element of the interior that is moved by the most of its sigmas, and by how many."""
+        ratio = {n: abs(v) / self.sigma[n] for n, v in self.interior.items() if self.sigma[n] > 0.0}
+        worst = max(ratio, key=lambda n: ratio[n])
+        return worst, ratio[worst]
 
     @property
     def most(self) -> tuple[str, float]:
@@ -142,21 +162,22 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
 
 
 def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
-    """The file's datum, or 100 m along each axis where it has none.
+    """The file's datum, or 100 m along each axis and lines that are 10 ms late where it has none.
 
     Raises:
         CalibrationError: a case cannot be solved.
     """
     errors = campaign.spec.errors
     right = campaign.independent
-    shifts = [(_TRIAL_SHIFT, 0.0, 0.0), (0.0, _TRIAL_SHIFT, 0.0), (0.0, 0.0, _TRIAL_SHIFT)]
+    shifts = [(_TRIAL_SHIFT, 0.0, 0.0), (0.0, _TRIAL_SHIFT, 0.0), (0.0, 0.0, _TRIAL_SHIFT), (0.0, 0.0, 0.0)]
     if errors.switched_on and any(errors.datum):
         east, north, up = errors.datum
         right, shifts = right.shifted((-east, -north, -up)), [errors.datum]
     base = simultaneous(right)
     rows = []
     for east, north, up in shifts:
-        wrong = right.shifted((east, north, up))
+        late = 0.0 if any((east, north, up)) else _TRIAL_TIME
+        wrong = right.later(late) if late else right.shifted((east, north, up))
         found = simultaneous(wrong)
         change = dict(zip(found.names, found.values - base.values, strict=True))
         names = [p.name for p in campaign.passes]
@@ -169,13 +190,30 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
                 found.chi_square - base.chi_square,
                 found.p_value,
                 _after(wrong),
+                late,
+                {n: base.sigma[n] for n in campaign.inner},
+                _warned(campaign, change, late or float(np.linalg.norm((east, north, up)))),
             )
         )
     return tuple(rows)
 
 
+def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
+    """How large a cause of this size (metres or seconds) and these changes must be for `surprises` to tell it."""
+    known = _expected(campaign)
+    ratio = max((abs(change.get(name, 0.0)) / sigma for name, (_, sigma) in known.items()), default=0.0)
+    return SURPRISE * size / ratio if ratio > 0.0 else None
+
+
 def surprises(campaign: Campaign, found: Adjustment) -> tuple[Surprise, ...]:
     """Estimates beyond `SURPRISE` sigmas of what launch and orbit leave to expect, the largest first."""
+    known = _expected(campaign)
+    all_of_them = [Surprise(n, float(found.value(n) - v), s) for n, (v, s) in known.items() if n in found.names]
+    return tuple(sorted((s for s in all_of_them if s.ratio > SURPRISE), key=lambda s: -s.ratio))
+
+
+def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
+    """Unknown -> value and standard deviation that launch and orbit leave to expect."""
     launch, errors = campaign.spec.launch, campaign.spec.errors
     inner = campaign.inner
     start = dict(zip(inner, np.ravel([campaign.laboratory[line].interior for line in campaign.lines]), strict=True))
@@ -187,8 +225,7 @@ def surprises(campaign: Campaign, found: Adjustment) -> tuple[Surprise, ...]:
         if errors.switched_on:
             drift = zip(OFFSET, errors.gps.drift, strict=True)
             known |= {f"{one.name} offset {axis}": (0.0, s) for axis, s in drift if s > 0.0}
-    all_of_them = [Surprise(n, float(found.value(n) - v), s) for n, (v, s) in known.items() if n in found.names]
-    return tuple(sorted((s for s in all_of_them if s.ratio > SURPRISE), key=lambda s: -s.ratio))
+    return known
 
 
 def _after(campaign: Campaign) -> tuple[float, float]:

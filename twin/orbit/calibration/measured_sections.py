@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from analysis.units import ARCSEC
@@ -18,6 +20,8 @@ _FEW = 30
 _LISTED = 12
 """Names that a text lists at most."""
 _LEAST_CHANCE = 1e-3
+_WIDE = 2.0
+"""Factor on the sigmas of a line beyond which there is a warning."""
 _MANY = 0.1
 """Share of image points that may be left out without a warning."""
 
@@ -31,7 +35,9 @@ def measured_section(run: CalibrationRun) -> Section:
     for one in campaign.passes:
         gone = campaign.rejected.get(one.name)
         meeting = meeting_of(campaign, one, run.fields[one.name].adjustment)
-        lost = (None, None, None) if gone is None else (len(gone.points), len(gone.check_points), gone.factor)
+        lost = (
+            (None, None, None) if gone is None else (len(gone.points), len(gone.check_points), _factors(gone.factors))
+        )
         alone = run.fields[one.name].adjustment
         rows.append(
             (
@@ -56,8 +62,8 @@ def measured_section(run: CalibrationRun) -> Section:
         "measured-points",
         "Points of every pass",
         "Left out: image points that robust weights gave up, check points whose rays do not meet. Factor: on the given "
-        "sigmas of image points, by the residuals of those that remain. Chi-square over its degrees of freedom, of the "
-        "pass calibrated by itself and of the rays of its check points with these parameters.",
+        "sigmas of image points of the lines, by the residuals of those that remain. Chi-square over its degrees of "
+        "freedom, of the pass calibrated by itself and of the rays of its check points with these parameters.",
         (
             "pass",
             "control",
@@ -71,7 +77,7 @@ def measured_section(run: CalibrationRun) -> Section:
             "check χ²/dof",
         ),
         rows,
-        (None, None, None, None, None, None, 2, 2, 3, 2),
+        (None, None, None, None, None, None, None, 2, 3, 2),
     )
     pixels = Table(
         "measured-pixels",
@@ -83,6 +89,14 @@ def measured_section(run: CalibrationRun) -> Section:
         (None, None, 3, 3, 2, 2, None),
     )
     return Section("Measurements", (*_screening(run), *_limits(run)), (points, pixels))
+
+
+def _factors(found: Mapping[str, float]) -> str:
+    """In words: one where all lines have it."""
+    texts = {line: f"{v:.2f}" for line, v in found.items()}
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return ", ".join(f"{line} {v}" for line, v in texts.items())
 
 
 def _count(images: object) -> int:
@@ -180,10 +194,12 @@ def measured_warnings(run: CalibrationRun) -> list[str]:
                 f"{name}: {lost} of {gone.entered} image points were left out, more than {100.0 * _MANY:.0f}%: are the "
                 "conventions right, and the points matched well?"
             )
-        if gone.factor > 2.0:
+        wide = {line: factor for line, factor in gone.factors.items() if factor > _WIDE}
+        if wide:
+            listed = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
             found.append(
-                f"{name}: image points scatter {gone.factor:.1f} times as much as their sigmas say; the sigmas of the "
-                "result have been made larger by this factor"
+                f"{name}: image points scatter more than their sigmas say, by factors of {listed}; their sigmas have "
+                "been made larger by these"
             )
     for one in run.campaign.passes:
         meeting = meeting_of(run.campaign, one, run.fields[one.name].adjustment)

@@ -20,6 +20,7 @@ import numpy as np
 from analysis.orbit.calibration_parameters import CalibrationField, Noise
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.three_line_model import LineModel, Rays
+from optics.numerics.physical_error import UnphysicalError
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import pixel_places
@@ -69,7 +70,7 @@ def light_shift(
         return np.zeros((len(line), 2))
     ground = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(ground)):
-        raise ValueError("a look misses the Earth")
+        raise UnphysicalError("a look misses the Earth")
     seconds = sensor.time(line)
     arm = ground - sensor.trajectory.position(seconds)
     geometric = np.einsum("nji,nj->ni", sensor.trajectory.body_to_itrs(seconds), arm) - model.position

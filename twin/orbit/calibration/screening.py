@@ -6,6 +6,7 @@ residuals of the rest ask for it. Nothing of it uses the truth but the counts.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +24,12 @@ from twin.orbit.measured.pass_measurements import ImagePoints
 
 _ROUNDS = 3
 _SETTLED = 1.05
-"""A factor on the sigmas that is as small is not applied, and none below 1: what the three lines' matches with one
-template have in common does not show in residuals, because it moves the adjusted point."""
+"""A factor on the sigmas of all lines together that is as small is not applied, and none below 1: what the three lines'
+matches with one template have in common does not show in residuals, because it moves the adjusted point."""
+_OWN_SIGMAS = 4.0
+"""By which the variance of a line of a pass must stand out to have a factor of its own, 3e-5 by chance. A variance by
+the median of n good points is uncertain by 1.44 / sqrt(n) of itself (1 / ln 2 of its root mean square)."""
+_MEDIAN_SPREAD = 1.0 / np.log(2.0)
 _FALSE_ALARM = 1e-4
 """Of check points, as of image points in the adjustment."""
 
@@ -36,19 +41,21 @@ def screened(campaign: Campaign) -> Campaign:
         CalibrationError: it cannot be adjusted.
     """
     found, kept = _robust(campaign)
-    total = 1.0
+    total: dict[tuple[str, str], float] = {(p.name, line): 1.0 for p in campaign.passes for line in p.control_images}
     for _ in range(_ROUNDS):
-        factor = _factor(found, kept)
-        if factor <= _SETTLED:
+        factors = _factors(found, kept)
+        if not factors:
             break
-        total *= factor
-        campaign = replace(campaign, noise=replace(campaign.noise, image=campaign.noise.image * factor))
+        for key, factor in factors.items():
+            total[key] *= factor
+        campaign = _rescaled(campaign, factors)
         found, kept = _robust(campaign)
     passes, rejected, judged = [], {}, []
     for k, one in enumerate(campaign.passes):
         less, keep_check = _without(campaign, one, kept[one.name], found)
         passes.append(less)
-        rejected[one.name] = _rejected(one, kept[one.name], keep_check, total)
+        own = FrozenMap({line: total[one.name, line] for line in one.control_images})
+        rejected[one.name] = _rejected(one, kept[one.name], keep_check, own)
         if campaign.images is not None:
             shown = campaign.images[k]
             judged.append(replace(shown, screening=_counted(one, shown, kept[one.name], keep_check)))
@@ -73,14 +80,60 @@ def _robust(campaign: Campaign) -> tuple[Adjustment, _Kept]:
     return found, kept
 
 
-def _factor(found: Adjustment, kept: _Kept) -> float:
-    """Root of the mean square of the standardised residuals of the points that are kept, by their median."""
-    squares = []
-    for name, lines in found.residual.items():
-        for line, residual in lines.items():
-            squares.append(np.sum(residual**2, axis=1)[kept[name][line]])
+def _factors(found: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
+    """(field, line) -> factor on the sigmas of its image points, by the median of the standardised residuals that are
+    kept: its own where a line stands out from the sigmas and from all others, else that of all these together. Empty
+    where none is needed.
+    """
+    squares = {
+        (name, line): np.sum(residual**2, axis=1)[kept[name][line]]
+        for name, lines in found.residual.items()
+        for line, residual in lines.items()
+    }
+    own: dict[tuple[str, str], float] = {}
+    while len(own) < len(squares):
+        # the worst first: its residuals are no measure of the others
+        rest = {key: _variance(row) for key, row in squares.items() if key not in own and len(row)}
+        if not rest:
+            break
+        common = max(_variance(np.concatenate([squares[key] for key in rest])), 1.0)
+        beyond = {k: (v / common - 1.0) * np.sqrt(len(squares[k])) / _MEDIAN_SPREAD for k, v in rest.items()}
+        worst = max(beyond, key=lambda k: beyond[k])
+        if beyond[worst] <= _OWN_SIGMAS:
+            factor = float(np.sqrt(_variance(np.concatenate([squares[key] for key in rest]))))
+            return own | (dict.fromkeys(rest, factor) if factor > _SETTLED else {})
+        own[worst] = float(np.sqrt(rest[worst]))
+    return own
+
+
+def _variance(squares: np.ndarray) -> float:
+    """Of residuals from their squared lengths (n,), by the median."""
     # median of chi-square with two degrees of freedom is 2 ln 2; the tails are what robust weights are for
-    return float(np.sqrt(np.median(np.concatenate(squares)) / (2.0 * np.log(2.0))))
+    return float(np.median(squares) / (2.0 * np.log(2.0)))
+
+
+def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:
+    """With sigmas of image points times the factor of their pass and line."""
+
+    def grown(one: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
+        return FrozenMap(
+            {
+                line: replace(row, covariance=row.covariance * factors.get((one.name, line), 1.0) ** 2)
+                for line, row in images.items()
+            }
+        )
+
+    passes = tuple(
+        replace(
+            p,
+            control_images=grown(p, p.control_images),
+            check_images=grown(p, p.check_images),
+            tie_images=grown(p, p.tie_images),
+        )
+        for p in campaign.passes
+    )
+    removed = campaign.effects if campaign.spec.effects.corrected else NO_EFFECTS
+    return replace(campaign, passes=passes).without_effects(removed)
 
 
 def _without(
@@ -120,7 +173,7 @@ def _renumbered(row: ImagePoints, stays: np.ndarray) -> ImagePoints:
     return replace(row, point=(np.cumsum(stays) - 1)[row.point])
 
 
-def _rejected(one: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factor: float) -> Rejected:
+def _rejected(one: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, factors: Mapping[str, float]) -> Rejected:
     """Names of what was left out."""
     points = [
         (str(one.control_ids[point]), name)
@@ -129,7 +182,7 @@ def _rejected(one: FieldPass, kept: dict[str, np.ndarray], check: np.ndarray, fa
     ]
     entered = sum(len(row.point) for row in one.control_images.values())
     gone = tuple(str(name) for name in one.check_ids[~check])
-    return Rejected(entered, entered - len(points), tuple(points), len(check), int(check.sum()), gone, factor)
+    return Rejected(entered, entered - len(points), tuple(points), len(check), int(check.sum()), gone, factors)
 
 
 def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], check: np.ndarray) -> Screening:

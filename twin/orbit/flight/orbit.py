@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from optics.numerics.physical_error import UnphysicalError
 from twin.orbit.flight.earth import DAY, EQUATORIAL_RADIUS, FLATTENING, Earth, EarthRotation, ut1_of
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def sun_synchronous_inclination(semi_major_axis: float, eccentricity: float = 0.
     """
     cosine = SUN_RATE / node_rate(semi_major_axis, eccentricity, 0.0)
     if abs(cosine) > 1.0:
-        raise ValueError(f"no sun-synchronous orbit has a semi-major axis of {semi_major_axis / 1e3:.0f} km")
+        raise UnphysicalError(f"no sun-synchronous orbit has a semi-major axis of {semi_major_axis / 1e3:.0f} km")
     return math.acos(cosine)
 
 
@@ -131,7 +132,7 @@ class Orbit:
         """
         t = np.asarray(seconds, dtype=np.float64)
         if not np.all((t >= self.first) & (t <= self.last)):
-            raise ValueError(
+            raise UnphysicalError(
                 f"time outside the orbit, which is known from {self.first:g} s to {self.last:g} s: found "
                 f"{np.min(t):g} s to {np.max(t):g} s"
             )
@@ -223,7 +224,7 @@ def _solve(state: np.ndarray, end: float, tolerance: float) -> Any:
         events=above_ground,
     )
     if found.status == 1 or above_ground(0.0, state) < 0.0:
-        raise ValueError(f"the orbit runs into the Earth {found.t[-1]:.0f} s from its epoch")
+        raise UnphysicalError(f"the orbit runs into the Earth {found.t[-1]:.0f} s from its epoch")
     if not found.success:
         raise RuntimeError(f"the orbit could not be followed: {found.message}")
     return found.sol
@@ -268,7 +269,7 @@ def _passing_state(spec: PassingSpec, earth: Earth, from_itrs: np.ndarray) -> np
         reach = abs(z) < abs(math.sin(sun_synchronous_inclination(a)))
         inclination = _osculating_inclination(a, 0.0, None, z) if reach else sun_synchronous_inclination(a)
     if abs(z) > math.sin(inclination):
-        raise ValueError(
+        raise UnphysicalError(
             f"an orbit of inclination {math.degrees(inclination):.3f} deg never passes latitude "
             f"{math.degrees(spec.latitude):.3f} deg"
         )

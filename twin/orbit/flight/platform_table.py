@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline, KroghInterpolator
 from scipy.spatial.transform import Rotation
 
+from optics.numerics.physical_error import UnphysicalError
 from twin.orbit.flight.light_effects import EARTH_RATE
 from twin.orbit.flight.trajectory import Attitude, Trajectory, readings
 
@@ -25,6 +26,12 @@ _SPLINE_ERROR = 1e-3
 _FOURTH_DERIVATIVE = 1.1e-5
 """m/s^4, of a coordinate of a low circular orbit: r n^4 at 300 km, with the Earth's turn."""
 _LAGRANGE_NODES = 10
+_LEAST_ROWS = 12
+"""Readings from which on every fourth still makes a curve."""
+_GROWS = 4.0
+"""Factor on the error of twice the step that noise does not reach."""
+_SURELY = 1e3
+"""Metres; no noise is as large."""
 _GAP = 5.0
 """Median intervals: readings that are farther apart leave a gap, in which nothing is known."""
 _UNIT_TOLERANCE = 1e-3
@@ -43,6 +50,7 @@ class PlatformTable:
         attitude_time: (M,) seconds, increasing.
         quaternion: (M, 4) x, y, z, w (scalar last) of unit length, neighbours on one side; turns body axes into those
             of the ITRS, v_itrs = R(q) v_body.
+        usable: two times, seconds, between which the orbit may be used; readings beyond serve to join those within.
     """
 
     epoch: str
@@ -51,6 +59,7 @@ class PlatformTable:
     velocity: Array | None
     attitude_time: Array
     quaternion: Array
+    usable: tuple[float, float] = (-np.inf, np.inf)
 
     @classmethod
     def of(
@@ -146,12 +155,12 @@ class TabulatedTrajectory:
     @property
     def first(self) -> float:
         """Begin of the span that both orbit and attitude cover, seconds."""
-        return float(max(self.table.orbit_time[0], self.table.attitude_time[0]))
+        return float(max(self.table.orbit_time[0], self.table.attitude_time[0], self.table.usable[0]))
 
     @property
     def last(self) -> float:
         """Its end, seconds."""
-        return float(min(self.table.orbit_time[-1], self.table.attitude_time[-1]))
+        return float(min(self.table.orbit_time[-1], self.table.attitude_time[-1], self.table.usable[1]))
 
     @property
     def orbit_interval(self) -> float:
@@ -172,7 +181,7 @@ class TabulatedTrajectory:
     def known(self, seconds: ArrayLike) -> np.ndarray:
         """Whether orbit and attitude are known at times (...), which is not before, after, or in a gap of readings."""
         t = np.asarray(seconds, dtype=np.float64)
-        found = np.ones(t.shape, bool)
+        found = (t >= self.table.usable[0]) & (t <= self.table.usable[1])
         for time in (self.table.orbit_time, self.table.attitude_time):
             after = np.clip(np.searchsorted(time, t, side="right") - 1, 0, len(time) - 2)
             # a reading at the end of a gap is known
@@ -235,8 +244,33 @@ class TabulatedTrajectory:
             wrong = float(np.ravel(t)[int(np.argmin(np.ravel(good)))])
             where = f"which reach from {self.first:.9g} s to {self.last:.9g} s"
             kind = "in a gap of" if self.first <= wrong <= self.last else "outside of"
-            raise ValueError(f"the time {wrong:.9g} s lies {kind} the readings of orbit and attitude, {where}")
+            raise UnphysicalError(f"the time {wrong:.9g} s lies {kind} the readings of orbit and attitude, {where}")
         return t
+
+    @cached_property
+    def interpolation_error(self) -> float:
+        """How wrong positions may be halfway between readings, metres, root mean square, by the table itself.
+
+        Every second reading is left out, and what it then deviates by is scaled to the full table by the order of the
+        interpolation, 4 or 10. Zero where that is the noise of the readings, which does not grow with the step.
+        """
+        time, place = self.table.orbit_time, self.table.position
+        step = np.diff(time)
+        if len(time) < _LEAST_ROWS or np.any(np.abs(step - np.median(step)) > 0.01 * np.median(step)):
+            return 0.0
+        found = []
+        for every in (2, 4):
+            kept = slice(0, None, every)
+            joined = (
+                CubicSpline(time[kept], place[kept])
+                if self.interpolation == "spline"
+                else _Lagrange(time[kept], place[kept])
+            )
+            # one interval from the ends, where any interpolation is worse
+            inner = (time > time[every]) & (time < time[::every][-2]) & (np.arange(len(time)) % every == every // 2)
+            found.append(float(np.sqrt(np.mean(np.sum((joined(time[inner]) - place[inner]) ** 2, axis=1)))))
+        order = 4 if self.interpolation == "spline" else min(_LAGRANGE_NODES, len(time) // 2)
+        return found[0] / 2.0**order if found[0] > _SURELY or found[1] > _GROWS * found[0] else 0.0
 
     @staticmethod
     def _gaps(time: Array) -> np.ndarray:

@@ -18,6 +18,7 @@ from typing import Protocol
 import numpy as np
 from numpy.polynomial import chebyshev
 
+from optics.numerics.physical_error import UnphysicalError
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import (
     SPEED_OF_LIGHT,
@@ -68,7 +69,7 @@ class GeolocationGrid:
             error = float(np.max(np.linalg.norm(grid._interpolated(line, between) - exact, axis=-1)))
             if error <= tolerance:
                 return cls(sensor, height, grid.nodes, error)
-        raise ValueError(f"{_COUNTS[-1]} nodes leave an error of {error:.3g} m, more than {tolerance:.3g} m")
+        raise UnphysicalError(f"{_COUNTS[-1]} nodes leave an error of {error:.3g} m, more than {tolerance:.3g} m")
 
     def blocks(self, lines: np.ndarray, pixels: np.ndarray, block: int = 128) -> Iterator[tuple[slice, np.ndarray]]:
         """Ground points of all these lines and pixels, block by block.
@@ -126,7 +127,7 @@ def _rigorous(sensor: Sensor, lines: np.ndarray, pixels: np.ndarray, height: flo
     line, pixel = np.meshgrid(lines, pixels, indexing="ij")
     points = sensor.ground(line.ravel(), pixel.ravel(), height).reshape(*line.shape, 3)
     if not np.all(np.isfinite(points)):
-        raise ValueError("a look misses the Earth")
+        raise UnphysicalError("a look misses the Earth")
     return points
 
 

@@ -89,6 +89,8 @@ TERMS = (
     "attitude_bias",
     "attitude_thermal",
     "attitude_slow",
+    "attitude_drift",
+    "attitude_walk",
 )
 """All that can be switched."""
 
@@ -106,6 +108,13 @@ def readings(first: float, last: float, interval: float) -> np.ndarray:
 
 def _noise(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
     return CubicSpline(time, sigma * np.random.default_rng(seed).standard_normal((time.size, 3)))
+
+
+def _walk(time: np.ndarray, sigma: np.ndarray, seed: np.random.SeedSequence) -> Series:
+    """A random walk, zero at the time that is nearest to zero; sigma in a second."""
+    steps = np.random.default_rng(seed).standard_normal((time.size, 3)) * np.sqrt(time[1] - time[0])
+    course = np.cumsum(steps, axis=0)
+    return CubicSpline(time, sigma * (course - course[int(np.argmin(np.abs(time)))]))
 
 
 def _drift(time: np.ndarray, sigma: np.ndarray, correlation_time: float, seed: np.random.SeedSequence) -> Series:
@@ -127,6 +136,7 @@ class MeasurementErrors:
         bias: constant rotation vector in body axes, radians, shape (3,).
         thermal: amplitude of what changes with latitude, radians, shape (3,).
         reference: latitude at which that vanishes, radians.
+        rate: of a drift that vanishes at time zero, radians per second, shape (3,).
     """
 
     position_terms: tuple[Series, ...]
@@ -135,6 +145,7 @@ class MeasurementErrors:
     bias: np.ndarray
     thermal: np.ndarray
     reference: float
+    rate: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
         """Position errors along the orbital frame's axes, metres; (...) -> (..., 3)."""
@@ -155,7 +166,8 @@ class MeasurementErrors:
             Shape (..., 3).
         """
         shape = np.sin(np.asarray(latitude) - self.reference)
-        return _sum(self.attitude_terms, seconds) + self.bias + shape[..., None] * self.thermal
+        drift = np.asarray(seconds, np.float64)[..., None] * self.rate
+        return _sum(self.attitude_terms, seconds) + self.bias + shape[..., None] * self.thermal + drift
 
 
 def draw_errors(
@@ -194,6 +206,12 @@ def draw_errors(
     if "attitude_slow" in terms and any(star.slow.noise):
         values = readings(first, last, star.slow.interval)
         attitude.append(_noise(values, np.array(star.slow.noise), streams["attitude_slow"]))
+    rate = np.zeros(3)
+    if "attitude_drift" in terms and any(star.drift):
+        rate = np.array(star.drift) * np.random.default_rng(streams["attitude_drift"]).standard_normal(3)
+    if "attitude_walk" in terms and any(star.walk):
+        looks = readings(first, last, star.interval)
+        attitude.append(_walk(looks, np.array(star.walk), streams["attitude_walk"]))
     return MeasurementErrors(
         tuple(position),
         tuple(velocity),
@@ -201,6 +219,7 @@ def draw_errors(
         np.array(star.bias) * ("attitude_bias" in terms),
         np.array(star.thermal.amplitude) * ("attitude_thermal" in terms),
         star.thermal.reference,
+        rate,
     )
 
 

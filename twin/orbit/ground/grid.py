@@ -15,6 +15,7 @@ from scipy import fft
 from scipy.ndimage import map_coordinates
 from scipy.sparse import csr_array
 
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import cores
 from twin.orbit.flight.earth import Earth, curvature_radii
 
@@ -215,7 +216,7 @@ class SplineGrid:
             and np.min(north) >= south_end
             and np.max(north) <= north_end
         ):
-            raise ValueError(
+            raise UnphysicalError(
                 f"ground beyond what is known: east {np.min(east):.0f} to {np.max(east):.0f} m, north "
                 f"{np.min(north):.0f} to {np.max(north):.0f} m; it reaches from {west_end:.0f} to {east_end:.0f} m and "
                 f"from {south_end:.0f} to {north_end:.0f} m"

@@ -26,6 +26,7 @@ from analysis.matching.matches import MatchOptions, match
 from analysis.matching.options import Reason
 from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.images.imaged_ground import Frame, ImagedGround, Map
 
@@ -180,7 +181,7 @@ POINTS_REMEDY = "a larger patch, a smaller reach or template, or more points"
 """For a PointsError."""
 
 
-class PointsError(ValueError):
+class PointsError(PhysicalError, ValueError):
     """Points that cannot be measured."""
 
 

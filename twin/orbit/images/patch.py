@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Control, make_control
@@ -47,7 +48,7 @@ LARGEST_GROUND = 40_000.0
 """Metres: side of the ground of one patch, against input that asks for more than the memory holds."""
 
 
-class PatchError(ValueError):
+class PatchError(PhysicalError, ValueError):
     """A patch that cannot be imaged.
 
     Attributes:

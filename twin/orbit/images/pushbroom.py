@@ -19,6 +19,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from scipy import fft
 
+from optics.numerics.physical_error import PhysicalError, UnphysicalError
 from optics.numerics.threads import cores, one_blas_thread
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
@@ -36,7 +37,7 @@ _MET = 1e-4
 _MOST_STEPS = 40
 
 
-class SteepTerrainError(ValueError):
+class SteepTerrainError(PhysicalError, ValueError):
     """Terrain that is steeper than a look: a part of it is hidden."""
 
 
@@ -89,7 +90,9 @@ class LookMap:
             error = float(np.max(np.abs(one._at(*probe) - exact)))
             if error <= tolerance:
                 return cls(frame, terrain, span, east, north, error)
-        raise ValueError(f"{_COUNTS[-1]} nodes along lines and pixels leave {error:.2g} m, more than {tolerance:g} m")
+        raise UnphysicalError(
+            f"{_COUNTS[-1]} nodes along lines and pixels leave {error:.2g} m, more than {tolerance:g} m"
+        )
 
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """East, north and height of the terrain that a grid of image points sees: (L,), (P,) -> (L, P) each, metres.
@@ -180,7 +183,7 @@ def _local(
 ) -> tuple[np.ndarray, np.ndarray]:
     points = sensor.ground(line, pixel, height)
     if not np.all(np.isfinite(points)):
-        raise ValueError("a look misses the Earth")
+        raise UnphysicalError("a look misses the Earth")
     return frame.local(points)[:2]
 
 
@@ -280,7 +283,7 @@ def look_map(sensor: Sensor, frame: GroundFrame, terrain: Terrain, window: Windo
         ValueError: the window, with its margin, is not all inside the image.
     """
     if not window.fits(sensor):
-        raise ValueError(
+        raise UnphysicalError(
             f"a window of {window.lines} lines from {window.first_line} and {window.pixels} pixels from "
             f"{window.first_pixel} does not lie {BORDER} inside the image of {sensor.lines} lines and "
             f"{sensor.camera.pixels} pixels"
@@ -357,7 +360,7 @@ def render_patch(
         if error <= LARGEST_ERROR:
             break
     else:
-        raise ValueError(
+        raise UnphysicalError(
             f"terrain so rough that places are {error:.3g} pixels off, more than {LARGEST_ERROR}; take more samples of "
             "a pixel or a smoother terrain"
         )

@@ -134,7 +134,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     sensors = {name: _sensor(spec, name, cameras[name], path, times[name], light) for name in spec.images}
     images = {name: _image(one, name, sensors[name], folder) for name, one in spec.images.items()}
     limits = dem.limits()
-    frame, ends = _extent(images, limits, spec.points.reach + spec.points.template)
+    frame, ends = _extent(spec, images, limits)
     maps = UserMaps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
     height = float(np.median(maps.dem.values if maps.dem.valid is None else maps.dem.values[maps.dem.valid]))
     images = {name: _sampled(image, height) for name, image in images.items()}
@@ -235,10 +235,10 @@ def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
 
 
 def _extent(
-    images: Mapping[str, UserImage], heights: tuple[float, float], reach: int
+    spec: OrbitMatchSpec, images: Mapping[str, UserImage], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
     """Plane coordinates of the ground, and west, east, south and north end of what the images can show, metres."""
-    seen = []
+    seen, reach = [], spec.points.reach + spec.points.template
     for name, image in images.items():
         window = image.window
         side = [np.linspace(-reach, n - 1.0 + reach, _BORDER) for n in (window.lines, window.pixels)]
@@ -249,7 +249,8 @@ def _extent(
         for height in heights:
             points = sensor.ground(line, pixel, height)
             if not np.all(np.isfinite(points)):
-                raise InputError(Issue(f"{name} looks past the Earth: are the conventions right? `check` tells"))
+                remedy = "conventions under which the lines look at the Earth: `twin.orbit check` tells"
+                raise spec.error(f"{name} looks past the Earth", ("images", name), allowed=remedy)
             seen.append(points)
     every = np.concatenate(seen)
     longitude, latitude, _ = Earth().geodetic(np.mean(every, axis=0))

@@ -14,11 +14,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
-from twin.orbit.measured.clock import known_scale
+from twin.orbit.measured.clock import Readings, known_scale
 from twin.orbit.measured.platform_readings import (
     AttitudeReadings,
     OrbitReadings,
     Scalar,
+    Segment,
     Turns,
     known_frame,
     require_orbit,
@@ -64,16 +65,18 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         if centre.upper() != "EARTH":
             raise InputError(Issue("an orbit about another body", file, line, ("CENTER_NAME",), shown(centre), "EARTH"))
     frame, line = _same(file, segments, "REF_FRAME")
-    rows, lines = _joined(segments)
+    rows, lines = _all_rows(segments)
     widths = {len(row) for row in rows}
     cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
     found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
     clock = readings(file, [row[0] for row in rows], lines)
-    require_rising(file, clock, lines)
     require_orbit(file, found[:, :3], lines)
-    return OrbitReadings(
-        file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), _scale(file, segments)
-    )
+    parts = _parts(file, segments)
+    for part, segment in zip(parts, segments, strict=True):
+        own = slice(part.first, part.last + 1)
+        require_rising(file, Readings(clock.day[own], clock.second[own]), segment.lines)
+    scale = _scale(file, segments)
+    return OrbitReadings(file, clock, found[:, :3], found[:, 3:], known_frame(frame, file, line), scale, parts)
 
 
 def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings:
@@ -227,6 +230,29 @@ def _scale(file: str, segments: list[_Segment]) -> str:
     except Problem as problem:
         key = ("TIME_SYSTEM",)
         raise InputError(Issue(problem.problem, file, line, key, problem.found, problem.allowed)) from None
+
+
+def _all_rows(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:
+    """Rows of all segments one after the other, with their lines."""
+    return [row for s in segments for row in s.rows], [line for s in segments for line in s.lines]
+
+
+def _parts(file: str, segments: list[_Segment]) -> tuple[Segment, ...]:
+    """Segments of an orbit: nothing may be interpolated from one to the next, for they meet where an orbit breaks, as
+    at a manoeuvre, nor used outside of USEABLE_START_TIME and USEABLE_STOP_TIME (502.0-B, 5.2.4).
+    """
+    found, first = [], 0
+    for segment in segments:
+        count = len(segment.rows)
+        ends = [segment.keys.get(f"USEABLE_{end}_TIME", segment.keys.get(f"{end}_TIME")) for end in ("START", "STOP")]
+        usable = None
+        if any(f"USEABLE_{end}_TIME" in segment.keys for end in ("START", "STOP")):
+            texts = [segment.rows[k][0] if one is None else one[0] for k, one in zip((0, -1), ends, strict=True)]
+            where = [segment.lines[k] if one is None else one[1] for k, one in zip((0, -1), ends, strict=True)]
+            usable = readings(file, texts, where)
+        found.append(Segment(first, first + count - 1, usable))
+        first += count
+    return tuple(found)
 
 
 def _joined(segments: list[_Segment]) -> tuple[list[list[str]], list[int]]:

@@ -13,7 +13,7 @@ import numpy as np
 import pyproj
 
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import no_file
 
 LARGEST_PART = 100_000_000
 """Pixels that are read at once."""
@@ -127,8 +127,9 @@ def opened(file: str) -> Iterator[Any]:
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
     # names that GDAL takes for addresses or archives are none of files
-    if not is_file(Path(file)):
-        raise InputError(Issue("no such file", file, allowed="a GeoTIFF"))
+    wrong = no_file(Path(file))
+    if wrong is not None:
+        raise InputError(Issue(wrong, file, allowed="a GeoTIFF"))
     try:
         # a file beside the raster is not the raster
         with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from scenes.yaml.csv_table import Column, read_table, table_text
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, shown
+from scenes.yaml.json_file import parse_json
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.measured.datum import Datum, Geoid
@@ -72,18 +72,21 @@ def read_ground_points(spec: GroundFileSpec, folder: Path) -> GroundFile:
     """
     path = folder / spec.file
     images: dict[str, np.ndarray] = {}
+    heights = spec.heights
     match path.suffix.lower():
         case ".geojson" | ".json":
             rows, system = _geojson(path, spec), spec.crs or _GEOGRAPHIC
         case ".gcp":
-            rows, images = _gcp(path)
-            system = _required(spec)
+            rows, images, header = _gcp(path)
+            system = _required(spec) if header is None else _of_header(spec, header)
+            if header is not None and heights is None and "geocent" not in header.lower():
+                heights = "ellipsoid"  # that program counts heights from the datum
         case _:
             rows, system = _csv(path, spec), _required(spec)
     file = str(path)
     try:
         geoid = None if spec.geoid is None else Geoid.read(folder / spec.geoid)
-        datum = Datum.of(system, spec.heights, geoid)
+        datum = Datum.of(system, heights, geoid)
     except Problem as problem:
         raise spec.error(problem.problem, ("crs",), found=problem.found, allowed=problem.allowed) from None
     try:
@@ -190,14 +193,7 @@ def _fits(spec: GroundFileSpec, names: tuple[str, ...]) -> None:
 
 def _geojson(path: Path, spec: GroundFileSpec) -> _Rows:
     file, text = str(path), table_text(path, "a GeoJSON file")
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(Issue(f"not JSON: {error.msg}", file, error.lineno)) from None
-    except RecursionError:
-        raise InputError(Issue("not GeoJSON: nested too deeply", file)) from None
-    except ValueError as error:
-        raise InputError(Issue(f"not JSON: {error}", file)) from None
+    data = parse_json(text, file)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list) or not features:
         raise InputError(Issue("no features", file, None, ("features",), None, "a FeatureCollection of Points"))
@@ -244,16 +240,46 @@ def _finite(value: Any) -> bool:
 _GCP = ("latitude", "longitude", "height", "sigma x", "sigma y", "sigma z")
 
 
-def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray]]:
-    """Points of a .gcp file, and where its images have them."""
-    file = str(path)
+def _alike(first: Any, second: Any) -> bool:
+    """Whether two geographic systems name the same datum, or one that PROJ takes for the same."""
+    import pyproj
+
+    bodies = (first.ellipsoid, second.ellipsoid)
+    if bodies[0] is None or bodies[1] is None or abs(bodies[0].semi_major_metre - bodies[1].semi_major_metre) > 1e-3:
+        return False
+    to_first = pyproj.Transformer.from_crs(second.to_2d(), first.to_2d(), always_xy=True)
+    there = np.array(to_first.transform([10.0, 116.0, -75.0], [50.0, 40.0, -30.0]))
+    return bool(np.abs(there - [[10.0, 116.0, -75.0], [50.0, 40.0, -30.0]]).max() < 1e-9)
+
+
+def _of_header(spec: GroundFileSpec, header: str) -> str:
+    """The system of a header `# WKT:`, which the test may repeat."""
+    import pyproj
+
+    try:
+        crs = pyproj.CRS(header)
+        # ensembles, datums and their axes are spelt in many ways; places are what has to agree
+        same = spec.crs is None or _alike(pyproj.CRS(spec.crs), crs)
+    except pyproj.exceptions.CRSError:
+        raise spec.error("the header # WKT: of the file cannot be read", ("file",), found=shown(header)) from None
+    if not crs.is_geographic:
+        problem, allowed = "a header with a projection", "a geographic system: latitude, longitude, height"
+        raise spec.error(problem, ("file",), found=crs.name, allowed=allowed)
+    if not same:
+        allowed = f"{crs.name}, as the file's header says, or none"
+        raise spec.error("the system is said differently by the file", ("crs",), found=spec.crs, allowed=allowed)
+    return spec.crs or header
+
+
+def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray], str | None]:
+    """Points of a .gcp file, where its images have them, and the system that its header states."""
+    file, header = str(path), None
     rows, lines = [], []
     for k, line in enumerate(text_lines(path, "a .gcp file")):
         cells = line.replace(",", " ").split()
         if not cells or line.lstrip().startswith("#"):
             if "WKT:" in line:
-                problem = "a header with a projection"
-                raise InputError(Issue(problem, file, k + 1, (), None, "latitude and longitude, and no WKT"))
+                header = line.partition("WKT:")[2].strip()
             continue
         if len(cells) < 7 or (len(cells) - 7) % 5:
             allowed = "id, latitude, longitude, height, three sigmas, and for each image name, column, row, two sigmas"
@@ -279,4 +305,4 @@ def _gcp(path: Path) -> tuple[_Rows, dict[str, np.ndarray]]:
                 raise InputError(Issue("not a sigma", file, lines[k], ("image",), shown(cells[start]), "above zero"))
             images.setdefault(cells[start], []).append(np.array([k, line, column, sigma_row, sigma_column]))
     measured = {name: np.array(values) for name, values in images.items()}
-    return _Rows(ids, found[:, [1, 0, 2]], found[:, 3:], ["control"] * len(ids), lines), measured
+    return _Rows(ids, found[:, [1, 0, 2]], found[:, 3:], ["control"] * len(ids), lines), measured, header

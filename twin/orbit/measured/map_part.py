@@ -18,6 +18,8 @@ from twin.orbit.measured.geotiff import GeoRaster, open_raster, opened
 if TYPE_CHECKING:
     from scenes.specs.measured.pass_files import RasterFileSpec
 
+MOST_HEIGHT = 2.0e4
+"""Metres above or below the ellipsoid or a geoid: farther no ground lies, whatever its datum."""
 _SAMPLED = 512
 """Rows and columns at which a map is looked through for its extreme heights."""
 _WGS84 = "EPSG:4326"
@@ -122,15 +124,24 @@ class UserMap:
         return cls(raster, way, geoid)
 
     def limits(self) -> tuple[float, float]:
-        """Least and largest value of some thousand places over the whole map."""
+        """Least and largest height of some thousand places over the whole elevation model.
+
+        Raises:
+            InputError: there are none, or they are no heights of ground.
+        """
         shape = tuple(min(n, _SAMPLED) for n in self.raster.shape)
         with opened(self.raster.file) as source:
             some = source.read(self.raster.band, out_shape=shape, masked=True)
-        values = np.asarray(some.compressed(), float)
+        with np.errstate(invalid="ignore"):  # of a damaged file some are not even right NaN
+            values = np.asarray(some.compressed(), float)
         values = values[np.isfinite(values)]
         if not len(values):
             raise InputError(Issue("a map without values", self.raster.file))
-        return float(values.min()), float(values.max())
+        low, high = float(values.min()), float(values.max())
+        if max(-low, high) > MOST_HEIGHT:
+            found, allowed = f"{low:.6g} to {high:.6g} m", f"up to {MOST_HEIGHT:g} m; empty pixels as nodata"
+            raise InputError(Issue("no heights of ground", self.raster.file, found=found, allowed=allowed))
+        return low, high
 
     def part(self, frame: GroundFrame, ends: tuple[float, float, float, float], heights: bool = False) -> MapPart:
         """What lies within some ends.

@@ -23,6 +23,7 @@ from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
 from scenes.yaml.units import LENGTH, SPEED, TIME
 from twin.orbit.flight.line_times import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
+from twin.orbit.measured.map_part import MOST_HEIGHT
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_columns import platform_of
 from twin.run.procedure import Advance, silent
@@ -63,8 +64,6 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
 }
 """Key of a pass -> columns of its table; `tie_points` has those of `image_points`."""
 _SIGMAS = (("sigma",), ("sigma_plan", "sigma_height"), ("sigma_x", "sigma_y", "sigma_z"))
-_MOST_HEIGHT = 2.0e4
-"""Metres above or below the ellipsoid: farther no ground point lies, whatever its datum."""
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
 """Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
@@ -260,7 +259,7 @@ def ground_of(table: Table) -> GroundPoints:
     radius = np.linalg.norm(place, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         height = radius - radius / np.linalg.norm(place / _EARTH_AXES, axis=1)
-    far = np.flatnonzero(~(np.abs(height) < _MOST_HEIGHT))
+    far = np.flatnonzero(~(np.abs(height) < MOST_HEIGHT))
     if len(far):
         found = f"{height[far[0]] / 1e3:.6g} km above the ellipsoid"
         allowed = "Earth-centred, Earth-fixed coordinates of the ground, not geodetic ones; and is the unit right?"

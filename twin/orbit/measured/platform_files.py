@@ -6,7 +6,7 @@ Reading and understanding are two steps: `PlatformReadings` holds what the files
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +45,8 @@ _TURN = (
     *(Column(name, needed=False) for name in (*_NAMED, *_PLACED)),
     *(Column(name, ANGLE, needed=False) for name in _ANGLES),
 )
+_LARGEST_ERROR = 0.01
+"""Metres; of positions between readings."""
 _EME2000_FROM_GCRS = np.asarray(erfa.bp06(2451545.0, 0.0)[0])
 """Frame bias (IERS Conventions 2010, section 5.5.4)."""
 
@@ -138,6 +140,9 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
             at a time without orbit.
     """
     orbit, attitude = readings.orbit, readings.attitude
+    usable: Instants | None = None
+    if orbit.segments:
+        orbit, usable = _one_segment(readings, meant)
     fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
     looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
     epoch = epoch or epoch_before(fixes)
@@ -164,9 +169,41 @@ def platform_table(readings: PlatformReadings, meant: Conventions, epoch: str | 
         matrix = to_itrs(meant.attitude_frame, rotation)(turn_time) @ matrix
     quaternion = Rotation.from_matrix(matrix).as_quat(canonical=False)
     try:
-        return PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
+        table = PlatformTable.of(epoch, time, position, velocity, turn_time, quaternion)
     except ValueError as error:
         raise InputError(Issue(str(error), orbit.file)) from None
+    between = TabulatedTrajectory(table).interpolation_error
+    if between > _LARGEST_ERROR:
+        step = float(np.median(np.diff(time)))
+        found = f"{between:.2g} m with {step:g} s between readings"
+        allowed = f"{_LARGEST_ERROR:g} m: readings closer together"
+        raise InputError(Issue("positions between the readings are not known", orbit.file, None, (), found, allowed))
+    if usable is None:
+        return table
+    first, last = usable.since(epoch)
+    return replace(table, usable=(float(first), float(last)))
+
+
+def _one_segment(readings: PlatformReadings, meant: Conventions) -> tuple[OrbitReadings, Instants | None]:
+    """That part of an orbit in which most of the attitude lies, and between which moments it may be used."""
+    orbit, attitude = readings.orbit, readings.attitude
+    looks = _instants(attitude.file, attitude.clock, meant.attitude_scale, meant.attitude_offset)
+    fixes = _instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset)
+    start = epoch_before(fixes)
+    time, turn_time = fixes.since(start), looks.since(start)
+    best, best_count, best_usable = orbit.segments[0], -1, None
+    for one in orbit.segments:
+        usable = (
+            None if one.usable is None else _instants(orbit.file, one.usable, meant.orbit_scale, meant.orbit_offset)
+        )
+        first, last = (time[one.first], time[one.last]) if usable is None else usable.since(start)
+        count = int(np.sum((turn_time >= first) & (turn_time <= last)))
+        if count > best_count:
+            best, best_count, best_usable = one, count, usable
+    own = slice(best.first, best.last + 1)
+    clock = Readings(orbit.clock.day[own], orbit.clock.second[own])
+    velocity = None if orbit.velocity is None else orbit.velocity[own]
+    return replace(orbit, clock=clock, position=orbit.position[own], velocity=velocity, segments=()), best_usable
 
 
 def _in_itrs(
@@ -235,7 +272,7 @@ def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: C
 
 def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     path = folder / spec.file
-    head = list(first_lines(path, "an orbit: SP3-c or d, CCSDS OEM, or CSV"))
+    head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, or CSV"))
     if head and is_sp3(head[0]):
         return read_sp3(path, spec.satellite)
     if (kind := message_kind(head)) is not None:

@@ -20,6 +20,20 @@ FRAMES: tuple[str, ...] = get_args(Frame)
 
 
 @dataclass(frozen=True, eq=False)
+class Segment:
+    """Part of an orbit that is joined by itself, as between two manoeuvres.
+
+    Attributes:
+        first, last: of its readings, counted from 0.
+        usable: two clock readings between which the file says that it may be used; None for all of it.
+    """
+
+    first: int
+    last: int
+    usable: Readings | None = None
+
+
+@dataclass(frozen=True, eq=False)
 class OrbitReadings:
     """An orbit as a file holds it.
 
@@ -30,6 +44,7 @@ class OrbitReadings:
         velocity: (N, 3) m/s in axes and against axes of the same frame; None where the file has none.
         frame: in which; None where the file does not say.
         scale: of the clock; None where the file does not say.
+        segments: parts that no interpolation may join; empty for one.
     """
 
     file: str
@@ -38,6 +53,7 @@ class OrbitReadings:
     velocity: np.ndarray | None
     frame: str | None = None
     scale: str | None = None
+    segments: tuple[Segment, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +91,8 @@ def known_frame(name: str, file: str, line: int | None = None, key: str = "REF_F
         InputError: another one.
     """
     word = name.strip().upper().replace("-", "").replace("_", "")
-    if word.startswith(("ITRF", "ITRS", "ITR", "IGS", "IGB", "WGS84", "WGS", "SLR", "ECEF")):
+    # SP3 has five letters: ITR97, IER97 of the IERS, IGS14, IGb08, and ECF where a realisation is not said
+    if word.startswith(("ITRF", "ITRS", "ITR", "IER", "IGS", "IGB", "IGC", "WGS84", "WGS", "SLR", "ECEF", "ECF")):
         return "ITRS"
     found = {"GCRF": "GCRS", "ICRF": "GCRS", "GCRS": "GCRS", "J2000": "EME2000", "EME2000": "EME2000", "TEME": "TEME"}
     if word not in found:

@@ -1,7 +1,8 @@
-"""Orbits in SP3-c and SP3-d files (Hilla, The Extended Standard Product 3 Orbit Format, 2010 and 2016).
+"""Orbits in SP3-c and SP3-d files (Hilla, The Extended Standard Product 3 Orbit Format, 2010 and 2016), and in the
+older SP3-a and SP3-b (Remondi 1991, Gurtner 1998), whose times are GPS and whose satellites are numbers.
 
 Positions are kilometres, velocities dm/s, both Earth-fixed; the time system stands in the header. A position of zeros
-is a missing one.
+is a missing one. A file without its last line EOF is whole where it has as many epochs as its header says.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from twin.orbit.measured.clock import known_scale
 from twin.orbit.measured.platform_readings import OrbitReadings, known_frame, require_orbit
 from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
 
-WHAT = "an SP3-c or SP3-d file"
+WHAT = "an SP3 file"
 
 
 def is_sp3(first: str) -> bool:
@@ -29,23 +30,23 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         satellite: its number as the file has it, L51; may be left out where there is one only.
 
     Raises:
-        InputError: another version, no such satellite, fewer than two places, a line that cannot be read.
+        InputError: no such satellite, fewer than two places, a line that cannot be read, a file that ends early.
     """
     file, lines = str(path), text_lines(path, WHAT)
     head = lines[0]
-    if head[:2] not in ("#c", "#d"):
-        raise InputError(Issue("another version of SP3", file, 1, (), shown(head[:2]), "#c or #d"))
-    which = satellite or _only_satellite(file, lines)
-    scale = _scale(file, lines)
+    old = head[:2] in ("#a", "#b")
+    which = _name(satellite, lines, old) if satellite else _only_satellite(file, lines)
+    scale = _scale(file, lines, old)
     system = head[46:51].strip()
     frame = known_frame(system, file, 1, "coordinate system") if system not in ("", "UNDEF") else None
     texts, where, places, rows, speeds, speed_rows = [], [], [], [], [], []
     epoch: str | None = None
     ended = last_used = False
+    epochs = 0
     for k, line in enumerate(lines):
         mark = line[:1]
         if mark == "*":
-            epoch, last_used = _epoch(file, k + 1, line), False
+            epoch, last_used, epochs = _epoch(file, k + 1, line), False, epochs + 1
         elif mark in "PV" and line[1:4].strip() == which:
             if epoch is None:
                 raise InputError(Issue("a record before the first epoch", file, k + 1, (), shown(line[:20]), WHAT))
@@ -66,8 +67,11 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
         elif line.startswith("EOF"):
             ended = True
             break
-    if not ended:
-        raise InputError(Issue("the file ends early", file, len(lines), (), None, "EOF as the last line"))
+    stated = head[32:39].strip()
+    if not ended and not (stated.isdigit() and int(stated) == epochs and last_used):
+        found = f"{epochs} of {stated} epochs" if stated.isdigit() else None
+        allowed = "EOF as the last line, or all epochs of the header"
+        raise InputError(Issue("the file ends early", file, len(lines), (), found, allowed))
     if not rows and satellite is not None:
         raise _unknown(file, lines, satellite)
     if len(rows) < 2:
@@ -93,6 +97,15 @@ def _only_satellite(file: str, lines: list[str]) -> str:
     return names[0]
 
 
+def _name(wanted: str, lines: list[str], old: bool) -> str:
+    """As a file spells it: in the old versions 5, 05 and G05 are one."""
+    names = {line[1:4].strip() for line in lines if line[:1] == "P"}
+    if wanted in names or not old:
+        return wanted
+    number = wanted.lstrip("Gg").lstrip("0")
+    return next((n for n in sorted(names) if n.lstrip("Gg").strip().lstrip("0") == number), wanted)
+
+
 def _unknown(file: str, lines: list[str], wanted: str) -> InputError:
     """What to say of a satellite that a file does not have."""
     names = list(dict.fromkeys(line[1:4].strip() for line in lines if line[:1] == "P"))
@@ -102,14 +115,18 @@ def _unknown(file: str, lines: list[str], wanted: str) -> InputError:
     return InputError(issue)
 
 
-def _scale(file: str, lines: list[str]) -> str:
+def _scale(file: str, lines: list[str], old: bool) -> str:
     for k, line in enumerate(lines[:400]):
         if line.startswith("%c"):
+            if old and line[9:12].lower() in ("ccc", "", "   "):
+                return known_scale("GPS")
             try:
                 return known_scale(line[9:12])
             except Problem as problem:
                 key = ("time system",)
                 raise InputError(Issue(problem.problem, file, k + 1, key, problem.found, problem.allowed)) from None
+    if old:
+        return known_scale("GPS")
     raise InputError(Issue("no line %c with the time system", file, None, (), None, WHAT))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scenes.yaml.csv_table import table_text
+from scenes.yaml.csv_table import LARGEST_NUMBER, table_text
 from scenes.yaml.errors import InputError, Issue, Problem, shown
 from twin.orbit.measured.clock import Readings
 
@@ -37,7 +37,7 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
         heads: (K,) what the columns are, for messages.
 
     Raises:
-        InputError: a row with another number of texts, one that is no number, or not finite.
+        InputError: a row with another number of texts, one that is no number, not finite, or beyond LARGEST_NUMBER.
     """
     width = len(heads)
     uneven = next((k for k, row in enumerate(cells) if len(row) != width), None)
@@ -58,6 +58,10 @@ def numbers(file: str, cells: Sequence[Sequence[str]], lines: Sequence[int], hea
     if np.any(bad):
         k, j = (int(v) for v in np.argwhere(bad)[0])
         raise InputError(Issue("not a finite number", file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
+    huge = np.abs(values) > LARGEST_NUMBER
+    if np.any(huge):
+        k, j = (int(v) for v in np.argwhere(huge)[0])
+        raise InputError(Issue("larger than any quantity", file, lines[k], (heads[j],), shown(cells[k][j]), "a number"))
     return values
 
 

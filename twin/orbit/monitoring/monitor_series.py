@@ -11,9 +11,11 @@ import numpy as np
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
 from analysis.monitor.monitoring import CameraParameters
-from analysis.monitor.recovery import joint, measure_spots
+from analysis.monitor.recovery import joint, judged_spots
 from analysis.monitor.series_smoother import smooth, window_of
+from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
+from analysis.spots.fit_state import FitStates
 from analysis.spots.spot_positions import (
     SeriesNoise,
     SpotError,
@@ -34,6 +36,10 @@ if TYPE_CHECKING:
 CHUNK = 25
 """States rendered at once, to bound memory."""
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
+
+
+Judged = tuple[SpotPositions, FitStates]
+"""Spots with the sigmas that their fits leave them, and how good these are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +95,25 @@ class Measured:
         positions: (2, S, C, 2) before and after, px.
         covariance: (S, 2 C, 2 C) px^2 of each state's shifts.
         noise: of the shifts of all states together; None where they are not of one series.
+        evidence: what the fits of the spots say of their sigmas.
     """
 
     positions: np.ndarray
     covariance: np.ndarray
     noise: SeriesNoise | None
+    evidence: SpotEvidence
+
+    def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
+        """A warning where sigma does not hold: at the worst of the states.
+
+        Args:
+            times: of the states, seconds.
+            spots: their names.
+        """
+        worst = self.evidence.worst
+        told = self.evidence.doubt(worst, spots)
+        bad = int(np.count_nonzero(~self.evidence.holds))
+        return () if told is None else (f"at {moment(times[worst])}, the worst of {bad} times: {told.text}",)
 
     @property
     def shifts(self) -> np.ndarray:
@@ -115,8 +135,10 @@ class _Some:
 class _Collected:
     """Differences to one set of reference images, piece by piece: influence maps of all positions would be large."""
 
-    def __init__(self, experiment: MonitorExperiment, before: SpotPositions, series: bool) -> None:
+    def __init__(self, experiment: MonitorExperiment, start: Judged, series: bool) -> None:
+        before, self.fits = start
         self.detector, self.before = experiment.calibration.noise, before
+        self.more: list[FitStates] = []
         self.spots = experiment.calibration.spots
         self.end: list[np.ndarray] = []
         self.spread: list[np.ndarray] = []
@@ -124,7 +146,9 @@ class _Collected:
         if series and experiment.disturbances is not None:
             self.noise = SeriesNoise(noise_parts(before, self.detector), window_of(2 * self.spots))
 
-    def add(self, after: SpotPositions) -> None:
+    def add(self, found: Judged) -> None:
+        after, fits = found
+        self.more.append(fits)
         spread = difference_covariance(self.before, after, self.detector)
         self.spread.append(joint(spread.reshape(-1, self.spots, 2, 2)))
         self.end.append(after.position.reshape(-1, self.spots, 2))
@@ -134,7 +158,8 @@ class _Collected:
     def measured(self) -> Measured:
         end = np.concatenate(self.end)
         start = np.broadcast_to(self.before.position.reshape(1, self.spots, 2), end.shape)
-        return Measured(np.stack([start, end]), np.concatenate(self.spread), self.noise)
+        evidence = SpotEvidence(self.fits, FitStates.joined(self.more))
+        return Measured(np.stack([start, end]), np.concatenate(self.spread), self.noise, evidence)
 
 
 class MonitorSeries:
@@ -215,7 +240,10 @@ class MonitorSeries:
             found.add(self._spots(after, number))
             pieces.append(found.measured())
         positions = np.concatenate([one.positions for one in pieces], axis=1)
-        return Measured(positions, np.concatenate([one.covariance for one in pieces]), None)
+        every = [one.evidence for one in pieces]
+        first, last = (FitStates.joined([getattr(one, name) for one in every]) for name in ("before", "after"))
+        covariance = np.concatenate([one.covariance for one in pieces])
+        return Measured(positions, covariance, None, SpotEvidence(first, last))
 
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
         """(S, 8, 2 C) of the estimator, parameters of the pair per pixel.
@@ -288,12 +316,12 @@ class MonitorSeries:
         values = np.einsum("...pd,...d->...p", gains, shifts)
         return {name: values[:, 4 * k : 4 * k + 4] for k, name in enumerate(self.pair)}
 
-    def _spots(self, frames: np.ndarray, first: int | None) -> SpotPositions:
+    def _spots(self, frames: np.ndarray, first: int | None) -> Judged:
         calibration = self.experiment.calibration
         flat = frames.reshape(-1, *frames.shape[-2:])
         try:
             with one_blas_thread():
-                return measure_spots(flat, self.frames, calibration, self.spec.analysis.centroid, cores())
+                return judged_spots(flat, self.frames, calibration, self.spec.analysis.centroid, cores())
         except SpotError as error:
             raise self._lost(error, self.spec.referred if first is None else first) from error
 

@@ -145,6 +145,7 @@ class MonitorFlight:
         repeated: what the monitor says at time `worst`, measured again and again.
         worst: number of the time with the largest change of the angle.
         turned: camera -> its line at the reference when the whole camera is turned by 1 arcsec about its Y.
+        doubts: where the monitor's sigmas do not hold, for its spots are not as calibrated.
     """
 
     spec: OrbitMonitorSpec
@@ -165,6 +166,7 @@ class MonitorFlight:
     worst: int
     causes: tuple[Cause, ...]
     turned: Mapping[str, LineCamera]
+    doubts: tuple[str, ...] = ()
 
     def true_line(self, camera: str, k: int) -> CalibratedLine:
         """A camera as it truly is at time number k, in the analysis's form: for comparison only."""
@@ -241,6 +243,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         worst,
         causes,
         FrozenMap(turned),
+        used.doubts(spec.course.times, [channel.key for channel in experiment.path.channels]),
     )
 
 

@@ -15,6 +15,7 @@ from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
+from twin.sensors.grey_steps import coarse_warnings
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
@@ -355,7 +356,7 @@ def _facts(setup: MonitorSetup) -> tuple[tuple[str, str], ...]:
 
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
-    out = []
+    out = [*coarse_warnings(run.setup), *run.flight.doubts]
     if not run.scatter.agrees:
         low, high = run.scatter.limits
         ratio = run.scatter.spread / run.scatter.sigma

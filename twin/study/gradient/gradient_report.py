@@ -73,7 +73,7 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
             worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
             tables=[artefact_content(a, place(a)) for a in tables],
             figures=[artefact_content(a, place(a)) for a in figures],
-            command=reproduce(PROGRAM, "config.yaml", "--gradient"),
+            command=reproduce((PROGRAM, "config.yaml", "--gradient")),
             versions=versions(),
         )
     )

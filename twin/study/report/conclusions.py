@@ -7,7 +7,8 @@ from collections import Counter
 from scenes.specs.study import GRID, SAMPLERS
 from twin.run.report import one_sentence
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
-from twin.study.report.study_analysis import GOALS, Convergence, StudyAnalysis
+from twin.study.report.stated_noise import impossible
+from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
 from twin.study.report.study_runs import Response, typeset
 from twin.study.report.study_statistics import LEAST
 from twin.study.report.study_wording import listed, number, percent, plural, span, with_unit
@@ -34,6 +35,16 @@ def warnings(found: StudyAnalysis) -> list[str]:
             out.append(
                 "So many failed that the others no longer follow the design; statistics are those of what can be done."
             )
+    wrong = impossible(runs)
+    out += [str(issue) for issue in wrong.issues] if wrong is not None else []
+    doubts = [text for text in runs.doubts if text]
+    if doubts:
+        # the same words about other numbers are one reason
+        common = [f"{text} ({plural(n, 'run')})" for text, n in Counter(map(_reason, doubts)).most_common(3)]
+        out.append(
+            f"σ does not hold in {len(doubts)} of {plural(runs.count, 'run')}, whose readings are in all statistics as "
+            f"they are: {'; '.join(common)}. Which, the column doubt says."
+        )
     for r in runs.responses:
         missing = int((~r.good & ~runs.failed).sum())
         if missing:
@@ -46,13 +57,23 @@ def warnings(found: StudyAnalysis) -> list[str]:
     return out
 
 
+def _reason(doubt: str) -> str:
+    """A doubt in its first words, without numbers and names of spots."""
+    head, _, rest = doubt.partition("; ")
+    if "fit of the spots" in head:
+        return f"the fit of spots is not good: {rest.partition(':')[0].partition('. ')[0]}"
+    return head.removeprefix("σ does not hold: ").partition(" (")[0]
+
+
 def indices_texts(found: StudyAnalysis) -> list[str]:
     """How the indices were found, and how good that is."""
     if found.runs.sampled:
         out = [
             f"From the given runs ({design_title(found.runs.kind)}; not a design made for the indices): polynomial "
-            f"chaos, whose squared coefficients are the parts of the variance; intervals from {RESAMPLES} resamples by "
-            f"the wild bootstrap. RBD-FAST with {HARMONICS} harmonics beside it."
+            f"chaos, whose squared coefficients are the parts of the variance. Intervals from {RESAMPLES} resamples of "
+            "the runs, for the terms that were chosen and as far into the tails as these runs reach; what the terms "
+            "leave may belong to any factor and counts for every upper end, less the noise that the runs state. "
+            f"RBD-FAST with {HARMONICS} harmonics beside it."
         ]
     else:
         out = [
@@ -65,7 +86,7 @@ def indices_texts(found: StudyAnalysis) -> list[str]:
         elif part.method == "chaos":
             out.append(_model_text(name, part))
         elif part.noise is not None and part.noise > 0.01:
-            out.append(f"{name}: the runs' own sigmas state {percent(min(part.noise, 1.0))} of the variance as noise.")
+            out.append(f"{name}: the runs state {percent(part.noise)} of the variance as their noise.")
     return out
 
 
@@ -76,7 +97,7 @@ def _model_text(name: str, part: Indices) -> str:
         f"{percent(part.rest)} of the variance not explained"
     ).replace("-", "\N{MINUS SIGN}" if part.held_out < 0 else "-")
     if part.noise is not None:
-        text += f" (noise by the runs' own sigmas: {percent(min(part.noise, 1.0))})"
+        text += f" (noise as the runs state it: {percent(part.noise)})"
     explained = part.rest - (part.noise or 0.0) < 0.05
     if part.held_out < BAD_MODEL and not explained:
         text += "; so poor a model tells orders of importance at best"
@@ -151,7 +172,8 @@ def verdict(found: StudyAnalysis) -> str:
         name = f"{worst.name} ({worst.text})" if worst.name else "all requirements together"
         least = ", met least," if len(known) > 1 else ""
         are = "is" if worst.name else "are"
-        first.append(f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a number")
+        whatever = _whatever(worst)
+        first.append(f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a number{whatever}")
     elif runs.responses:
         first.append(_contributors(found, runs.responses[0]))
     short = [name for name, statistics in found.convergences.items() if not all(one.enough for one in statistics)]
@@ -169,8 +191,16 @@ def _requirement_text(found: StudyAnalysis) -> str:
             continue
         of = f" (95% interval {span(r.interval)})" if r.interval is not None else " of the grid"
         are = "is" if r.name else "are"
-        texts.append(f"{name} {are} met by {percent(r.share)} of the runs, {r.met} of {r.count}{of}.")
+        texts.append(f"{name} {are} met by {percent(r.share)} of the runs, {r.met} of {r.count}{of}{_whatever(r)}.")
     return " ".join(texts)
+
+
+def _whatever(r: Requirement) -> str:
+    """What the runs without a number leave open, for the end of a sentence."""
+    if r.bounds is None:
+        return ""
+    interval = f" (95% interval {span(r.bounds_interval)})" if r.bounds_interval is not None else ""
+    return f", and by {r.met} to {r.most} of all {r.runs} runs, whatever the others would have given{interval}"
 
 
 def _contributors(found: StudyAnalysis, response: Response) -> str:
@@ -230,8 +260,8 @@ def _rest_reason(indices: Indices) -> str:
     if indices.noise is None:
         return "noise, or a shape that the model does not follow"
     if indices.noise > 0.7 * indices.rest:
-        return f"noise: the runs' own sigmas state {percent(min(indices.noise, 1.0), 0)}"
-    return f"the runs' own sigmas state only {percent(indices.noise, 0)}; the model does not follow the rest"
+        return f"noise: the runs state {percent(indices.noise, 0)}"
+    return f"the runs state only {percent(indices.noise, 0)} as noise; the model does not follow the rest"
 
 
 def _knee(found: StudyAnalysis, k: int) -> str:

@@ -11,6 +11,7 @@ from scipy import stats
 
 from twin.study.report.study_runs import Factor, Response
 from twin.study.report.study_statistics import CONFIDENCE, Estimate, Interval
+from twin.study.runs.sampling import quantiles
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,8 @@ class Effect:
     Attributes:
         factor: its name.
         swing: change of the response from the factor's 5% to its 95% quantile, in the response's unit; of a text the
-            largest minus the smallest mean of its values, the other factors equal.
+            largest minus the smallest mean of its values, the other factors equal. The quantiles are those of the
+            factor's distribution where runs are drawn from it.
         coefficient: standardised regression coefficient, sigmas of the response per sigma of the factor; None for
             texts.
         rank: Spearman's rank correlation; None for texts.
@@ -57,7 +59,9 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     """The model, None when the response is constant or there are too few runs for it.
 
     Intervals are those of White's covariance in MacKinnon and White's form HC3, which stays true when what the model
-    leaves is not equally large everywhere. Columns of the matrix that follow from others are left out.
+    leaves is not equally large everywhere. Of standardised coefficients they hold what the drawn factors and responses
+    scatter by, too: sum over the runs of what each does to the coefficient. Columns of the matrix that follow from
+    others are left out.
     """
     good = response.good
     y = response.values[good]
@@ -87,7 +91,8 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     rest = y - seen @ coefficients
     leverage = np.minimum(np.sum(q**2, axis=1), 1.0 - 1e-9)
     bread = np.linalg.solve(r, q.T) * (rest / (1.0 - leverage))
-    covariance = bread @ bread.T
+    # rounding of a perfect fit
+    bread = bread if float(np.std(rest)) > 1e-12 * float(np.std(y)) else 0.0 * bread
     t = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, n - terms))
     total = float(np.sum((y - y.mean()) ** 2))
     r2 = 1.0 - float(np.sum(rest**2)) / total
@@ -96,7 +101,7 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     for factor, columns in blocks:
         own = slice(first, first + columns.shape[1])
         first += columns.shape[1]
-        effects.append(_effect(factor, good, y, coefficients[own], covariance[own, own], t))
+        effects.append(_effect(factor, good, y, coefficients[own], bread[own], t))
     effects.sort(key=lambda effect: -abs(effect.swing.value))
     adjusted = 1.0 - (1.0 - r2) * (n - 1) / (n - terms)
     return LinearModel(r2, adjusted, terms, tuple(effects), tuple(cannot))
@@ -114,35 +119,55 @@ def _columns(factor: Factor, good: np.ndarray) -> np.ndarray:
 
 
 def _effect(
-    factor: Factor, good: np.ndarray, y: np.ndarray, coefficient: np.ndarray, covariance: np.ndarray, t: float
+    factor: Factor, good: np.ndarray, y: np.ndarray, coefficient: np.ndarray, moved: np.ndarray, t: float
 ) -> Effect:
+    """``moved`` (m, n): what each run does to each coefficient; ``t`` of Student's distribution for one interval."""
     values = factor.values[good]
     if not factor.numeric:
         levels = [level for level in factor.levels if np.any(values == level)]
         means = np.concatenate([[0.0], coefficient])
         first, last = int(np.argmin(means)), int(np.argmax(means))
-        contrast = np.zeros(len(means))
-        contrast[last] += 1.0
-        contrast[first] -= 1.0
-        error = math.sqrt(max(float(contrast[1:] @ covariance @ contrast[1:]), 0.0))
-        swing = float(means[last] - means[first])
         ends = (str(levels[first]), str(levels[last]))
-        return Effect(factor.name, Estimate(swing, (max(swing - t * error, 0.0), swing + t * error)), None, None, ends)
-    low, high = (float(v) for v in np.quantile(values, (0.05, 0.95)))
-    b, error = float(coefficient[0]), math.sqrt(max(float(covariance[0, 0]), 0.0))
-    reach = (high - low) / float(values.std())
-    scale = 1.0 / float(np.std(y))
+        return Effect(factor.name, _largest_difference(means, moved, t), None, None, ends)
+    low, high = _span(factor, values)
+    b, own = float(coefficient[0]), moved[0]
+    spread = float(np.std(y))
+    # a standardised coefficient moves with the sigmas of the runs, too, which belong to the same runs
+    widths = 0.5 * (((values - values.mean()) / values.std()) ** 2 - ((y - y.mean()) / spread) ** 2) / len(y)
     rank = float(stats.spearmanr(values, y).statistic)
     return Effect(
         factor.name,
-        _scaled(b, t * error, reach),
-        _scaled(b, t * error, scale),
+        _estimate(b, own, (high - low) / float(values.std()), t),
+        _estimate(b, own + b * widths, 1.0 / spread, t),
         Estimate(rank, _rank_interval(rank, len(y))),
         (low, high),
     )
 
 
-def _scaled(value: float, half: float, scale: float) -> Estimate:
+def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
+    """The 5% and 95% quantiles of a factor: of its distribution, which is known, where the runs are drawn from it."""
+    if factor.drawn:
+        low, high = quantiles(factor.spec, np.array([0.05, 0.95]))
+    else:
+        low, high = np.quantile(values, (0.05, 0.95))
+    return float(low), float(high)
+
+
+def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estimate:
+    """Of (m,) means, the first of which is 0 by definition: the interval is of all pairs at once, by Bonferroni, so
+    that it stays true although the largest is looked for.
+    """
+    moved = np.concatenate([np.zeros((1, moved.shape[1])), moved])
+    first, last = np.triu_indices(len(means), 1)
+    size = np.abs(means[last] - means[first])
+    # as many times less often as there are pairs; in sigmas of a normal distribution about the one of Student's
+    wide = t * float(stats.norm.isf(0.5 * (1.0 - CONFIDENCE) / len(size)) / stats.norm.isf(0.5 * (1.0 - CONFIDENCE)))
+    half = wide * np.linalg.norm(moved[last] - moved[first], axis=1)
+    return Estimate(float(np.max(size)), (max(float(np.max(size - half)), 0.0), float(np.max(size + half))))
+
+
+def _estimate(value: float, moved: np.ndarray, scale: float, t: float) -> Estimate:
+    half = t * math.sqrt(float(np.sum(moved**2)))
     return Estimate(scale * value, (scale * (value - half), scale * (value + half)))
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy import stats
 from scipy.special import roots_legendre
 
+from twin.study.report.stated_noise import noise_share
 from twin.study.report.study_runs import Factor, Response, StudyRuns
 from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate
 
@@ -81,7 +85,10 @@ def _of_number(factor: Factor, values: np.ndarray, degree: int) -> tuple[np.ndar
         return np.polynomial.hermite_e.hermevander(x, degree)[:, 1:] * scale, orders
     if kind == "truncated":
         mean, sigma, low, high = numbers
-        low, high = max(low, mean - 10.0 * sigma), min(high, mean + 10.0 * sigma)
+        # further out the density is below exp(-50) of its largest within the limits, which may lie far from the mean
+        nearest = (min(max(mean, low), high) - mean) / sigma
+        reach = sigma * math.sqrt(nearest**2 + 100.0)
+        low, high = max(low, mean - reach), min(high, mean + reach)
         nodes, weights = roots_legendre(200)
         places = 0.5 * (low + high) + 0.5 * (high - low) * nodes
         z = (places - mean) / sigma
@@ -152,10 +159,11 @@ def _orthonormal(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
 HIGHEST_DEGREE = 12
 MOST_TERMS = 250
 MOST_RUNS = 20_000
+TINY = sys.float_info.min
 RUNS_TO_CHOOSE = 3_000
 """Of the first that many runs the degree is found."""
 RUNS_PER_TERM = 2.5
-RESAMPLES = 300
+RESAMPLES = 1000
 HARMONICS = 10
 """Of the factor's cycle that RBD-FAST sums."""
 
@@ -193,7 +201,8 @@ class Indices:
         terms: of them; 0 for a grid.
         held_out: R2 of runs that the model was not fitted to, by leaving each out in turn; None for a grid.
         rest: share of the variance that the model does not explain; 0 for a grid.
-        noise: share of the variance that the runs' own sigmas state; None without.
+        noise: share of the variance that the runs state as noise, as `noise_share`; None without. By chance above 1
+            where nothing else varies.
     """
 
     method: str
@@ -218,15 +227,17 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     No design of a study is Saltelli's, so that the indices come from the given runs. A complete grid is its own
     distribution, whose variance is taken apart exactly. Of drawn designs polynomial chaos is fitted (Sudret,
     Reliability Engineering and System Safety 93, 964, 2008); the variances are sums of its squared coefficients, less
-    what their noise adds. The degree is that with the smallest error of runs left out in turn. Intervals come from 300
-    resamples by the wild bootstrap of what the model leaves.
+    what their noise adds. The degree is that with the smallest error of runs left out in turn. Intervals come from 1000
+    resamples of the runs. They are those of the terms that were chosen; what these leave may belong to any factor, and
+    counts for the upper end of each as far as the runs do not state it as noise.
     """
     axes = [axis for axis in runs.axes if any(len(np.unique(f.values[response.good])) > 1 for f in axis)]
     if response.constant:
         return NoIndices("the response is constant")
     if not axes:
         return NoIndices("no factor varies")
-    noise = _noise(response)
+    stated = noise_share(response, runs.study)
+    noise = None if stated is None else stated.share
     if not runs.sampled:
         if not np.all(response.good):
             return NoIndices("runs of the grid are missing, and its variance cannot be taken apart")
@@ -241,15 +252,9 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
         return NoIndices(str(error))
     if chaos is None:
         return NoIndices(f"{n} runs are too few for {len(axes)} factors")
-    return Indices("chaos", chaos.indices(runs), chaos.degree, len(chaos.coefficients), chaos.held_out,
-                   chaos.rest, noise)  # fmt: skip
-
-
-def _noise(response: Response) -> float | None:
-    if response.sigma is None:
-        return None
-    sigma = response.sigma[response.good]
-    return float(np.nanmean(sigma**2) / np.var(response.known)) if np.any(np.isfinite(sigma)) else None
+    own = 0.0 if noise is None else noise * float(np.var(response.known, ddof=1))
+    found = chaos.indices(own, runs.study.design.seed)
+    return Indices("chaos", found, chaos.degree, len(chaos.coefficients), chaos.held_out, chaos.rest, noise)
 
 
 def _of_grid(axes: Sequence[tuple[Factor, ...]], values: np.ndarray) -> tuple[Index, ...]:
@@ -359,47 +364,84 @@ class _Chaos:
         total = float(np.sum(coefficients[1:] ** 2)) + rest
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
-    def indices(self, runs: StudyRuns) -> tuple[Index, ...]:
-        first, total = self._shares(self.y[:, None])
-        # what is left at each run is turned at random; it is first made as large as that of a run left out
-        fit = self.q @ (self.q.T @ self.y)
-        left = (self.y - fit) / np.sqrt(np.maximum(1.0 - np.sum(self.q**2, axis=1), 1e-9))
-        generator = np.random.default_rng(np.random.SeedSequence(runs.study.design.seed))
-        parts = []
-        for _ in range(RESAMPLES // 50):
-            signs = generator.choice((-1.0, 1.0), (len(self.y), 50))
-            parts.append(self._shares(fit[:, None] + left[:, None] * signs))
-        firsts, totals = (np.concatenate([part[k] for part in parts], axis=1) for k in (0, 1))
+    def indices(self, noise: float, seed: int) -> tuple[Index, ...]:
+        """Of every axis, the largest total first.
+
+        Args:
+            noise: variance of the noise that the runs state, 0 where they state none.
+            seed: of the resamples.
+        """
+        first, total = self._shares()
+        lows, highs = self._resampled(noise, seed)
         out = []
         for k, axis in enumerate(self.axes):
             names = tuple(factor.name for factor in axis)
-            check = rbd_fast(axis, self.good, self.y)
-            out.append(Index(names, _estimate(first[k, 0], firsts[k]), _estimate(total[k, 0], totals[k]), check))
+            alone = _estimate(first[k], lows[:, 0, k], highs[:, 0, k])
+            whole = _estimate(total[k], lows[:, 1, k], highs[:, 1, k])
+            out.append(Index(names, alone, whole, rbd_fast(axis, self.good, self.y)))
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
-    def _shares(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First order and total indices (axes, b) of responses (n, b)."""
-        n, m = len(self.y), len(self.terms)
-        centred = y - y.mean(axis=0)
-        projected = self.q.T @ centred
-        rest = (np.sum(centred**2, axis=0) - np.sum(projected**2, axis=0)) / (n - m - 1)
-        # rounding of a perfect fit
-        rest = np.where(rest < 1e-20 * np.var(y, axis=0), 0.0, rest)
-        inverse = np.linalg.inv(self.r)
-        squares = (inverse @ projected)[1:] ** 2
-        # a coefficient's square is too large by its variance
-        squares = squares - np.sum(inverse**2, axis=1)[1:, None] * rest
-        whole = np.maximum(np.sum(squares, axis=0), 0.0) + rest
+    def _parts(self, squares: np.ndarray) -> np.ndarray:
+        """Of squared coefficients (..., m) the sums of each axis alone and of all terms with it, (..., 2, axes)."""
         used = self.terms > 0
-        alone = used.sum(axis=1) == 1
-        first = np.stack([np.sum(squares[used[:, k] & alone], axis=0) for k in range(used.shape[1])])
-        total = np.stack([np.sum(squares[used[:, k]], axis=0) for k in range(used.shape[1])])
-        return np.clip(first / whole, 0.0, 1.0), np.clip(total / whole, 0.0, 1.0)
+        alone = used & (used.sum(axis=1) == 1)[:, None]
+        return np.stack([squares @ alone, squares @ used], axis=-2)
+
+    @cached_property
+    def _fit_rest(self) -> tuple[np.ndarray, float]:
+        """What is left at each run as if it had been left out, (n,), and the variance of what is left."""
+        centred = self.y - self.y.mean()
+        left = centred - self.q @ (self.q.T @ centred)
+        rest = float(np.sum(left**2)) / (len(self.y) - len(self.terms) - 1)
+        # rounding of a perfect fit
+        rest = rest if rest >= 1e-20 * np.var(self.y) else 0.0
+        return left / np.maximum(1.0 - np.sum(self.q**2, axis=1), 1e-9), rest
+
+    @cached_property
+    def _squares(self) -> np.ndarray:
+        """(m,) squared coefficients; each is too large by its variance, which is taken off."""
+        inverse = np.linalg.inv(self.r)
+        return np.asarray(self.coefficients**2 - np.sum(inverse**2, axis=1)[1:] * self._fit_rest[1])
+
+    def _shares(self) -> np.ndarray:
+        """First order and total indices, (2, axes)."""
+        whole = max(float(np.sum(self._squares)), 0.0) + self._fit_rest[1]
+        return np.clip(self._parts(self._squares) / whole, 0.0, 1.0)
+
+    def _resampled(self, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of resampled runs, (b, 2, axes) each: without what the model leaves, and with all of it that is not
+        noise.
+
+        Pairs are resampled, each run with its factors and its response, so that the coefficients and the whole variance
+        vary as between studies: each run as often as a Poisson variable of mean 1 says, the coefficients to first order
+        by what each run does to them when it is left out.
+        """
+        n, m = len(self.y), len(self.terms)
+        out, rest = self._fit_rest
+        # of runs that the terms were not fitted to: what they are wrong by elsewhere is in it
+        held_out = float(np.mean(out**2)) if rest > 0.0 else 0.0
+        # few runs know their own scatter badly: as Student's distribution is wider than the normal one
+        wide = float(stats.t.ppf(0.975, n - m - 1) / stats.norm.ppf(0.975))
+        each = wide * (np.linalg.solve(self.r, self.q.T)[1:] * out).T
+        spread = np.sum(each**2, axis=0)
+        generator = np.random.default_rng(np.random.SeedSequence(seed))
+        lows, highs = [], []
+        for _ in range(RESAMPLES // 100):
+            more = generator.poisson(1.0, (100, n)) - 1.0
+            moved = self.coefficients + more @ each
+            # about the estimate: the squares of what is added are taken off
+            squares = moved**2 - self.coefficients**2 - spread + self._squares
+            unexplained = np.maximum(held_out + wide * (more @ (out**2 - held_out)) / n, 0.0)
+            whole = np.maximum(np.sum(squares, axis=-1), 0.0) + unexplained
+            parts, whole = self._parts(squares), np.maximum(whole, TINY)[:, None, None]
+            lows.append(np.clip(parts / whole, 0.0, 1.0))
+            highs.append(np.clip((parts + np.maximum(unexplained - noise, 0.0)[:, None, None]) / whole, 0.0, 1.0))
+        return np.concatenate(lows), np.concatenate(highs)
 
 
-def _estimate(value: float, resampled: np.ndarray) -> Estimate:
+def _estimate(value: float, lows: np.ndarray, highs: np.ndarray) -> Estimate:
     side = 0.5 * (1.0 - CONFIDENCE)
-    low, high = (float(v) for v in np.quantile(resampled, (side, 1.0 - side)))
+    low, high = float(np.quantile(lows, side)), float(np.quantile(highs, 1.0 - side))
     return Estimate(float(value), (min(low, float(value)), max(high, float(value))))
 
 

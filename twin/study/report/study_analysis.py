@@ -14,6 +14,7 @@ import xarray as xr
 from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
 from twin.study.report.linear_model import LinearModel, MainEffect, linear_model, main_effects
 from twin.study.report.sensitivity_indices import Indices, NoIndices, sensitivity_indices
+from twin.study.report.stated_noise import NoiseShare, noise_share
 from twin.study.report.study_runs import Factor, Response, StudyRuns
 from twin.study.report.study_statistics import (
     CONFIDENCE,
@@ -111,7 +112,8 @@ class Requirement:
         text: in words.
         met: runs that meet it.
         count: runs that have a number.
-        interval: of the share, in a drawn design; None in a grid.
+        runs: all runs, those without a number too.
+        interval: of the share of those that have a number, in a drawn design; None in a grid.
         judged: statistics of what is judged: the response, or its size; None for all together.
         unit: of it.
     """
@@ -120,6 +122,7 @@ class Requirement:
     text: str
     met: int
     count: int
+    runs: int
     interval: tuple[float, float] | None
     judged: Description | None
     unit: str
@@ -128,6 +131,27 @@ class Requirement:
     def share(self) -> float | None:
         """Share of the runs with a number; None without any."""
         return self.met / self.count if self.count else None
+
+    @property
+    def most(self) -> int:
+        """Runs that would meet it if all without a number did."""
+        return self.met + self.runs - self.count
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """Share of all runs if none and if all of those without a number meet it; None where all have one. Whether a
+        run fails may go with what it would have given: then the interval of the others says nothing of all.
+        """
+        return None if self.count == self.runs else (self.met / self.runs, self.most / self.runs)
+
+    @property
+    def bounds_interval(self) -> tuple[float, float] | None:
+        """From the lower end of the interval of the lower bound to the upper end of that of the upper one, in a drawn
+        design: whatever runs without a number would have given.
+        """
+        if self.bounds is None or (self.interval is None and self.count):
+            return None
+        return share_interval(self.met, self.runs)[0], share_interval(self.most, self.runs)[1]
 
 
 def is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
@@ -166,7 +190,7 @@ def _counted(
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
     interval = share_interval(met, count) if runs.sampled and count else None
-    return Requirement(name, text, met, count, interval, judged, unit)
+    return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
 def _text(spec: ThresholdSpec) -> str:
@@ -247,6 +271,7 @@ class StudyAnalysis:
         descriptions: statistics of responses and of stated sigmas.
         linear: None where no model can be fitted.
         effects: main effects of a grid; empty in drawn designs.
+        noise: of the responses whose noise the runs state.
         indices: empty when the study does not ask for them.
         convergences: how the statistics settle; empty for grids.
         requirements: in the study's order, then all together.
@@ -258,6 +283,7 @@ class StudyAnalysis:
     descriptions: Mapping[str, Description]
     linear: Mapping[str, LinearModel | None]
     effects: Mapping[str, tuple[MainEffect, ...]]
+    noise: Mapping[str, NoiseShare]
     indices: Mapping[str, Indices | NoIndices]
     convergences: Mapping[str, tuple[Convergence, ...]]
     requirements: tuple[Requirement, ...]
@@ -282,6 +308,7 @@ class StudyAnalysis:
             descriptions={r.name: describe(r.values, runs.sampled) for r in everything},
             linear={r.name: linear_model(runs.factors, r) for r in everything},
             effects={r.name: () if runs.sampled else main_effects(runs.factors, r) for r in everything},
+            noise={share.response: share for r in runs.responses if (share := noise_share(r, runs.study)) is not None},
             indices={r.name: sensitivity_indices(runs, r) for r in indexed},
             convergences={
                 r.name: convergences(r.known) if runs.sampled and not r.constant else () for r in runs.responses
@@ -336,6 +363,7 @@ def plain_data(found: StudyAnalysis) -> dict[str, Any]:
                 "unit": r.unit,
                 **({"sigma_of": r.of} if r.of else {}),
                 **_description(found.descriptions[r.name]),
+                **_noise(found.noise.get(r.name)),
                 "linear_model": _linear(found.linear[r.name]),
                 "main_effects": [
                     {"factor": e.factor, "levels": e.levels.tolist(), "means": e.means.tolist(), "swing": e.swing}
@@ -354,6 +382,8 @@ def plain_data(found: StudyAnalysis) -> dict[str, Any]:
                 "runs_with_a_number": r.count,
                 "share": r.share,
                 "interval": list(r.interval) if r.interval is not None else None,
+                "bounds": list(r.bounds) if r.bounds is not None else None,
+                "bounds_interval": list(r.bounds_interval) if r.bounds_interval is not None else None,
             }
             for r in found.requirements
         ],
@@ -393,6 +423,10 @@ def _description(d: Description) -> dict[str, Any]:
         "p0135": d.tails[0] if d.tails else None,
         "p99865": d.tails[1] if d.tails else None,
     }
+
+
+def _noise(found: NoiseShare | None) -> dict[str, Any]:
+    return {} if found is None else {"noise_share": found.share, "noise_share_possible": found.possible}
 
 
 def _linear(model: LinearModel | None) -> dict[str, Any] | None:

@@ -2,33 +2,50 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import xarray as xr
 
 from scenes.specs.study import StudySpec
-from twin.run.artefact import Artefact
+from twin.run.artefact import Artefact, Undrawn
+from twin.run.owned_files import every_file
 from twin.run.page import artefact_content, environment, place, reproduce
+from twin.run.run_folder import json_text
 from twin.run.versions import versions
 from twin.study.report.conclusions import conclusions, design_title, verdict, warnings
 from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
 from twin.study.report.study_runs import StudyRuns
 from twin.study.report.study_sections import factor_table, own_file, response_table, sections
 from twin.study.runs.plan import Plan
-from twin.study.runs.study_folder import PROGRAM
+from twin.study.runs.study_folder import PROGRAM, StudyFolder
 
-__all__ = ["summary", "write_report", "write_study_report"]
+__all__ = ["report_files", "summary", "write_report"]
 
 TEMPLATE = "study.html.j2"
 STATISTICS = "statistics.json"
 ARTEFACTS = "artefacts"
 
 
-def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str], given: Sequence[str] = ()) -> str:
+@dataclass(frozen=True, eq=False)
+class StudyReport:
+    """A report.
+
+    Attributes:
+        verdict: that it begins with.
+        contents: of its files, by their paths in the study's folder.
+        undrawn: what could not be drawn, a sentence each.
+    """
+
+    verdict: str
+    contents: dict[str, bytes]
+    undrawn: tuple[str, ...]
+
+
+def write_report(
+    data: xr.Dataset, plan: Plan, folder: StudyFolder, files: Sequence[str], given: Sequence[str] = ()
+) -> StudyReport:
     """Write ``report.html``, ``statistics.json`` and the folder ``artefacts`` into the study's folder.
 
     Args:
@@ -39,31 +56,32 @@ def write_report(data: xr.Dataset, plan: Plan, folder: Path, files: Sequence[str
         given: what is wrong with what the study is given, to be told before all else.
 
     Returns:
-        The verdict that it begins with.
+        The verdict that it begins with, and what could not be drawn.
     """
-    return write_study_report(data, plan.setup.study, folder, files, given)
+    made = report_files(data, plan.setup.study, files, given)
+    contents = made.contents
+    # what an earlier report showed may not be there any more
+    there = [name for name in every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents]
+    folder.remove(there)
+    folder.write_all(contents)
+    return made
 
 
-def write_study_report(
+def report_files(
     data: xr.Dataset,
     study: StudySpec,
-    folder: Path,
     files: Sequence[str] = ("study.nc", "study.csv"),
     given: Sequence[str] = (),
-) -> str:
-    """As ``write_report``, for a study whose base is not at hand."""
+) -> StudyReport:
+    """The report with all its files; arguments as of ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
     responses, factors = response_table(found), factor_table(found.runs)
     parts = sections(found)
-    # what an earlier report showed may not be there any more
-    shutil.rmtree(folder / ARTEFACTS, ignore_errors=True)
-    (folder / ARTEFACTS).mkdir()
-    for artefact in (responses, factors, *(a for section in parts for a in section.artefacts)):
-        if own_file(artefact):
-            (folder / place(artefact)).write_bytes(artefact.content())
+    shown = (responses, factors, *(a for section in parts for a in section.artefacts))
+    undrawn = tuple(artefact.note for artefact in shown if isinstance(artefact, Undrawn))
+    contents = {place(artefact): artefact.content() for artefact in shown if own_file(artefact)}
     said = verdict(found)
-    text = json.dumps({**plain_data(found), "verdict": said}, indent=2, allow_nan=False) + "\n"
-    (folder / STATISTICS).write_text(text, encoding="utf-8")
+    contents[STATISTICS] = json_text({**plain_data(found), "verdict": said}).encode()
     page = (
         environment(__package__)
         .get_template(TEMPLATE)
@@ -74,7 +92,7 @@ def write_study_report(
             runs=found.runs,
             failed=int(found.runs.failed.sum()),
             design=design_title(found.runs.kind),
-            warnings=[*given, *warnings(found)],
+            warnings=[*given, *undrawn, *warnings(found)],
             conclusions=conclusions(found),
             responses=_shown(responses),
             factors=_shown(factors),
@@ -88,12 +106,12 @@ def write_study_report(
                 for section in parts
             ],
             files=files,
-            command=reproduce(PROGRAM, "config.yaml"),
+            command=reproduce((PROGRAM, "config.yaml")),
             versions=versions(),
         )
     )
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    return said
+    contents["report.html"] = page.encode()
+    return StudyReport(said, contents, undrawn)
 
 
 def _shown(artefact: Artefact) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from scenes.specs.study import GRID, StudySpec
+from scenes.specs.study import GRID, NOISE, StudySpec
 from scenes.specs.study_factor import FactorSpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
@@ -29,12 +29,14 @@ class Factor:
         unit: of the numbers, empty for pure numbers and texts.
         values: (runs,) float64, or text.
         spec: where the values come from.
+        drawn: whether the runs are drawn from it; those of a grid are not.
     """
 
     name: str
     unit: str
     values: np.ndarray
     spec: FactorSpec
+    drawn: bool = False
 
     @property
     def numeric(self) -> bool:
@@ -64,14 +66,14 @@ class Response:
         name: of the response.
         unit: empty for pure numbers.
         values: (runs,) float64, NaN where there is none.
-        sigma: (runs,) the standard deviation that each run states for it; None without.
+        noise: (runs,) the standard deviation by noise alone that each run states for it; None without.
         of: of a standard deviation that is looked at like a response: what it belongs to; empty for responses.
     """
 
     name: str
     unit: str
     values: np.ndarray
-    sigma: np.ndarray | None = None
+    noise: np.ndarray | None = None
     of: str = ""
 
     @cached_property
@@ -109,6 +111,7 @@ class StudyRuns:
         sigmas: the standard deviations that the runs state for responses, where they are not all the same.
         failed: (runs,) bool.
         messages: (runs,) why a run failed.
+        doubts: (runs,) why sigma does not hold in a run, empty where it does; none of commands that do not say so.
     """
 
     study: StudySpec
@@ -117,27 +120,27 @@ class StudyRuns:
     sigmas: tuple[Response, ...]
     failed: np.ndarray
     messages: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, data: xr.Dataset, study: StudySpec) -> StudyRuns:
         """The runs of a data set as ``twin.study.study_files.make_dataset`` makes it."""
+        drawn = study.design.kind != GRID
         factors = tuple(
-            Factor(name, str(data[name].attrs.get("units", "")), _factor_values(data[name].values), spec)
+            Factor(name, str(data[name].attrs.get("units", "")), _factor_values(data[name].values), spec, drawn)
             for name, spec in study.factors.items()
         )
         responses, sigmas = [], []
         for name, response in study.responses.items():
             unit = str(data[name].attrs.get("units", ""))
-            key = f"{name}_sigma"
-            sigma = data[key].values.astype(np.float64) if response.sigma is not None else None
-            responses.append(Response(name, unit, data[name].values.astype(np.float64), sigma))
-            if sigma is not None:
-                own = Response(key, unit, sigma, None, name)
-                if not own.constant:
-                    sigmas.append(own)
+            stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.stated}
+            responses.append(Response(name, unit, data[name].values.astype(np.float64), stated.get(NOISE)))
+            own = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
+            sigmas += [one for one in own if not one.constant]
         messages = tuple(str(m) for m in data["message"].values.tolist()) if "message" in data else ()
+        doubts = tuple(str(m) for m in data["doubt"].values.tolist()) if "doubt" in data else ()
         failed = data["failed"].values.astype(bool)
-        return cls(study, factors, tuple(responses), tuple(sigmas), failed, messages)
+        return cls(study, factors, tuple(responses), tuple(sigmas), failed, messages, doubts)
 
     @property
     def count(self) -> int:

@@ -7,10 +7,11 @@ from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from scenes.specs.study_factor import FactorSpec
 from scenes.yaml.errors import key_text
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed, plain
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table, Undrawn, fixed, plain
 from twin.run.report import Section
 from twin.run.svg import look, to_svg
 from twin.study.report import conclusions
@@ -35,6 +36,7 @@ from twin.study.report.study_plots import (
 from twin.study.report.study_runs import Factor, StudyRuns, typeset
 from twin.study.report.study_statistics import Estimate
 from twin.study.report.study_wording import DASH, normality_text, number, percent, plural, share, span, with_limits
+from twin.study.runs.base_job import one_line
 
 MOST_NAMED = 6
 
@@ -128,15 +130,24 @@ def own_file(artefact: Artefact) -> bool:
     return artefact.name not in WORDED
 
 
-def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure:
-    with look(f"study-{name}"):
-        return SvgFigure(name, title, caption, to_svg(draw()))
+def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
+    """A figure; what cannot be drawn must not cost the numbers beside it, and is told in its place."""
+    try:
+        with look(f"study-{name}"):
+            figure = draw()
+            for text in figure.findobj(Text):
+                if "$" in text.get_text():  # somebody's unit or name, and no formula
+                    text.set_parse_math(False)
+            return SvgFigure(name, title, caption, to_svg(figure))
+    except Exception as error:
+        return Undrawn(name, title, caption, one_line(error))
 
 
 def _requirements(found: StudyAnalysis) -> Section | None:
     if not found.requirements:
         return None
     failed = int(found.runs.failed.sum())
+    lacking = any(r.bounds is not None for r in found.requirements)
     rows: list[list[Cell]] = [
         [
             r.name or "all",
@@ -146,6 +157,8 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             r.count,
             percent(r.share),
             span(r.interval) if r.interval is not None else DASH,
+            *([DASH if r.bounds is None else f"{r.met} … {r.most} of {r.runs}"] if lacking else ()),
+            *([DASH if r.bounds_interval is None else span(r.bounds_interval)] if lacking else ()),
             number(r.judged.p95.value) if r.judged and r.judged.p95 else DASH,
             number(r.judged.p997.value) if r.judged and r.judged.p997 else DASH,
         ]
@@ -153,6 +166,13 @@ def _requirements(found: StudyAnalysis) -> Section | None:
     ]
     how = "The interval is Clopper and Pearson's, 95%." if found.runs.sampled else "A grid is no sample: no interval."
     lost = f" {failed} failed runs are not counted." if failed else ""
+    more = ("all runs", "interval of all runs") if lacking else ()
+    open_ends = ""
+    if lacking:
+        open_ends = (
+            " Runs may fail where the response is bad, or where it is good: the column of all runs goes from none of "
+            "those without a number to all of them."
+        )
     return Section(
         "Requirements",
         (),
@@ -160,8 +180,9 @@ def _requirements(found: StudyAnalysis) -> Section | None:
             Table(
                 "requirements",
                 "Share of the runs that meet them",
-                f"Of the runs that have a number.{lost} {how} The last columns are quantiles of what is judged.",
-                ("requirement", "", "unit", "met", "of", "share", "interval", "95%", "99.7%"),
+                f"Of the runs that have a number.{lost} {how}{open_ends} The last columns are quantiles of what is "
+                "judged.",
+                ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
                 rows,
             ),
         ),
@@ -324,7 +345,9 @@ def _fronts(found: StudyAnalysis) -> Section | None:
         return Section("Best compromises", remarks) if remarks else None
     caption = "Blue: runs that no other run beats in both; the stairs bound what is known to be possible. "
     caption += "Knee: where the front, scaled to its range, bulges farthest from the line through its ends."
-    parts: list[SvgFigure | Table] = [_figure("pareto", "Pareto fronts", caption, lambda: pareto_figure(found))]
+    parts: list[SvgFigure | Undrawn | Table] = [
+        _figure("pareto", "Pareto fronts", caption, lambda: pareto_figure(found))
+    ]
     for k, front in enumerate(found.fronts):
         x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
         others = [f for f in found.runs.factors if f not in (x, y) and len(f.levels) > 1]

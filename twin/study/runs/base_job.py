@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from analysis.measurement_error import MeasurementError
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
+from optics.numerics.physical_error import PhysicalError
 from scenes.yaml.errors import InputError, KeyPath
 from scenes.yaml.spec import Spec
 from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.procedure import BenchError, Procedure, silent
+from twin.run.procedure import Procedure, silent
 from twin.study.runs.config_tree import Tree, with_values
 
 
@@ -69,8 +69,10 @@ class BaseJob(Protocol):
         """Outcome of every run. The numbers may depend on which runs are done together, but on nothing else."""
 
 
-PHYSICS = (InputError, BenchError, AimError, BeamMissedError, ValueError, ArithmeticError)
-"""What says that a run cannot be. All errors of the analysis are ValueErrors."""
+PHYSICS = (InputError, PhysicalError, MeasurementError)
+"""What says that a run cannot be: its values do not go together, light is lost, a fit finds no end. Any other error is
+a fault of the program and stops the study.
+"""
 
 
 @dataclass(frozen=True)
@@ -120,4 +122,6 @@ class ProcedureBase:
 
 def one_line(error: Exception) -> str:
     """What went wrong, on one line; an input error without the file it does not have."""
+    if not str(error).strip():
+        return type(error).__name__
     return "; ".join(line.strip().removeprefix("input: ") for line in str(error).splitlines() if line.strip())

@@ -22,14 +22,18 @@ class BlockResult:
     Attributes:
         values: (n, R) in the order of the study's responses, NaN in runs that failed and where there is no number.
         sigmas: (n, R) their standard deviations, NaN where none is asked for.
+        noises: (n, R) those by noise alone, likewise.
         messages: (n,) why a run failed, empty for one that did not.
         seconds: that a worker took for them.
+        doubts: (n,) why sigma does not hold in a run that did not fail, empty where it does.
     """
 
     values: np.ndarray
     sigmas: np.ndarray
+    noises: np.ndarray
     messages: tuple[str, ...]
     seconds: float
+    doubts: tuple[str, ...]
 
     @property
     def failed(self) -> np.ndarray:
@@ -42,8 +46,9 @@ class BlockResult:
     ) -> BlockResult:
         """The responses of some outcomes."""
         values = np.full((len(outcomes), len(responses)), np.nan)
-        sigmas = np.full(values.shape, np.nan)
-        messages = []
+        sigmas, noises = (np.full(values.shape, np.nan) for _ in range(2))
+        messages: list[str] = []
+        doubts = []
         for k, outcome in enumerate(outcomes):
             message = outcome.message or "failed" if isinstance(outcome, Failure) else ""
             if not isinstance(outcome, Failure):
@@ -54,11 +59,14 @@ class BlockResult:
                             values[k, r] -= _number(outcome, response.minus, name)
                         if response.sigma is not None:
                             sigmas[k, r] = _number(outcome, response.sigma, name)
+                        if response.noise is not None:
+                            noises[k, r] = _number(outcome, response.noise, name)
                 except Problem as problem:
                     message = str(problem)
-                    values[k] = sigmas[k] = np.nan
+                    values[k] = sigmas[k] = noises[k] = np.nan
             messages.append(message)
-        return cls(values, sigmas, tuple(messages), seconds)
+            doubts.append("" if isinstance(outcome, Failure) or message else _doubt(outcome))
+        return cls(values, sigmas, noises, tuple(messages), seconds, tuple(doubts))
 
     @classmethod
     def joined(cls, parts: Sequence[BlockResult]) -> BlockResult:
@@ -66,9 +74,25 @@ class BlockResult:
         return cls(
             np.concatenate([part.values for part in parts]),
             np.concatenate([part.sigmas for part in parts]),
+            np.concatenate([part.noises for part in parts]),
             tuple(message for part in parts for message in part.messages),
             sum(part.seconds for part in parts),
+            tuple(doubt for part in parts for doubt in part.doubts),
         )
+
+
+CONTRADICTED = "the shifts of the spots contradict the stated disturbances"
+"""Why sigma does not hold where the fits of the spots are good."""
+
+
+def _doubt(outcome: Mapping[str, Any]) -> str:
+    """Why the sigmas of what was recovered do not hold, without its numbers; empty where they do."""
+    recovered = outcome.get("recovered", {})
+    course = outcome.get("course", {}).get("sigma_holds", [])
+    if not isinstance(recovered, Mapping) or (recovered.get("sigma_holds", True) and all(course)):
+        return ""
+    texts = recovered.get("doubts") or [CONTRADICTED if not recovered["sigma_holds"] else "at some times of the course"]
+    return str(texts[0])
 
 
 def _number(outcome: Mapping[str, Any], key: Any, name: str) -> float:

@@ -12,41 +12,19 @@ import io
 import json
 import os
 import stat
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from twin.run.durable import PARTIAL, make_folders, sync_folder, write_safely
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.plan import Plan
 
-PARTIAL = ".partial"
-
-
-def write_safely(place: Path, content: bytes) -> None:
-    """Write a file so that under its name it is whole or not there, whenever the power fails.
-
-    Until then it is a hidden file beside its place that ends in ``PARTIAL``.
-
-    Raises:
-        OSError: the disk is full, or gone.
-    """
-    partial = place.with_name(f".{place.name}{PARTIAL}")
-    with partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(place)
-    folder = os.open(place.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-
-
 FOLDER, INDEX = "chunks", "index.txt"
-PARTS = ("values", "sigmas", "messages", "seconds", "blocks")
+PARTS = ("values", "sigmas", "noises", "messages", "doubts", "seconds", "blocks")
 """Arrays in the file of a chunk."""
 
 
@@ -105,7 +83,7 @@ class ChunkStore:
 
     def open(self) -> None:
         """Read the index and check every chunk in it; corrupt ones are moved aside and told in ``corrupt``."""
-        self.folder.mkdir(parents=True, exist_ok=True)
+        make_folders(self.folder)
         for left in self.folder.glob(f"*{PARTIAL}"):
             left.unlink(missing_ok=True)
         listed = self._listed()
@@ -122,6 +100,15 @@ class ChunkStore:
                 left.unlink(missing_ok=True)
         if self.corrupt or self._index_is_damaged(listed):
             self._rewrite_index()
+
+    def look(self) -> None:
+        """As `open`, but nothing in the folder is touched: chunks that are not whole are not among the entries."""
+        for entry in self._listed():
+            try:
+                self.read(entry)
+            except ChunkError:
+                continue
+            self.entries[entry.first] = entry
 
     @property
     def done(self) -> set[int]:
@@ -160,10 +147,13 @@ class ChunkStore:
             runs=len(whole.messages),
             sha256=hashlib.sha256(content).hexdigest(),
         )
+        first_line = not (self.folder / INDEX).exists()
         with (self.folder / INDEX).open("ab") as index:
             index.write(_line(entry))
             index.flush()
             os.fsync(index.fileno())
+        if first_line:
+            sync_folder(self.folder)
         self.entries[first] = entry
 
     def read(self, entry: Entry) -> BlockResult:
@@ -237,14 +227,65 @@ class ChunkStore:
         write_safely(self.folder / INDEX, b"".join(_line(entry) for entry in self.entries.values()))
 
 
+@dataclass(frozen=True)
+class ChunkFiles:
+    """The chunks of a study as they stand on the disk.
+
+    Attributes:
+        damaged: files that are not as they were written, the index among them; paths in the study's folder.
+        unlisted: files that the index does not know.
+        runs: number of runs in chunks that are whole.
+    """
+
+    damaged: tuple[str, ...]
+    unlisted: tuple[str, ...]
+    runs: int
+
+
+def examined(study: Path) -> ChunkFiles:
+    """What has become of the chunks of a finished study, by their own checksums; nothing is touched.
+
+    Args:
+        study: its folder.
+    """
+    folder, damaged, listed, runs = study / FOLDER, [], set(), 0
+    try:
+        lines = _content(folder / INDEX).splitlines(keepends=True)
+    except OSError:
+        lines = []
+    entries = [_entry(line) if line.endswith(b"\n") else None for line in lines]
+    if not entries or None in entries:
+        damaged.append(INDEX)
+    for entry in entries:
+        if entry is None or entry.file in listed:
+            continue
+        listed.add(entry.file)
+        try:
+            whole = hashlib.sha256(_content(folder / entry.file)).hexdigest() == entry.sha256
+        except OSError:
+            whole = False
+        if whole:
+            runs += entry.runs
+        else:
+            damaged.append(entry.file)
+    there = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+    others = sorted(there - listed - {INDEX})
+    in_study = [tuple(f"{FOLDER}/{name}" for name in names) for names in (damaged, others)]
+    return ChunkFiles(in_study[0], in_study[1], runs)
+
+
 def _packed(first: int, blocks: int, result: BlockResult) -> bytes:
     out = io.BytesIO()
-    messages = np.frombuffer(json.dumps(list(result.messages)).encode(), np.uint8)
+    messages, doubts = (
+        np.frombuffer(json.dumps(list(texts)).encode(), np.uint8) for texts in (result.messages, result.doubts)
+    )
     np.savez(
         out,
         values=result.values,
         sigmas=result.sigmas,
+        noises=result.noises,
         messages=messages,
+        doubts=doubts,
         seconds=np.float64(result.seconds),
         blocks=np.array([first, blocks]),
     )
@@ -259,18 +300,21 @@ def _unpacked(content: bytes, entry: Entry, shape: tuple[int, int]) -> BlockResu
     """
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
         packed = {name: file[name] for name in PARTS}
-    for name in ("values", "sigmas"):
+    numbers = ("values", "sigmas", "noises")
+    for name in numbers:
         if packed[name].dtype != np.float64 or packed[name].shape != shape:
             raise ValueError(f"{name} are {packed[name].dtype} {packed[name].shape} instead of float64 {shape}")
     if packed["blocks"].tolist() != [entry.first, entry.blocks]:
         raise ValueError("it is of other blocks")
-    messages = json.loads(packed["messages"].tobytes())
-    if not (isinstance(messages, list) and len(messages) == shape[0] and all(isinstance(m, str) for m in messages)):
-        raise ValueError("it has not one message for each run")
+    messages, doubts = (json.loads(packed[name].tobytes()) for name in ("messages", "doubts"))
+    for texts in (messages, doubts):
+        if not (isinstance(texts, list) and len(texts) == shape[0] and all(isinstance(m, str) for m in texts)):
+            raise ValueError("it has not one message for each run")
     seconds = packed["seconds"]
     if seconds.dtype != np.float64 or seconds.shape != () or not seconds >= 0.0:
         raise ValueError("it does not say how long it took")
-    return BlockResult(packed["values"], packed["sigmas"], tuple(messages), float(seconds))
+    values, sigmas, noises = (packed[name] for name in numbers)
+    return BlockResult(values, sigmas, noises, tuple(messages), float(seconds), tuple(doubts))
 
 
 def _content(place: Path) -> bytes:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import queue
-import shutil
 import signal
-import tempfile
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -17,8 +14,11 @@ from dataclasses import dataclass, field
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
-from twin.run.cli import InputErrorText, ending_signals
+from twin.run.cli import InputErrorText
+from twin.run.ending_signals import ending_later
+from twin.run.unfinished import scratch
 from twin.run.versions import source_digest, versions
 from twin.study.runs.task import ONE_THREAD
 
@@ -36,6 +36,9 @@ LEAST_MEMORY = 0.5e9
 RETRIES = 2
 """How often a task is given to another worker after the one that had it died."""
 SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+ENCRYPTED = ("tls://", "wss://")
+SCRATCH = "twin-study"
+"""Beginning of the names of folders that workers write into."""
 
 
 class ClusterError(Exception):
@@ -108,11 +111,17 @@ def local_workers(count: int) -> Iterator[Workers]:
     Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
     So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
     """
+    with scratch(SCRATCH) as place, _cluster(count, place) as workers:
+        yield workers
+
+
+@contextmanager
+def _cluster(count: int, place: Path) -> Iterator[Workers]:
+    """Workers of this command's own, who write below ``place``."""
     import dask
     from distributed import Client, LocalCluster
     from distributed.security import Security
 
-    place = Path(tempfile.mkdtemp(prefix="twin-study-"))
     settings = {
         # set before the processes start: NumPy reads them when it is imported
         "distributed.nanny.pre-spawn-environ": {**ONE_THREAD},
@@ -133,46 +142,25 @@ def local_workers(count: int) -> Iterator[Workers]:
     }
     with _kept_environment():
         _silence()
-        try:
-            with dask.config.set(settings), ExitStack() as stack:
-                with _ending_later(), _children_deaf_to_ctrl_c():
-                    cluster = LocalCluster(
-                        n_workers=count,
-                        threads_per_worker=1,
-                        processes=True,
-                        host="127.0.0.1",
-                        protocol="tls",
-                        security=Security.temporary(),
-                        # no dashboard; its port cannot be left out, so it is a free one, seen by this machine only
-                        dashboard_address="127.0.0.1:0",
-                        worker_dashboard_address="127.0.0.1:0",
-                        scheduler_kwargs={"dashboard": False},
-                        local_directory=str(place),
-                        memory_limit=0,
-                        silence_logs=logging.CRITICAL,
-                    )
-                    stack.enter_context(cluster)
-                yield Workers(stack.enter_context(Client(cluster, set_as_default=False)), True)
-        finally:
-            shutil.rmtree(place, ignore_errors=True)
-
-
-@contextmanager
-def _ending_later() -> Iterator[None]:
-    """Signals that ask the program to end are heeded when the block is over: Dask cannot close what has half begun."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    got: list[int] = []
-    asked = (signal.SIGINT, *ending_signals())
-    before = {number: signal.signal(number, lambda number, frame: got.append(number)) for number in asked}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    for heard in got:
-        signal.raise_signal(heard)
+        with dask.config.set(settings), ExitStack() as stack:
+            with ending_later(), _children_deaf_to_ctrl_c():
+                cluster = LocalCluster(
+                    n_workers=count,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    protocol="tls",
+                    security=Security.temporary(),
+                    # no dashboard; its port cannot be left out, so it is a free one, seen by this machine only
+                    dashboard_address="127.0.0.1:0",
+                    worker_dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
+                    local_directory=str(place),
+                    memory_limit=0,
+                    silence_logs=logging.CRITICAL,
+                )
+                stack.enter_context(cluster)
+            yield Workers(stack.enter_context(Client(cluster, set_as_default=False)), True)
 
 
 @contextmanager
@@ -213,11 +201,10 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
         tell: told that there are no workers yet.
 
     Raises:
-        InputErrorText: it cannot be reached, or its workers do not have the twin.
+        InputErrorText: it cannot be reached, no certificates are named, or its workers do not have the twin.
         ClusterError: it has no workers.
     """
-    if not address.startswith(SCHEMES):
-        raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
+    _check_address(address)
     import dask
     from distributed import Client
 
@@ -243,6 +230,33 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
             yield workers
         finally:
             client.close(timeout=2)
+
+
+def _check_address(address: str) -> None:
+    """Whether a scheduler can be there at all, and what TLS needs to reach it.
+
+    Raises:
+        InputErrorText: no address, or no certificates.
+    """
+    try:
+        parts = urlsplit(address)
+        whole = parts.hostname and parts.port
+    except ValueError:
+        whole = None
+    if not (address.startswith(SCHEMES) and whole):
+        raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
+    if not address.startswith(ENCRYPTED):
+        return
+    from distributed.security import Security
+
+    names = "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ...__CLIENT__CERT and ...__CLIENT__KEY (docs/studies.md)"
+    try:
+        known = Security().get_connection_args("client").get("ssl_context")
+    except (OSError, ValueError, TypeError) as error:
+        text = f"--scheduler {address}: the certificates that Dask is told of cannot be used ({error}); see {names}"
+        raise InputErrorText(text) from None
+    if known is None:
+        raise InputErrorText(f"--scheduler {address}: TLS needs certificates; name them to Dask by {names}")
 
 
 def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:

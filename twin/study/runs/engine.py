@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from scenes.yaml.errors import KeyPath, Problem
+from scenes.specs.study import NOISE, TOTAL
+from scenes.yaml.errors import KeyPath, Problem, key_text
 from twin.run.cli import InputErrorText
 from twin.run.versions import source_digest
 from twin.study.runs.block_result import check_response
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import ClusterError, Workers, killed
+from twin.study.runs.config_tree import leaf
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
-from twin.study.runs.task import Pilot, Task, evaluate, pilot
+from twin.study.runs.task import OtherProgramError, Pilot, Task, evaluate, pilot
 
 CHUNK_SECONDS = 6.0
 """How long a worker is to be busy with a chunk: what is lost when it dies, against what handing over costs."""
@@ -67,6 +70,18 @@ class IncompleteError(Exception):
     """Some runs could not be computed although everything else was; the message names them."""
 
 
+class ProgramFault(Exception):
+    """The program failed in a run, which says nothing of the run; the message names it and the error.
+
+    Attributes:
+        trace: the worker's traceback, as text.
+    """
+
+    def __init__(self, message: str, trace: str) -> None:
+        super().__init__(message)
+        self.trace = trace
+
+
 @dataclass(eq=False)
 class Engine:
     """Runs a study.
@@ -98,8 +113,8 @@ class Engine:
 
         Raises:
             InputError: the base cannot be run as it is, or a response's key leads nowhere in its results.
-            IncompleteError: workers died again and again in some runs, or the program failed in them; the others are
-                there.
+            IncompleteError: workers died again and again in some runs; the others are there.
+            ProgramFault: any error but those that say that a run cannot be; what is done is there.
             ClusterError: the scheduler is gone.
             OSError: a chunk cannot be written.
         """
@@ -139,7 +154,7 @@ class Engine:
             runs = _runs_text([self.plan.block(block)])
             if killed(error):
                 raise IncompleteError(f"the workers died in the first block, {runs}")
-            raise IncompleteError(f"the program failed in the first block, {runs}: {_error_text(error)}") from error
+            raise _fault(future)
         first: Pilot = future.result()
         if first.refusal is not None:
             raise first.refusal
@@ -160,7 +175,6 @@ class Engine:
         alone: set[int] = set()
         running: dict[Any, tuple[range, Any]] = {}
         bad: list[range] = []
-        reasons: list[str] = []
         while waiting or running or suspects:
             if not waiting and not running:
                 waiting.append(suspects.pop(0))
@@ -179,18 +193,17 @@ class Engine:
                 self.progress.done(self.store.runs, self.plan.runs)
                 continue
             error = future.exception()
+            if not killed(error):
+                raise _fault(future)
             if len(blocks) > 1:
                 waiting.extend(range(block, block + 1) for block in reversed(blocks))
                 continue
-            if killed(error) and blocks.start not in alone:
+            if blocks.start not in alone:
                 suspects.append(blocks)
                 continue
             bad.append(self.plan.block(blocks.start))
-            reason = "the workers died" if killed(error) else f"the program failed: {_error_text(error)}"
-            if reason not in reasons:
-                reasons.append(reason)
         if bad:
-            raise IncompleteError(f"not computed: {_runs_text(bad)} ({'; '.join(reasons)})")
+            raise IncompleteError(f"not computed: {_runs_text(bad)} (the workers died)")
 
     def _task(self, config: str, blocks: range) -> Task:
         return Task(
@@ -209,7 +222,8 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
         InputError: one that they do not, with what there is.
     """
     for name, response in setup.study.responses.items():
-        for key, path in (("key", response.key), ("sigma", response.sigma), ("minus", response.minus)):
+        asked = {"key": response.key, "sigma": response.sigma, "noise": response.noise, "minus": response.minus}
+        for key, path in asked.items():
             if path is None:
                 continue
             try:
@@ -219,6 +233,27 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
                 text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
                 restated = Problem(text, problem.found, problem.allowed, problem.suggestion, problem.within)
                 raise setup.error(restated, place) from None
+            if key == "noise":
+                _check_noise(setup, sample, name, path)
+
+
+def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> None:
+    """Check that the noise of a response is not a total standard deviation beside which that of noise stands.
+
+    Raises:
+        InputError: it is.
+    """
+    place = max((k for k, part in enumerate(path) if isinstance(part, str)), default=0)
+    named = str(path[place])
+    own = (*path[:place], f"{named.removesuffix(TOTAL)}{NOISE}", *path[place + 1 :])
+    if named.endswith(NOISE):
+        return
+    try:
+        leaf(sample, own)
+    except Problem:
+        return
+    text = "not the noise alone, which stands beside it"
+    raise setup.error(Problem(text, key_text(path), key_text(own)), ("responses", name, "noise"))
 
 
 def fit_workers(wanted: int, memory: float, least: float) -> int:
@@ -248,9 +283,15 @@ def _runs_text(parts: Sequence[range]) -> str:
     return "runs " + ", ".join(f"{part.start}-{part.stop - 1}" for part in parts)
 
 
-def _error_text(error: BaseException) -> str:
+def _fault(future: Any) -> Exception:
+    """What is raised for a task that has failed otherwise than by the death of its worker."""
+    error = future.exception()
     notes = " ".join(getattr(error, "__notes__", ()))
-    return f"{type(error).__name__}: {error} {notes}".strip()
+    text = f"{type(error).__name__}: {error} {notes}".strip()
+    if isinstance(error, OtherProgramError):
+        return IncompleteError(text)
+    trace = "".join(traceback.format_exception(type(error), error, future.traceback()))
+    return ProgramFault(f"the program failed: {text}", trace)
 
 
-__all__ = ["ClusterError", "Engine", "Estimate", "IncompleteError", "InputErrorText", "Progress"]
+__all__ = ["ClusterError", "Engine", "Estimate", "IncompleteError", "InputErrorText", "ProgramFault", "Progress"]

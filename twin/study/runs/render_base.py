@@ -21,6 +21,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
+from scenes.models.instrument_model import Instrument
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.spec import Spec
@@ -138,7 +139,9 @@ def run_together(
                 start = first if shared else _of(first, good)
                 stated = experiment.disturbances
                 frames = _of(after, good)
-                recovery = recover(start, frames, experiment.calibration, _centroid(runs[0]), 1, stated)
+                again = experiment.motion_models
+                known = experiment.calibration
+                recovery = recover(start, frames, known, _centroid(runs[0]), 1, stated, motions=again)
         except SpotError as error:
             lost = _lost(error, experiment, good)
             for i, reason in lost.items():
@@ -279,10 +282,11 @@ class RenderBase:
             asked = [(k, state, render.obstructed) for k, state, render in renders if render.quality]
             for obstructed in (True, False):
                 part = [(k, state) for k, state, own in asked if own == obstructed]
-                found = quality_dicts(experiment.instrument, backend, [state for _, state in part], obstructed)
+                found = _qualities(experiment.instrument, backend, [state for _, state in part], obstructed)
                 for (k, _), quality in zip(part, found, strict=True):
                     done = out[k]
-                    out[k] = done if isinstance(done, Failure) else {**(done or {}), "quality": quality}
+                    if not isinstance(done, Failure):
+                        out[k] = quality if isinstance(quality, Failure) else {**(done or {}), "quality": quality}
         return [outcome if outcome is not None else Failure("not done") for outcome in out]
 
     def _maker(self, tree: Tree) -> JobMaker:
@@ -310,6 +314,18 @@ class RenderBase:
             self._before[key] = experiment.frames_before(frames, seed)
             _forget(self._before)
         return self._before[key]
+
+
+def _qualities(
+    instrument: Instrument, backend: Backend, states: Sequence[State], obstructed: bool
+) -> list[dict[str, Any] | Failure]:
+    """Image quality of states, done together; when it cannot be in one, all are tried alone."""
+    try:
+        return [*quality_dicts(instrument, backend, states, obstructed)]
+    except PHYSICS as error:
+        if len(states) == 1:
+            return [Failure(one_line(error))]
+    return [found for state in states for found in _qualities(instrument, backend, [state], obstructed)]
 
 
 def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:

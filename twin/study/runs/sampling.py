@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
 from scenes.specs.study import GRID, StudySpec, unit_cube
 from scenes.specs.study_factor import FactorSpec
@@ -80,6 +80,8 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
         mean, sigma, low, high = numbers
         # the inverse is taken in the nearer tail, where it has digits
         a, b = (low - mean) / sigma, (high - mean) / sigma
+        if a > FAR or b < -FAR:
+            return np.asarray(np.clip(mean + sigma * _far(a, b, u), low, high))
         flip = a > 0.0
         first, last = (ndtr(-b), ndtr(-a)) if flip else (ndtr(a), ndtr(b))
         z = -ndtri(last - u * (last - first)) if flip else ndtri(first + u * (last - first))
@@ -88,6 +90,29 @@ def _quantile(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
         raise ValueError(f"a factor of kind {factor.kind!r} has no quantiles")
     low, high = numbers
     return np.asarray(low + u * (high - low))
+
+
+FAR = 5.0
+"""Limits that all lie further out, in sigmas: there the share of the normal distribution between them has no digits,
+its logarithm does."""
+
+
+def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
+    """Quantiles of a normal distribution of sigma 1 between limits far in one of its tails."""
+    if a > 0.0:
+        return -_far(-b, -a, 1.0 - u)
+    # both limits below the mean: log of Phi(a) + u (Phi(b) - Phi(a)), taken from the larger one
+    first, last = log_ndtr(a), log_ndtr(b)
+    return np.asarray(ndtri_exp(last + np.log1p((1.0 - u) * np.expm1(first - last))))
+
+
+def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
+    """Where the distribution function of a factor of numbers is ``u``; of a list the least of its values where that is
+    reached.
+    """
+    if factor.kind in _LISTS:
+        return np.quantile(np.array(factor.numbers().values, np.float64), u, method="inverted_cdf")
+    return _quantile(factor, u)
 
 
 def extremes(factor: FactorSpec) -> list[float]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import json
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,12 +19,22 @@ from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
 from scenes.specs.study import StudySpec
 from scenes.specs.study_factor import FactorSpec, Scalar
-from scenes.yaml.csv_table import table_text
+from scenes.yaml.csv_table import lines_of, table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec
 from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile, dump_yaml, parse_yaml, read_yaml
+from scenes.yaml.yaml_file import (
+    LARGEST_BYTES,
+    NO_TEXT,
+    UNWRITABLE,
+    WRITABLE,
+    YamlFile,
+    dump_yaml,
+    parse_yaml,
+    plain_scalar,
+    read_yaml,
+)
 from twin.run.versions import source_digest, versions
 from twin.study.runs.base_job import BaseJob
 from twin.study.runs.config_tree import Tree, with_place, with_values
@@ -34,8 +45,10 @@ WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
 """
-DATA_ONLY = ("name", "description", "limits", "report")
-"""Keys of a study that change no number of it."""
+WORDS = ("name", "description", "limits", "report")
+"""Keys of a study that change no number of it: they may be others when it is gone on with, as may names and units of
+responses.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +75,11 @@ class StudySetup:
     @cached_property
     def content(self) -> str:
         """Checksum of everything in the study that a number depends on; the base's tree has all library files."""
-        study = {key: value for key, value in self.study.plain().items() if key not in DATA_ONLY}
+        study = {key: value for key, value in self.study.plain().items() if key not in WORDS}
         study["base"] = {"command": self.study.base.command}
+        # in their order: what is drawn for a factor, and the column of a response, go by their numbers
+        study["factors"] = list(study["factors"].items())
+        study["responses"] = [{k: v for k, v in one.items() if k != "unit"} for one in study["responses"].values()]
         content = json.dumps([study, self.tree, self.job.block], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()
 
@@ -147,8 +163,13 @@ def _resolved(yaml: YamlFile) -> StudySetup:
     job = base_job(study.base.command)
     tree = job.resolve(_base_file(study)).plain()
     setup = _placed(study, tree)
-    if len(setup.to_yaml().encode()) > LARGEST_BYTES:
-        raise study.error("the study with its tables is larger than 1 MB", ("factors",), allowed="smaller tables")
+    size = len(setup.to_yaml().encode())
+    if size > LARGEST_BYTES:
+        rows = max((len(f.table.values or ()) for f in study.factors.values() if f.table is not None), default=0)
+        allowed = (
+            f"tables of at most {int(rows * LARGEST_BYTES / size)} rows or fewer columns" if rows else "fewer values"
+        )
+        raise study.error("the study with its tables is larger than 1 MB", ("factors",), allowed=allowed)
     return setup
 
 
@@ -181,7 +202,7 @@ def _base_file(study: StudySpec) -> Path:
     if "/" in text or text.endswith((".yaml", ".yml")):
         path = Path(study.source.file).parent / text
         if not is_file(path):
-            raise study.error(f"no such file: {path}", ("base", "file"))
+            raise study.error(unusable(path), ("base", "file"))
         return path
     names = sorted(path.stem for path in folder.glob("*.yaml"))
     if text not in names:
@@ -246,23 +267,19 @@ def _with_tables(study: StudySpec) -> StudySpec:
     """The study with the values of its tables' columns."""
     factors = dict(study.factors)
     tables: dict[str, dict[str, list[Any]]] = {}
+    named: dict[str, dict[str, KeyPath]] = {}
+    for name, factor in study.factors.items():
+        if factor.table is not None and factor.table.values is None:
+            named.setdefault(factor.table.file, {})[factor.table.column] = ("factors", name, "table")
     for name, factor in study.factors.items():
         if factor.table is None or factor.table.values is not None:
             continue
         key: KeyPath = ("factors", name, "table")
         table = factor.table
         if table.file not in tables:
-            tables[table.file] = _read_table(study, Path(study.source.file).parent / table.file, key)
+            place = Path(study.source.file).parent / table.file
+            tables[table.file] = _read_table(study, place, key, named[table.file])
         columns = tables[table.file]
-        if table.column not in columns:
-            suggestion = nearest(table.column, columns)
-            raise study.error(
-                "no such column",
-                (*key, "column"),
-                found=table.column,
-                allowed=names_text(columns),
-                suggestion=suggestion,
-            )
         new = factor.model_copy(update={"table": table.model_copy(update={"values": tuple(columns[table.column])})})
         try:
             new.numbers()
@@ -274,30 +291,65 @@ def _with_tables(study: StudySpec) -> StudySpec:
     return out
 
 
-def _read_table(study: StudySpec, path: Path, key: KeyPath) -> dict[str, list[Any]]:
-    """Columns of a CSV file."""
+LARGEST_TABLE = 100_000_000
+"""Bytes of a table's file, of which a study takes some columns."""
+MOST_CELLS = 90_000
+"""Of all tables together: the study's config.yaml holds them, and has room for 100 000 keys and values in 1 MB."""
+
+
+def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, KeyPath]) -> dict[str, list[Any]]:
+    """The named columns of a CSV file, each with the key at which it is named; row by row, so that no more of the file
+    than these and its text is held.
+    """
     if not is_file(path):
-        raise study.error(f"no such file: {path}", (*key, "file"), allowed="a CSV file, relative to this file")
-    text = table_text(path)
+        raise study.error(unusable(path), (*key, "file"), allowed="a CSV file, relative to this file")
+    rows = csv.reader(lines_of(table_text(path, most=LARGEST_TABLE)))
+    columns: dict[str, list[Any]] = {}
     try:
-        rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row]
+        heads = [head.strip() for head in next((row for row in rows if row), [])]
+        missing = next((column for column in named if column not in heads), None)
+        if missing is not None and heads:
+            meant = nearest(missing, heads)
+            text = "no such column"
+            raise study.error(
+                text, (*named[missing], "column"), found=missing, allowed=names_text(heads), suggestion=meant
+            )
+        if any(UNWRITABLE.search(head) for head in heads):
+            raise study.error(f"row 1 of the table {path}: {NO_TEXT}", (*key, "file"), allowed=WRITABLE)
+        # of columns of one name the last
+        places = {head: k for k, head in enumerate(heads) if head in named}
+        columns = {head: [] for head in places}
+        most = MOST_CELLS // max(len(places), 1)
+        for number, row in enumerate((row for row in rows if row), 2):
+            if len(row) != len(heads):
+                text = f"row {number} of the table {path} has {len(row)} cells, the first {len(heads)}"
+                raise study.error(text, (*key, "file"), allowed="as many cells in every row as names in the first")
+            if number > most + 1:
+                text = f"the table {path} has too many rows for a study"
+                allowed = f"at most {most} with {len(places)} of its columns; draw from a distribution beyond that"
+                raise study.error(text, (*key, "file"), allowed=allowed)
+            if any(UNWRITABLE.search(row[k]) for k in places.values()):
+                raise study.error(f"row {number} of the table {path}: {NO_TEXT}", (*key, "file"), allowed=WRITABLE)
+            for head, k in places.items():
+                columns[head].append(_cell(row[k]))
     except csv.Error as error:
-        raise study.error(f"the table {path} cannot be read: {error}", (*key, "file")) from None
-    if len(rows) < 2:
+        text = f"the table {path} cannot be read: {error}"
+        raise study.error(text, (*key, "file"), allowed="a CSV file") from None
+    if not any(columns.values()):
         raise study.error(f"the table {path} has no rows", (*key, "file"), allowed="names, then a row or more")
-    ragged = next((k for k, row in enumerate(rows) if len(row) != len(rows[0])), None)
-    if ragged is not None:
-        text = f"row {ragged + 1} of the table {path} has {len(rows[ragged])} cells, the first {len(rows[0])}"
-        raise study.error(text, (*key, "file"))
-    return {head.strip(): [_cell(row[k]) for row in rows[1:]] for k, head in enumerate(rows[0])}
+    return columns
 
 
 _SCALAR: TypeAdapter[Any] = TypeAdapter(Scalar)
+_PLAIN = re.compile(r"[-+]?\.?[0-9A-Za-z][-+0-9A-Za-z._/^() ]*")
+"""Cells that in YAML can be nothing but a plain scalar; most are."""
 
 
 def _cell(text: str) -> Any:
     """A cell as YAML would read it: number, true, false or text."""
     try:
+        if _PLAIN.fullmatch(text):
+            return _SCALAR.validate_python(plain_scalar(text.strip()))
         data = parse_yaml(f"- {json.dumps(text) if ':' in text or '#' in text else text}").data[0]
         return _SCALAR.validate_python(data)
     except (InputError, ValidationError):

@@ -4,31 +4,46 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
-import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from twin.run.run_folder import (
+from twin.run.durable import PARTIAL, make_folders, put_in_place, sync_folder, write_all_safely, write_safely
+from twin.run.ending_signals import ending_later
+from twin.run.owned_files import (
     MANIFEST,
-    NAMED,
     STUDY_LOCK,
     STUDY_STATE,
+    SUCCEEDS,
+    WRITTEN,
+    digest,
+    every_file,
+    foreign_files,
+    is_study,
+    manifest_digest,
+    remove_study,
+    succeeds,
+)
+from twin.run.run_folder import (
+    NAMED,
     Numbered,
     RunFolderError,
+    json_text,
+    read_manifest,
+    reason,
     refuse_others,
     remove_replaced,
     remove_run,
-    remove_study,
     unlisted,
 )
-from twin.run.unfinished import OLD, Unfinished, sweep
+from twin.run.unfinished import OLD, Unfinished, successor, sweep
 from twin.run.versions import sources, versions
-from twin.study.runs.chunk_store import FOLDER, INDEX, write_safely
+from twin.study.runs.chunk_store import FOLDER, INDEX
 from twin.study.runs.setup import StudySetup
 
 PROGRAM = "twin.study"
@@ -68,6 +83,11 @@ class StudyState(BaseModel):
         )
 
 
+def _begun(waiting: Path) -> str:
+    """Says that a study has been begun that was to replace a folder."""
+    return f", and what was begun to replace it is in {waiting}" if waiting.exists() else ""
+
+
 def _differences(
     before: Mapping[str, str], now: Mapping[str, str], message: Callable[[str, str, str], str]
 ) -> list[str]:
@@ -80,127 +100,206 @@ class StudyFolder:
     """Context manager that makes or takes up the folder of a study and keeps other commands out of it.
 
     What stands in it stays when the command is broken off, for --resume. The lock is the operating system's and ends
-    with the process, however it ends.
+    with the process, however it ends. What it is to replace stands until it is complete: until then it grows beside it
+    (`successor`).
 
     Args:
-        path: of the folder. Of several studies that start together with the same ``Numbered``, each gets a number of
-            its own.
+        target: where the folder shall stand. Of several studies that start together with the same ``Numbered``, each
+            gets a number of its own.
         setup: the study.
         resume: go on with what is there.
         force: replace what is there.
 
+    Attributes:
+        path: where it is written.
+
     Raises:
         RunFolderError: on entering; the folder exists, belongs to another study or to a running command, holds files
-            that it is not to lose, or cannot be made.
+            that it is not to lose, or cannot be made. On leaving; it is complete and cannot be put in place.
     """
 
-    def __init__(self, path: Path | Numbered, setup: StudySetup, resume: bool = False, force: bool = False) -> None:
-        self._numbered = path if isinstance(path, Numbered) else None
-        self.path = path.free() if isinstance(path, Numbered) else path
+    def __init__(self, target: Path | Numbered, setup: StudySetup, resume: bool = False, force: bool = False) -> None:
+        self._numbered = target if isinstance(target, Numbered) else None
+        self.target = target.free() if isinstance(target, Numbered) else target
+        self.path = self.target
         self.setup, self.resume, self.force = setup, resume, force
         self._locks: list[TextIO] = []
-        self._aside: Unfinished | None = None
-        self._fresh = False
+        self._fresh = self._working = False
 
     def __enter__(self) -> StudyFolder:
         """Make the folder or take it up, and lock it."""
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            sweep(self.path.parent, remove_replaced)
+            make_folders(self.target.parent)
+            sweep(self.target.parent, remove_replaced)
             if self._numbered is None:
-                self._check()
-            if self._numbered is None and self.path.exists():
-                self._take_lock()
-                if self.force and not self.resume:
-                    self._aside = Unfinished(self.path)
-                    self.path.rename(self._aside.path(OLD))
+                self._choose()
             if self._numbered is not None or not self.path.exists():
                 self._make()
-                self._take_lock()
+                self._fresh = True
+            self._take_lock(self.path)
+            for left in (place for place in every_file(self.path) if place.endswith(PARTIAL)):
+                (self.path / left).unlink(missing_ok=True)
             if (self.path / STUDY_STATE).exists():
                 self._check_identity()
             else:
                 self._fresh = True
                 self._begin()
+            self._working = True
         except BaseException as error:
             self._leave()
             if isinstance(error, OSError):
-                reason = os.strerror(error.errno) if error.errno else str(error)
-                raise RunFolderError(f"cannot use the folder {self.path}: {reason}") from error
+                raise RunFolderError(f"cannot use the folder {self.target}: {reason(error)}") from error
             raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Unlock; when nothing has been done, also remove the folder again, or put back what it was to replace."""
+        """Unlock; a complete study is put in place, one of which nothing has been done is removed."""
         self._leave()
 
     def _leave(self) -> None:
-        nothing_done = self._fresh and not (self.path / FOLDER / INDEX).exists() and not self.complete
-        if nothing_done:
-            remove_study(self.path)
-        if self._aside is not None:
-            old = self._aside.path(OLD)
-            if old.exists() and self.path.exists() and not nothing_done:
-                remove_run(old, self.path)
-            elif old.exists():
-                if self.path.exists():  # what somebody put there meanwhile
-                    remove_run(self.path, old)
-                old.rename(self.path)
-            self._aside.close()
-            self._aside = None
-        for lock in self._locks:
-            lock.close()
-        self._locks = []
+        try:
+            if self._fresh and not self.resumable:
+                remove_study(self.path)
+            elif self._working and self.complete:
+                (self.path / WRITTEN).unlink(missing_ok=True)
+                if self.path != self.target:
+                    self._put_in_place()
+        finally:
+            for lock in self._locks:
+                lock.close()
+            self._locks = []
+
+    def _put_in_place(self) -> None:
+        try:
+            with ending_later():
+                if not self.target.exists():
+                    self.path.rename(self.target)
+                    sync_folder(self.target.parent)
+                else:
+                    self._check_succession()
+                    beside = Unfinished(self.target)
+                    try:
+                        put_in_place(self.path, self.target, beside.path(OLD))
+                        with suppress(OSError):  # the next run beside it tries again
+                            remove_run(beside.path(OLD), self.target)
+                    finally:
+                        beside.close()
+                (self.target / SUCCEEDS).unlink(missing_ok=True)
+                self.path = self.target
+        except OSError as error:
+            text = f"the study is complete in {self.path} and cannot be put in place of {self.target}: {reason(error)}"
+            raise RunFolderError(f"{text}; try again with --resume") from error
 
     @property
     def complete(self) -> bool:
         """Whether the study has been finished."""
         return (self.path / MANIFEST).exists()
 
-    def _check(self) -> None:
-        if not (self.path.exists() or self.path.is_symlink()):
+    @property
+    def resumable(self) -> bool:
+        """Whether --resume has something to go on with."""
+        return any(place.exists() for place in (self.path / FOLDER / INDEX, self.path / MANIFEST))
+
+    def _choose(self) -> None:
+        """Check what is there, and choose where to work: in the target itself, or in what is to take its place."""
+        waiting = successor(self.target)
+        if waiting.exists() and self.target.exists() and succeeds(self.target, waiting):
+            # killed when the two had just changed places
+            remove_run(waiting, self.target)
+            (self.target / SUCCEEDS).unlink(missing_ok=True)
+        if waiting.exists() and not (waiting / STUDY_STATE).exists():
+            # killed before it had begun
+            self._take_lock(waiting)
+            remove_study(waiting)
+        there = self._holds_something()
+        if not there and not waiting.exists():
             return
-        if not self.path.is_dir():
-            raise RunFolderError(f"output {self.path} exists and is not a folder; choose another with --out")
-        if not any(path.name != STUDY_LOCK for path in self.path.iterdir()):
-            return
-        others = unlisted(self.path)
         if self.resume:
-            if not (self.path / STUDY_STATE).exists():
-                raise RunFolderError(f"{self.path} is not the folder of a study, so there is nothing to resume")
+            self.path = waiting if waiting.exists() else self.target
+            self._check_resumed()
         elif not self.force:
-            also = ", go on with it with --resume," if (self.path / STUDY_STATE).exists() else ""
+            study = waiting.exists() or (self.target / STUDY_STATE).exists()
+            also = ", go on with it with --resume," if study else ""
             raise RunFolderError(
-                f"output folder {self.path} exists; choose another with --out{also} or replace it with --force"
-            )
-        elif others is None:
-            raise RunFolderError(
-                f"output folder {self.path} is not the folder of a study or run, so --force does not replace it; "
-                "choose another with --out"
+                f"output folder {self.target} exists{_begun(waiting)}; choose another with --out{also} or replace it "
+                "with --force"
             )
         else:
-            refuse_others(self.path, others)
+            self._check_replaced(waiting)
+            if waiting.exists():
+                self._take_lock(waiting)
+                remove_study(waiting)
+            if there:
+                self.path = waiting
+        if self.path == waiting and is_study(self.target):
+            self._take_lock(self.target)
+
+    def _holds_something(self) -> bool:
+        """Whether there is anything at the target but a folder with nothing in it."""
+        if not (self.target.exists() or self.target.is_symlink()):
+            return False
+        if not self.target.is_dir():
+            raise RunFolderError(f"output {self.target} exists and is not a folder; choose another with --out")
+        return any(path.name != STUDY_LOCK for path in self.target.iterdir())
+
+    def _check_resumed(self) -> None:
+        """What is gone on with must be a study's, and its results as it wrote them, for they are written anew."""
+        if not (self.path / STUDY_STATE).exists():
+            raise RunFolderError(f"{self.path} is not the folder of a study, so there is nothing to resume")
+        if self.path != self.target and self.target.exists():
+            self._check_succession()
+        manifest = read_manifest(self.path)
+        own = {*manifest.sha256} if manifest is not None else set()
+        if changed := sorted(own & {*(unlisted(self.path) or ())}):
+            raise RunFolderError(
+                f"{self.path} holds files that were changed since: {', '.join(changed[:NAMED])}; --resume writes them "
+                "anew, so move or rename them"
+            )
+
+    def _check_replaced(self, waiting: Path) -> None:
+        """--force removes what runs and studies wrote, and nothing else."""
+        for place in (self.target, waiting):
+            if not place.exists() or not any(place.iterdir()):
+                continue
+            others = unlisted(place)
+            if others is None:
+                raise RunFolderError(
+                    f"output folder {place} is not the folder of a study or run, so --force does not replace it; "
+                    "choose another with --out"
+                )
+            refuse_others(place, others)
+
+    def _check_succession(self) -> None:
+        """Replace only what --force was said of."""
+        if not succeeds(self.path, self.target):
+            raise RunFolderError(
+                f"{self.target} holds another run than the one that the study in {self.path} was to replace; move one "
+                "of them away"
+            )
 
     def _make(self) -> None:
         """Make the folder; of several commands only one can."""
         while True:
             try:
                 self.path.mkdir()
-                return
+                break
             except FileExistsError:
                 if self._numbered is None:
                     raise
-                self.path = self._numbered.free()
+                self.path = self.target = self._numbered.free()
+        sync_folder(self.path.parent)
+        if self.path != self.target:
+            write_safely(self.path / SUCCEEDS, manifest_digest(self.target).encode())
 
-    def _take_lock(self) -> None:
-        lock = (self.path / STUDY_LOCK).open("a+", encoding="utf-8")
+    def _take_lock(self, folder: Path) -> None:
+        lock = (folder / STUDY_LOCK).open("a+", encoding="utf-8")
         self._locks.append(lock)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise RunFolderError(f"another command is working in {self.path}; wait until it has ended") from None
+            raise RunFolderError(f"another command is working in {self.target}; wait until it has ended") from None
 
     def _check_identity(self) -> None:
         """Refuse to go on with what another study, or another program, has begun: their numbers do not mix."""
@@ -231,11 +330,47 @@ class StudyFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file so that under its name it is whole or not there."""
-        write_safely(self.path / name, content)
+        self.write_all({name: content})
+
+    def write_all(self, files: Mapping[str, bytes]) -> None:
+        """As ``write``, several at once, by their paths in the folder.
+
+        Raises:
+            OSError: the disk is full, or gone; some may be there.
+        """
+        lines = [f"{hashlib.sha256(content).hexdigest()} {name}\n" for name, content in files.items()]
+        if [*files] != [MANIFEST]:
+            self._account(lines)
+        for folder in {(self.path / name).parent for name in files}:
+            make_folders(folder)
+        write_all_safely((self.path / name, content) for name, content in files.items())
+
+    def _account(self, lines: Sequence[str]) -> None:
+        """Keep account of what is written next."""
+        with (self.path / WRITTEN).open("a", encoding="utf-8") as account:
+            # a line that was half written when the power failed is ended
+            account.writelines(["\n", *lines])
+            account.flush()
+            os.fsync(account.fileno())
+
+    def begin_results(self) -> None:
+        """Results are written anew: until their manifest is, the folder is not a complete study's."""
+        manifest = read_manifest(self.path)
+        if manifest is not None:
+            self._account([f"{check} {name}\n" for name, check in manifest.sha256.items()])
+        (self.path / MANIFEST).unlink(missing_ok=True)
+        sync_folder(self.path)
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Remove files that the study has written; what somebody has put there or changed stays."""
+        others = {*(foreign_files(self.path, None) or ())}
+        for name in names:
+            if name not in others:
+                (self.path / name).unlink(missing_ok=True)
 
     def write_json(self, name: str, data: Any) -> None:
         """Write plain data."""
-        self.write(name, (json.dumps(data, indent=2, allow_nan=False) + "\n").encode())
+        self.write(name, json_text(data).encode())
 
     def checksums(self) -> dict[str, str]:
         """SHA-256 of every file of the result; chunks have their own in their index."""
@@ -244,5 +379,5 @@ class StudyFolder:
             name = file.relative_to(self.path).as_posix()
             inside = name.split("/")[0] == FOLDER or file.name.startswith(".") or name == MANIFEST
             if file.is_file() and not inside:
-                out[name] = hashlib.sha256(file.read_bytes()).hexdigest()
+                out[name] = digest(file)
         return out

@@ -63,7 +63,7 @@ PAPERS = {
 }
 """The source papers by the number that the ids begin with."""
 
-Comparison = Literal["equal", "at most", "at least"]
+Comparison = Literal["two-sided", "at most", "at least"]
 Basis = Literal["printed", "chosen", "theory"]
 AGREED: dict[Basis, Verdict] = {"printed": CONFIRMED, "chosen": REPRODUCED, "theory": CONSISTENT}
 """What a row rests on -> its verdict where simulation and claim agree: a print that could have failed, a print with
@@ -89,6 +89,7 @@ class CheckResult:
         sigma: standard deviation of ``measured``; None where there is no noise.
         unit: of all these numbers; "1" for a ratio.
         tolerance: how far apart claim and measurement may be, without the noise.
+        comparison: two-sided, at most or at least; a row with one side takes whatever lies on the other.
         because: why that tolerance, a phrase.
         power: tolerance + 3 sigma: the smallest error of the statement that the row would have found. An error just so
             large is found half the time, one of 3 sigma more practically always. None where nothing is compared.
@@ -112,6 +113,7 @@ class CheckResult:
     sigma: float | None
     unit: str
     tolerance: float
+    comparison: Comparison
     because: str
     power: float | None
     tells: float | None
@@ -189,7 +191,8 @@ class Check:
         printed: the paper's number; None where it prints none.
         tolerance: how far apart printed and measured may be and still agree, without the noise.
         reason: why that tolerance.
-        comparison: ``equal``, or what the paper claims of the measured value: ``at most`` or ``at least`` the printed.
+        comparison: ``two-sided``: off to either side counts; or what the paper claims of the measured value: ``at
+            most`` or ``at least`` the printed, so that whatever lies on the other side agrees, however far away.
         expected: the verdict that is known from earlier work; any other one is reported and fails the command. By
             default that of agreement.
         separation: how far away the nearest other statement is that the row is to tell from this one, in its unit; with
@@ -207,7 +210,7 @@ class Check:
     printed: float | None
     tolerance: float
     reason: str
-    comparison: Comparison = "equal"
+    comparison: Comparison = "two-sided"
     expected: Verdict = OF_AGREEMENT
     separation: float | None = None
     alternative: str = ""
@@ -291,12 +294,14 @@ class Check:
         goal, allowed = float(goal), self.tolerance + noise
         verdict, reason = self._verdict(measured, goal, allowed, explanations, otherwise)
         agrees = verdict == self.agreed
-        ranges = tuple(i.range(lambda value: self._outside(value, goal) <= allowed, agrees) for i in inputs)
+        ranges = tuple(i.range(lambda value: self.outside(value, goal) <= allowed, agrees) for i in inputs)
         chosen = f"Chosen here: {'; '.join(r.text for r in ranges)}." if ranges else ""
         name = "printed" if self.printed is not None else f"implied ({goal:.6g})"
-        sign = {"equal": "±", "at most": "up to +", "at least": "down to -"}[self.comparison]
+        sign = {"two-sided": "±", "at most": "up to +", "at least": "down to -"}[self.comparison]
         limit = f"Measured minus {name}: {measured - goal:+.3g}; allowed {sign}{allowed:.3g}, that is "
         limit += f"{self.tolerance:.3g} ({self.reason})" + (" + 3 sigma." if noise else ".")
+        if self.comparison != "two-sided":
+            limit += f" One-sided: whatever is {'less' if self.comparison == 'at most' else 'more'} agrees."
         limit += f" To be told from {self.alternative}, {self.separation:.3g} away."
         text = "\n".join(part for part in (how, chosen, reason, limit) if part)
         found = self._result(measured, sigma, verdict, text)
@@ -314,10 +319,10 @@ class Check:
         """The result where the text does not print what a comparison needs."""
         return self._result(None, None, NOT_CHECKABLE, why)
 
-    def _outside(self, measured: float, goal: float) -> float:
+    def outside(self, measured: float, goal: float) -> float:
         """By how much a value is not what is claimed, on the claim's side."""
         distance = measured - goal
-        return {"equal": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
+        return {"two-sided": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
 
     def _verdict(
         self, measured: float, goal: float, allowed: float, explanations: Sequence[Explanation], otherwise: str
@@ -327,7 +332,7 @@ class Check:
             f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.alternative} is "
             f"{self.separation:.3g} away and would have passed as well."
         )
-        if self._outside(measured, goal) <= allowed:
+        if self.outside(measured, goal) <= allowed:
             return (self.agreed, "") if allowed <= self.separation else (UNDECIDED, f"It agrees, but {weak}")
         for reason in explanations:
             if abs(measured - reason.value) <= allowed:
@@ -352,6 +357,7 @@ class Check:
             sigma=sigma,
             unit=self.unit,
             tolerance=self.tolerance,
+            comparison=self.comparison,
             because=self.reason,
             power=None,
             tells=self.separation,

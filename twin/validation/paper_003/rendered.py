@@ -39,7 +39,6 @@ _REACH = MARGIN + 4
 _TERRAIN: dict[str, object] = {"kind": "fractal", "relief": "30 m", "exponent": 2.4}
 Advance = Callable[[float], None]
 ROLL_PITCH = BIAS[:2]
-YAW = BIAS[2:]
 FREE_INTERIOR = tuple(n for n in (f"{line} {k}" for line in LINES for k in INTERIOR) if n not in GAUGE.held)
 
 

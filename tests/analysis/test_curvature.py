@@ -1,0 +1,107 @@
+"""Readings that are not linear are worked out anew, and nothing else is touched: on a made-up monitor of four motions
+with four spot coordinates, whose spots and parameters bend.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.monitor.curvature import BEYOND, Curvature, MotionModel, Retraced, read_again
+
+RNG = np.random.default_rng(4)
+A = RNG.standard_normal((4, 4)) + 3.0 * np.eye(4)
+B = RNG.standard_normal((4, 4))
+BEND, TURN = 0.02 * RNG.standard_normal((4, 4, 4)), 0.02 * RNG.standard_normal((4, 4, 4))
+NOISE = 1e-6 * np.eye(4)[None]
+ROWS = np.eye(4)
+
+
+def spots(x):
+    return x @ A.T + np.einsum("dpq,sp,sq->sd", BEND, x, x)
+
+
+def parameters(x):
+    return x @ B.T + np.einsum("dpq,sp,sq->sd", TURN, x, x)
+
+
+def model(trace=lambda x: Retraced(spots(x), parameters(x))):
+    inverse = np.linalg.inv(A)
+    return MotionModel(A, B, lambda noise: np.broadcast_to(inverse, (len(noise), 4, 4)), trace)
+
+
+def read(x, how=None):
+    """Linear readings of a true state's exact spots, and those that are worked out anew."""
+    shift = spots(x)
+    linear = shift @ np.linalg.inv(A).T @ B.T
+    gain = B @ np.linalg.inv(A)
+    total = np.broadcast_to(gain @ NOISE[0] @ gain.T, (len(x), 4, 4))
+    noise = np.broadcast_to(NOISE, (len(x), 4, 4))
+    return linear, *read_again(linear, shift, noise, total, ROWS, model() if how is None else how)
+
+
+def test_small_motions_are_left_as_they_are() -> None:
+    linear, found, told = read(1e-3 * np.random.default_rng(1).standard_normal((5, 4)))
+    assert np.array_equal(linear, found)
+    assert not told.beyond.any()
+    assert told.holds.all()
+    assert np.all(told.off < BEYOND)
+
+
+def test_states_near_the_nominal_one_are_not_traced() -> None:
+    asked = []
+
+    def counted(states):
+        asked.append(len(states))
+        return Retraced(spots(states), parameters(states))
+
+    near = replace(model(counted), near_px=0.1)
+    x = np.stack([1e-3 * np.ones(4), 0.5 * np.ones(4), 2e-3 * np.ones(4)])
+    _, found, told = read(x, near)
+    assert asked[0] == 1
+    assert told.beyond.tolist() == [False, True, False]
+    assert found[1] == pytest.approx(parameters(x)[1], rel=1e-4)
+    assert told.off[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_large_motions_are_read_as_they_are() -> None:
+    """The linear reading is off by tens of sigmas; Gauss and Newton's steps end within a hundredth of one."""
+    x = 0.5 * np.sign(np.random.default_rng(2).standard_normal((5, 4)))
+    linear, found, told = read(x)
+    sigma = np.sqrt(np.diagonal(B @ np.linalg.inv(A) @ NOISE[0] @ np.linalg.inv(A).T @ B.T))
+    assert np.all(np.max(np.abs(linear - parameters(x)) / sigma, axis=1) > 10.0)
+    assert np.max(np.abs(found - parameters(x)) / sigma) < 0.02
+    assert told.beyond.all()
+    assert told.holds.all()
+    # what is said to be off is, to first order
+    assert told.off == pytest.approx(np.abs(linear - parameters(x)) / sigma, rel=0.5, abs=5.0)
+    worst, size = told.worst(2)
+    assert size == np.max(told.off[2])
+    assert worst == int(np.argmax(told.off[2]))
+
+
+def test_states_without_light_and_steps_without_end_do_not_hold() -> None:
+    x = np.stack([0.5 * np.ones(4), 1e-3 * np.ones(4)])
+
+    def dark(states):
+        lost = np.any(np.abs(states) > 0.1, axis=1)[:, None]
+        return Retraced(np.where(lost, np.nan, spots(states)), np.where(lost, np.nan, parameters(states)))
+
+    linear, found, told = read(x, model(dark))
+    assert np.array_equal(linear, found)
+    assert told.holds.tolist() == [False, True]
+    assert told.worst(0)[1] == np.inf
+
+    def wild(states):
+        return Retraced(-2.0 * spots(states), parameters(states))
+
+    _, _, told = read(x[:1], model(wild))
+    assert told.beyond.all()
+    assert not told.holds.any()
+
+
+def test_states_of_a_series_stay_in_their_order() -> None:
+    one, two = (Curvature(np.full((2, 3), v), np.array([v > 3, False]), np.array([True, v < 3])) for v in (1.0, 5.0))
+    both = Curvature.joined([one, two])
+    assert both.beyond.tolist() == [False, False, True, False]
+    assert both.at(slice(2, 4)).rests.tolist() == [True, False]

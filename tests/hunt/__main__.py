@@ -1,0 +1,32 @@
+"""``python -m tests.hunt [CASES] [FIRST]``: hunt for cases in which the twin misleads its user, and print them."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from optics.numerics.backend import load_backend
+from tests.hunt.hunt import hunt
+
+
+def main(cases: int = 60, first: int = 0, dense: int = 6) -> int:
+    """Print defects as they come, and what became of all cases; how many defects there are."""
+    began, counts, checked, defects = time.monotonic(), Counter(), 0, 0
+    with tempfile.TemporaryDirectory() as folder:
+        for outcome in hunt(first, cases, Path(folder), load_backend("llvm"), dense):
+            counts[outcome.kind] += 1
+            checked += outcome.checked
+            if outcome.defect:
+                defects += 1
+                print(f"{outcome.case}: {outcome.kind}: {outcome.text}", flush=True)
+            elif outcome.kind == "refused":
+                print(f"{outcome.case}: refused: " + outcome.text.splitlines()[-1][:220], flush=True)
+    print(f"{cases} cases in {time.monotonic() - began:.0f} s, {checked} with dense images: {dict(counts)}")
+    return defects
+
+
+if __name__ == "__main__":
+    sys.exit(1 if main(*map(int, sys.argv[1:])) else 0)

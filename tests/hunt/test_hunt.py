@@ -1,0 +1,69 @@
+"""Legal instruments and jobs in which no estimate may mislead: right, or warned of, or refused with key and remedy."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from optics.geometry.tree import Motion
+from tests.hunt.dense_images import DenseImages
+from tests.hunt.hunt import RIGHT, hunt
+from tests.hunt.legal_instruments import legal_instrument
+from tests.hunt.legal_jobs import legal_job
+
+FEW, MANY = 60, 1000
+
+
+@pytest.fixture
+def found(tmp_path, backend):
+    """Function: first instrument, cases and every how many images are worked out once more -> outcomes."""
+
+    def outcomes(first: int, cases: int, dense: int):
+        return list(hunt(first, cases, tmp_path, backend, dense))
+
+    return outcomes
+
+
+def require_honest(outcomes) -> Counter:
+    assert not [f"{o.case}: {o.kind}: {o.text}" for o in outcomes if o.defect]
+    return Counter(o.kind for o in outcomes)
+
+
+def test_nobody_is_misled(found) -> None:
+    outcomes = found(0, FEW, 12)
+    counts = require_honest(outcomes)
+    # a twin that refuses or warns of everything would be honest, too
+    assert counts[RIGHT] > 0.4 * FEW
+    assert sum(o.checked for o in outcomes) > 2
+
+
+@pytest.mark.slow
+def test_nobody_is_misled_in_a_thousand_cases(found, capsys) -> None:
+    """Half an hour of one core."""
+    outcomes = found(1000, MANY, 6)
+    with capsys.disabled():
+        print(f"\n{MANY} cases: {dict(Counter(o.kind for o in outcomes))}")  # noqa: T201 - the test's result
+    counts = require_honest(outcomes)
+    assert counts[RIGHT] > 0.4 * MANY
+
+
+def test_cases_are_the_same_every_time_and_differ(experiment) -> None:
+    nodes = experiment("gf7_pair").instrument.nodes
+    assert legal_instrument(7) == legal_instrument(7)
+    assert legal_job(7, 1, nodes) == legal_job(7, 1, nodes)
+    texts = [str(legal_job(7, k, nodes)) for k in range(50)]
+    assert len(set(texts)) == 50
+    assert len({legal_instrument(k).text for k in range(50)}) > 40
+
+
+@pytest.mark.parametrize("defocus", [0.0, 3e-3])
+def test_the_reference_agrees_where_images_are_known_to_be_right(experiment, defocus: float) -> None:
+    path = experiment("gf7_pair").path
+    state = {"base/forward/focal_plane": Motion(shift=(1e-4, 5e-5, defocus))} if defocus else {}
+    image = path.photons_of(state)[0]
+    rows, columns = np.array([48, 50, 40, 20]), np.array([47, 52, 48, 70])
+    dense = DenseImages(path, state)
+    dense.trace()
+    assert np.abs(dense.photons(0, rows, columns) - image[rows, columns]).max() < 3e-6 * image.max()

@@ -1,0 +1,122 @@
+"""A command with its files, of which one is spoilt, and how far the command may go."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+import typer
+
+from scenes.specs.load import SCENES
+
+JOBS = Path(__file__).parents[1] / "golden/jobs"
+"""Small jobs of every command, those of the golden runs."""
+
+CUTS = (
+    "twin.monitor.truth.LineSight.truth",
+    "twin.laboratory.focus_alignment.align",
+    "twin.laboratory.distortion_bench.DistortionBench.record",
+    "twin.laboratory.turntable_run.choose",
+    "twin.laboratory.distortion_run.choose",
+    "twin.orbit.angle.angle_run.estimated",
+    "twin.orbit.angle.measured_angle.estimated",
+    "twin.orbit.calibration.flown_campaign._simulated_points",
+    "twin.orbit.calibration.calibration_run.campaign_of",
+    "twin.orbit.calibration.field_images.Imager.measured",
+    "twin.orbit.monitoring.monitoring_flight._changes",
+    "twin.orbit.images.simulate_run.fly_patch",
+    "twin.orbit.export.export_run._exported",
+    "twin.orbit.conventions.check_run._searched",
+    "twin.orbit.matching.match_run.measure_points",
+    "twin.study.study_command.local_workers",
+    "twin.study.gradient.study_gradient._Traced",
+    "twin.study.gradient.study_gradient._whole",
+    "twin.design.design_run.search",
+    "twin.design.layout_search._OneSearch.run",
+    "twin.camera.camera_run.run_camera",
+    "twin.uncertainty.uncertainty_run.run_uncertainty",
+    "twin.recover.recover_run._modelled",
+    "twin.recover.recover_run._measured",
+    "twin.live.__main__._serve",
+)
+"""Functions that begin the long computations."""
+SOONER = (
+    "twin.design.monitor_design.LayoutBench",
+    "scenes.models.thermal_model.ThermalModel._solid_response",
+    "optics.waves.transfer._correlate",
+)
+"""Parts of building that take seconds, finite elements and transfer functions: most mutants stop before them."""
+
+
+class Reached(BaseException):
+    """A command has read and built everything and would now compute."""
+
+
+def _reach(*_: object, **__: object) -> None:
+    raise Reached
+
+
+@contextmanager
+def cut(soon: bool) -> Iterator[None]:
+    """Let no command compute, and not even build what takes seconds if ``soon``."""
+    with ExitStack() as stack:
+        for name in (*CUTS, *SOONER) if soon else CUTS:
+            stack.enter_context(patch(name, _reach))
+        yield
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command and its files.
+
+    Attributes:
+        name: of the case.
+        kind: what sort of file is spoilt, as it is counted.
+        app: of the command.
+        words: before the file, such as the subcommand; {here} is the case's folder, here and in the other words.
+        files: name in the case's folder -> content.
+        target: the file that is changed.
+        options: after the file.
+        given: what the command is given; empty for the first of the files.
+        out: what its option --out is given, relative to the folder; empty for a command that has none.
+        whole: every so many mutants the command is not cut, but runs to its end; 0 for never.
+        weight: share of the mutants; slow commands get fewer.
+        changes: beginnings of the files' names that the command may change beside its results.
+        starts: whether it may start programs and listen on ports of this machine, when it is not cut.
+    """
+
+    name: str
+    kind: str
+    app: typer.Typer
+    words: tuple[str, ...]
+    files: Mapping[str, bytes]
+    target: str
+    options: tuple[str, ...] = ()
+    given: str = ""
+    out: str = "out/run"
+    whole: int = 0
+    weight: float = 1.0
+    changes: tuple[str, ...] = ()
+    starts: bool = False
+
+
+def text_of(name: str) -> bytes:
+    """A file of scenes."""
+    return (SCENES / name).read_bytes()
+
+
+def job_of(name: str) -> bytes:
+    """A file of the golden runs' small jobs."""
+    return (JOBS / name).read_bytes()
+
+
+def edited(content: bytes, *changes: tuple[str, str]) -> bytes:
+    """A text with other words, all of which have to be there."""
+    text = content.decode()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text.encode()

@@ -1,0 +1,127 @@
+"""Commands that are started in a folder with a numpy.py, an optics.py, a random.py run none of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from docs.site.command_pages import programs
+from tests.twin.live_page import running
+from twin.run.console import PROGRAMS
+
+ROOT = Path(__file__).resolve().parents[1]
+CONSOLE = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]["twin"]
+OURS = ("optics", "scenes", "twin", "analysis")
+
+
+def folder_of_traps(place: Path, *spared: str) -> Path:
+    """A folder with a module of every name that a command could import; each says that it was run, and fails."""
+    names = {*sys.stdlib_module_names, *OURS, "numpy", "typer", "rich", "pydantic", "drjit", "matplotlib", "dask"}
+    for name in names - {*spared}:
+        text = f"open({str(place / 'hit')!r}, 'a').write({name!r} + '\\n')\nraise ImportError({name!r})\n"
+        (place / f"{name}.py").write_text(text, "utf-8")
+    return place
+
+
+def started(place: Path, *words: str, here: str = "") -> subprocess.CompletedProcess[str]:
+    """Python with these words in a folder; this checkout's packages are on its path, as installed ones are."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment.pop("PYTHONSAFEPATH", None)
+    return subprocess.run([sys.executable, *words], cwd=here or place, env=environment, capture_output=True, text=True)
+
+
+def console(place: Path) -> str:
+    """The script that pip makes of the entry point, in a folder of its own."""
+    module, _, name = CONSOLE.partition(":")
+    script = place / "bin" / "twin"
+    script.parent.mkdir(exist_ok=True)
+    script.write_text(f"import sys\nfrom {module} import {name}\nsys.exit({name}())\n", "utf-8")
+    return str(script)
+
+
+def hits(place: Path) -> str:
+    return (place / "hit").read_text("utf-8") if (place / "hit").exists() else ""
+
+
+@pytest.mark.parametrize("module", ["twin.render", "scenes.lens", "analysis.mtf"])
+def test_a_module_runs_nothing_of_the_folder_where_it_is_started(tmp_path, module):
+    """One of the program's own name cannot be helped: Python looks for that there before this program is found."""
+    place = folder_of_traps(tmp_path, module.partition(".")[0])
+    done = started(place, "-m", module, "--help")
+    assert (done.returncode, hits(place)) == (0, ""), done.stderr
+    assert "Usage" in done.stdout
+
+
+def test_the_console_command_runs_nothing_of_it_either(tmp_path):
+    place = folder_of_traps(tmp_path)
+    done = started(place, console(place), "doctor", "--help")
+    assert (done.returncode, hits(place)) == (0, ""), done.stderr
+    assert "Usage" in done.stdout
+
+
+def test_the_traps_work(tmp_path):
+    place = folder_of_traps(tmp_path)
+    assert started(place, "-c", "import numpy").returncode == 1
+    assert hits(place) == "numpy\n"
+
+
+def test_a_checkout_is_taken_where_it_is(tmp_path):
+    """From its root, whatever else is installed; its child processes likewise."""
+    (tmp_path / "twin").mkdir()
+    text = (ROOT / "twin/__init__.py").read_text("utf-8")
+    (tmp_path / "twin/__init__.py").write_text(text, "utf-8")
+    (tmp_path / "twin/where.py").write_text("import os, sys\nprint(sys.path[0], os.environ.get('PYTHONSAFEPATH'))\n")
+    assert started(tmp_path, "-m", "twin.where").stdout.split() == [str(tmp_path), "None"]
+
+
+def test_programs_of_others_keep_their_folder(tmp_path):
+    """A script or a module of a user that imports the twin finds its neighbours, as ever."""
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/__init__.py").write_text("import twin, scenes, analysis\n")
+    (tmp_path / "mine/run.py").write_text("import neighbour\n")
+    (tmp_path / "neighbour.py").write_text("print('found')\n")
+    assert started(tmp_path, "-m", "mine.run").stdout == "found\n"
+    (tmp_path / "script.py").write_text("import twin\nimport neighbour\n")
+    assert started(tmp_path, "script.py").stdout == "found\n"
+
+
+def test_the_console_command_knows_every_program(tmp_path):
+    assert sorted(PROGRAMS.values()) == sorted(programs())
+    script = console(tmp_path)
+    listed = started(tmp_path, script, "--help")
+    assert all(module in listed.stdout for module in programs())
+    assert started(tmp_path, script).returncode == 2
+    wrong = started(tmp_path, script, "rendre")
+    assert wrong.returncode == 2
+    assert "choose render" in wrong.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["module", "console"])
+def test_processes_of_a_command_run_nothing_of_it_either(tmp_path, way):
+    """The second process of the main job, workers of a study, and what they start."""
+    place = folder_of_traps(tmp_path, *(["twin"] if way == "module" else []))
+
+    def run(name: str, *words: str) -> None:
+        how = ["-m", f"twin.{name}"] if way == "module" else [console(place), name]
+        done = started(place, *how, *words)
+        assert (done.returncode, hits(place)) == (0, ""), done.stderr
+
+    run("render", str(ROOT / "scenes/examples/perturb.yaml"), "--frames", "1", "--out", "one", "--quiet")
+    assert json.loads((place / "one/truth.json").read_text("utf-8"))
+    run("study", str(ROOT / "scenes/examples/study_smoke.yaml"), "--workers", "2", "--out", "two", "--yes", "--quiet")
+    assert (place / "two/study.nc").exists()
+
+
+@pytest.mark.slow
+def test_the_process_of_the_live_twin_runs_nothing_of_it_either(tmp_path):
+    place = folder_of_traps(tmp_path, "twin")
+    with running("gf7_pair", "--port", "0", "--stay", cwd=place, PYTHONPATH=str(ROOT)) as command:
+        assert command.end() == 0
+    assert hits(place) == ""

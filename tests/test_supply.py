@@ -1,0 +1,291 @@
+"""Lock files, bill of materials, licences and known vulnerabilities: complete, and refusing what is not."""
+
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.markers import Marker
+from packaging.requirements import Requirement
+
+from docs.supply.audit import findings
+from docs.supply.licences import read_carried, read_table
+from docs.supply.make_lock import EXTRAS, SupplyError, direct
+from twin import doctor
+from twin.run.lock_file import FOLDER, LAYERS, LockError, differences, normal, parse, read_layer, read_lock
+
+ROOT = Path(__file__).resolve().parent.parent
+PROJECT = "space-camera-twin"
+LOCK = {layer: read_layer(layer) for layer in LAYERS}
+PYTHONS = ("3.11.2", "3.11.7", "3.12.3", "3.13.5")
+"""Debian 12's, the one of the tests, Ubuntu 24.04's and Debian 13's."""
+
+
+def installed(layers: tuple[str, ...], python: str) -> dict[str, str]:
+    """Name -> version of what these layers install on Linux with this Python; no name with two versions."""
+    here = {
+        "python_version": ".".join(python.split(".")[:2]),
+        "python_full_version": python,
+        "sys_platform": "linux",
+        "platform_system": "Linux",
+        "platform_machine": "x86_64",
+        "os_name": "posix",
+        "implementation_name": "cpython",
+        "platform_python_implementation": "CPython",
+    }
+    out: dict[str, str] = {}
+    for layer in layers:
+        for p in LOCK[layer]:
+            if not p.marker or Marker(p.marker).evaluate(here):
+                assert out.setdefault(p.name, p.version) == p.version, p.name
+    return out
+
+
+@pytest.mark.parametrize("python", PYTHONS)
+@pytest.mark.parametrize("layer", EXTRAS)
+def test_every_requirement_is_locked_at_its_version(layer: str, python: str) -> None:
+    layers = LAYERS[: LAYERS.index(layer) + 1]
+    have = installed(layers, python)
+    wanted = [Requirement(line) for line in direct(EXTRAS[layer])]
+    assert len(wanted) > 30
+    minor = {"python_version": ".".join(python.split(".")[:2]), "platform_machine": "x86_64", "sys_platform": "linux"}
+    for one in wanted:
+        if one.marker is None or one.marker.evaluate(minor):
+            assert one.specifier.contains(have[normal(one.name)]), one
+        assert "==" in str(one.specifier), one
+
+
+def test_nothing_else_is_locked() -> None:
+    """Every package is asked for by the project, or by another one that its own layer or one before it has."""
+    for layer in EXTRAS:
+        before = {p.name: p for name in LAYERS[: LAYERS.index(layer) + 1] for p in LOCK[name]}
+        own = {normal(Requirement(line).name) for line in direct(EXTRAS[layer])}
+        reached, left = set(own), set(before)
+        while left:
+            more = {name for name in left if name in own or reached & set(before[name].asked_by)}
+            if not more:
+                break
+            reached |= more
+            left -= more
+        assert left <= {p.name for p in LOCK["install"]}
+        assert own <= reached
+    for layer in ("install", "peers"):
+        listed = [
+            Requirement(line) for line in (FOLDER / f"{layer}.in").read_text("utf-8").splitlines() if "==" in line
+        ]
+        assert {(normal(r.name), str(r.specifier)) for r in listed} == {(p.name, f"=={p.version}") for p in LOCK[layer]}
+
+
+def test_what_the_twin_needs_in_this_environment_is_locked() -> None:
+    """By what the installed packages ask for, not by what the lock says of itself; rasterio's command line apart."""
+    names = {p.name for p in read_lock()}
+    for name in {p.name for p in LOCK["runtime"] if p.here}:
+        try:
+            lines = importlib.metadata.requires(name) or []
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        for one in map(Requirement, lines):
+            if one.marker is None or one.marker.evaluate({"extra": ""}):
+                assert normal(one.name) in names | {"click-plugins", "cligj"}, (name, one.name)
+
+
+def test_no_lock_file_names_an_index_or_a_place() -> None:
+    for layer in LAYERS:
+        text = (FOLDER / f"{layer}.txt").read_text("utf-8")
+        assert not re.search(r"://|--(extra-)?index|--find-links|file:|(^|\s)/\w|@", text)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("numpy==2.4.6\n", "x:1: numpy has no hash"),
+        ("numpy==2.4.6 \\\n    --hash=sha256:12\n", "x:2: not a hash"),
+        ("numpy>=2\n", "x:1: not a pinned package"),
+        ("--index-url https://index.example/simple\n", "x:1: not a pinned package"),
+        ("numpy @ file:///tmp/numpy.whl\n", "x:1: not a pinned package"),
+    ],
+)
+def test_a_lock_file_that_is_none_is_refused(text: str, told: str) -> None:
+    with pytest.raises(LockError, match=re.escape(told)):
+        parse(text, "runtime", "x")
+
+
+@pytest.fixture
+def lock(tmp_path: Path) -> Path:
+    for layer in LAYERS:
+        shutil.copy(FOLDER / f"{layer}.txt", tmp_path)
+    return tmp_path
+
+
+def test_what_differs_from_the_lock_is_told(lock: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file, before = lock / "runtime.txt", differences(PROJECT, lock)
+    assert before.equal > 80
+    version = importlib.metadata.version("jinja2")
+    text = file.read_text("utf-8").replace(f"jinja2=={version}", "jinja2==99.1")
+    file.write_text(text + f"no-such-package==1.0 \\\n    --hash=sha256:{'0' * 64}\n", "utf-8")
+    found = differences(PROJECT, lock)
+    assert f"jinja2 {version}, locked 99.1" in found.other
+    assert "no-such-package==1.0" in found.missing
+    assert found.equal == before.equal - 1
+    monkeypatch.setattr("twin.run.lock_file.FOLDER", lock)
+    monkeypatch.setattr("twin.run.lock_file.differences", lambda own: found)
+    (line,) = doctor._lock()
+    assert line.status == "failed"
+    assert "99.1" in line.detail
+    assert "bash setup.sh" in line.detail
+
+
+def test_setup_installs_the_lock_and_nothing_else() -> None:
+    """Each call of pip: by checksums, or the project itself without what it asks for."""
+    text = (ROOT / "setup.sh").read_text("utf-8").replace("\\\n", " ")
+    calls = [line for line in text.splitlines() if "-m pip install" in line]
+    assert len(calls) == 2
+    assert all("--no-deps" in line for line in calls)
+    assert "--require-hashes --only-binary :all:" in calls[0]
+    assert "--no-build-isolation -e ." in calls[1]
+    assert f'all="{" ".join(LAYERS)}"' in text
+
+
+def forged(folder: Path, name: str, version: str) -> None:
+    """A wheel that can be installed, with other contents than the locked one."""
+    with zipfile.ZipFile(folder / f"{name}-{version}-py3-none-any.whl", "w") as wheel:
+        info = f"{name}-{version}.dist-info"
+        wheel.writestr(f"{name}/__init__.py", "raise SystemExit('forged')\n")
+        wheel.writestr(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        wheel.writestr(f"{info}/WHEEL", "Wheel-Version: 1.0\nGenerator: x\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(f"{info}/RECORD", "")
+
+
+@pytest.mark.slow
+def test_setup_refuses_another_file_than_the_locked_one(tmp_path: Path) -> None:
+    project, index = tmp_path / "project", tmp_path / "index"
+    (project / "docs/supply").mkdir(parents=True)
+    index.mkdir()
+    shutil.copytree(FOLDER, project / "docs/supply/lock")
+    for name in ("setup.sh", "pyproject.toml"):
+        shutil.copy(ROOT / name, project)
+    for p in LOCK["install"]:
+        forged(index, p.name, p.version)
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("PIP_")}
+    environment |= {
+        "PIP_NO_INDEX": "1",
+        "PIP_FIND_LINKS": str(index),
+        "PIP_CONFIG_FILE": os.devnull,
+        "PYTHON": sys.executable,
+    }
+    command = ["bash", "setup.sh"]
+    done = subprocess.run(
+        command, cwd=project, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 1
+    assert "DO NOT MATCH THE HASHES" in done.stderr
+    assert "Do not install that file" in done.stderr
+    assert not (project / ".venv/installed").exists()
+    assert list(project.glob(".venv/lib/*/site-packages/pip-26.3*")) == []
+
+
+def test_every_locked_package_has_its_licence() -> None:
+    rows = read_table()
+    assert len(rows) == len({(row.package, row.version) for row in rows})
+    assert {(row.package, row.version) for row in rows} == {(p.name, p.version) for p in read_lock()}
+    assert {row.copyleft for row in (*rows, *read_carried())} == {"no", "weak", "strong"}
+    assert {inner.package for inner in read_carried()} <= {row.package for row in rows}
+    pytest.importorskip("license_expression")
+    from docs.supply.licences import copyleft, spdx
+
+    for row in (*rows, *read_carried()):
+        assert row.copyleft == copyleft(row.licence), row
+        named = row.licence.replace("LicenseRef-Public-Domain", "CC0-1.0")
+        assert spdx().parse(named, validate=True, strict=True) is not None
+
+
+def test_nothing_that_the_twin_needs_is_strongly_copyleft() -> None:
+    """docs/installed.md says so."""
+    names = {row.package for row in read_table() if row.for_ in ("install", "runtime", "live")}
+    assert {row.package for row in read_table() if row.copyleft == "strong"} == set()
+    assert {inner.package for inner in read_carried() if inner.copyleft == "strong"} & names == set()
+
+
+def test_every_weak_or_strong_licence_stands_on_the_page() -> None:
+    page = (ROOT / "docs/installed.md").read_text("utf-8")
+    told = [row.package for row in read_table() if row.copyleft != "no"]
+    told += [inner.library for inner in read_carried() if inner.copyleft != "no"]
+    assert len(told) > 5
+    assert [name for name in told if name not in page] == []
+
+
+@pytest.mark.parametrize(
+    ("expression", "asks"),
+    [
+        ("MIT", "no"),
+        ("GPL-2.0-only OR MIT", "no"),
+        ("MIT AND LGPL-3.0-only", "weak"),
+        ("(MIT OR GPL-3.0-only) AND MPL-2.0", "weak"),
+        ("GPL-3.0-or-later WITH GCC-exception-3.1", "weak"),
+        ("Apache-2.0 WITH LLVM-exception", "no"),
+        ("MIT AND AGPL-3.0-or-later", "strong"),
+    ],
+)
+def test_what_a_licence_asks(expression: str, asks: str) -> None:
+    pytest.importorskip("license_expression")
+    from docs.supply.licences import copyleft
+
+    assert copyleft(expression) == asks
+
+
+@pytest.mark.parametrize("layers", [("install", "live"), pytest.param(LAYERS, marks=pytest.mark.slow)], ids=len)
+def test_the_bill_of_materials_lists_every_locked_package(layers: tuple[str, ...]) -> None:
+    pytest.importorskip("cyclonedx")
+    from docs.supply.sbom import bill
+
+    text = bill(layers)  # checks itself against the schema
+    assert text == bill(layers)
+    made = json.loads(text)
+    assert made["specVersion"] == "1.6"
+    parts = {(part["name"], part["version"]): part for part in made["components"]}
+    every = read_lock(layers=layers)
+    assert set(parts) == {(p.name, p.version) for p in every}
+    for p in every:
+        part = parts[p.name, p.version]
+        assert part["purl"] == f"pkg:pypi/{p.name}@{p.version}"
+        assert {one["content"] for one in part["hashes"]} == set(p.hashes)
+        assert part["licenses"]
+    needs = {one["ref"]: one.get("dependsOn", []) for one in made["dependencies"]}
+    assert "pkg:pypi/starlette@1.10.0" in needs[PROJECT]
+    assert "pkg:pypi/h11@0.16.0" in needs["pkg:pypi/uvicorn@0.54.0"]
+    assert {ref for refs in needs.values() for ref in refs} <= {part["bom-ref"] for part in made["components"]}
+    assert str(ROOT) not in text
+
+
+def test_a_bill_that_is_none_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("cyclonedx")
+    from docs.supply import sbom
+
+    monkeypatch.setattr(sbom, "read_table", lambda: [row for row in read_table() if row.package != "starlette"])
+    with pytest.raises(SupplyError, match=r"no licence of starlette 1\.10"):
+        sbom.bill(("live",))
+
+
+GOOD = {"name": "a", "version": "1", "vulns": []}
+BAD = {
+    "name": "b",
+    "version": "2",
+    "vulns": [{"id": "PYSEC-1", "fix_versions": ["3"], "aliases": [], "description": ""}],
+}
+SKIPPED = {"name": "c", "skip_reason": "Dependency not found on PyPI and could not be audited: c (3)"}
+
+
+def test_known_vulnerabilities_are_told_and_what_was_not_checked_is_no_good_news() -> None:
+    assert findings(json.dumps({"dependencies": [GOOD], "fixes": []})) == (1, ())
+    number, (found,) = findings(json.dumps({"dependencies": [GOOD, BAD], "fixes": []}))
+    assert (number, found.package, found.number, found.mended_in) == (2, "b", "PYSEC-1", ("3",))
+    with pytest.raises(SupplyError, match="no answer for 1 of 2 packages: c"):
+        findings(json.dumps({"dependencies": [GOOD, SKIPPED], "fixes": []}))
+    with pytest.raises(SupplyError, match="0 of 0"):
+        findings(json.dumps({"dependencies": [], "fixes": []}))

@@ -1,0 +1,290 @@
+"""The live twin's server among connections that mean no good, beside other servers, and after a restart."""
+
+from __future__ import annotations
+
+import http.cookiejar
+import socket
+import time
+import urllib.error
+import urllib.request
+from contextlib import ExitStack, suppress
+
+import numpy as np
+import pytest
+
+pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
+pytest.importorskip("websockets.sync.client", reason="the extra `live` is not installed")
+
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import Frame, Opcode
+
+from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
+from tests.twin.live_crowd import SOCKET, WRONG, crowded
+from tests.twin.live_page import CHROMIUM, FLAGS
+from twin.live import connections
+from twin.live.connections import MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS
+from twin.live.guard import COOKIE, Guard, names_of_this_machine
+
+PROMPT = 0.2
+"""Seconds in which a user's page is answered."""
+
+
+def lines(stack: ExitStack, port: int, number: int, said: bytes = b"", source: str = "127.0.0.1"):
+    """Connections that say something."""
+    out = []
+    for _ in range(number):
+        line = stack.enter_context(socket.create_connection(("127.0.0.1", port), 5, (source, 0)))
+        line.sendall(said)
+        out.append(line)
+    return out
+
+
+def ended(line: socket.socket, seconds: float) -> bool:
+    """Whether the server ends a connection in this time."""
+    line.settimeout(seconds)
+    try:
+        while line.recv(65536):
+            pass
+    except TimeoutError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def answered(port: int, ws, rounds: int, secret: str = SECRET) -> np.ndarray:
+    """Seconds that parts of the page and states took, on a new connection and on the page's own."""
+    out = []
+    for n in range(1, rounds + 1):
+        for path in ("/", "/live.js", "/session"):
+            began = time.perf_counter()
+            assert ask(port, path, secret)[0] == 200
+            out.append(time.perf_counter() - began)
+        began = time.perf_counter()
+        ws.send(state(n))
+        while not isinstance(said := ws.recv(10), bytes) or numbered(said) != n:
+            pass
+        out.append(time.perf_counter() - began)
+        time.sleep(0.01)
+    return np.array(out)
+
+
+def test_who_says_nothing_locks_nobody_out(capfd):
+    """70 idle connections did: the server counted them, and answered 503 until they went."""
+    with serving(StandIn()) as (port, server), ExitStack() as stack:
+        for k in range(10):
+            lines(stack, port, 30, source=f"127.0.0.{2 + k}")
+        for text in WRONG:
+            lines(stack, port, 2, text)
+        with connect(port) as ws:
+            ws.recv(5)
+            # a machine on which much else runs holds up one answer or the other
+            assert np.quantile(answered(port, ws, 20), 0.9) < PROMPT
+        assert len(server.connections) <= MOST_STRANGERS + MOST_KNOWN
+    said = capfd.readouterr()
+    assert (said.out, said.err) == ("", "")
+
+
+def test_one_address_does_not_take_the_places_of_others():
+    with serving(StandIn()) as (port, _), ExitStack() as stack:
+        quiet = lines(stack, port, 5, source="127.0.0.9")
+        time.sleep(0.1)
+        loud = lines(stack, port, 3 * MOST_OF_ONE)
+        time.sleep(0.3)
+        assert not any(ended(line, 0.01) for line in quiet)
+        assert sum(ended(line, 0.01) for line in loud) == 2 * MOST_OF_ONE
+
+
+@pytest.mark.parametrize(
+    "said",
+    [b"", b"GET / HTTP/1.1\r\nHo", b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 9000\r\n\r\nx"],
+    ids=["nothing", "half a head", "half a body"],
+)
+def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
+    monkeypatch.setattr(connections, "HEAD", 0.4)
+    with serving(StandIn()) as (port, server), ExitStack() as stack:
+        [line] = lines(stack, port, 1, said)
+        began = time.monotonic()
+        while not ended(line, 0.1) and time.monotonic() - began < 3.0:
+            line.sendall(b"x")
+        assert time.monotonic() - began < 1.5
+        time.sleep(0.05)
+        assert len(server.connections) == 0
+
+
+def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
+    monkeypatch.setattr(connections, "HEAD", 0.4)
+    whole = f"GET /session HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nCookie: space_camera_twin_%d={SECRET}\r\n\r\n"
+    with serving(StandIn()) as (port, _), ExitStack() as stack:
+        [line] = lines(stack, port, 1, (whole % (port, port)).encode())
+        assert b" 200 " in line.recv(65536)
+        assert not ended(line, 0.8)  # between requests there is more time
+        line.sendall(b"GET /")
+        assert ended(line, 1.5)
+
+
+def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
+    monkeypatch.setattr(connections, "ANSWER", 0.5)
+    whole = f"GET /three.min.js HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nCookie: space_camera_twin_%d={SECRET}\r\n\r\n"
+    with serving(StandIn()) as (port, server), ExitStack() as stack:
+        lines(stack, port, 1, (whole % (port, port)).encode() * 40)
+        time.sleep(0.2)
+        assert len(server.connections) == 1
+        time.sleep(1.0)
+        assert len(server.connections) == 0
+
+
+def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
+    """A client of its own: others read by themselves, in a thread."""
+    from twin.live import clients
+
+    monkeypatch.setattr(clients, "PATIENCE", 0.3)
+    monkeypatch.setattr(connections, "UNREAD", 0.3)
+    with serving(StandIn(bytes_each=30_000_000)) as (port, server), ExitStack() as stack:
+        head = SOCKET.replace(b"127.0.0.1", f"127.0.0.1:{port}".encode())
+        said = head + f"Cookie: {COOKIE.format(port=port)}={SECRET}\r\n\r\n".encode()
+        [line] = lines(stack, port, 1, said)
+        assert b" 101 " in line.recv(4096)
+        came, n = time.monotonic(), 0
+        while server.desk.clients or server._uvicorn.server_state.connections:
+            assert time.monotonic() - came < 20.0
+            n += 1
+            with suppress(OSError):  # it may be cut off by now
+                line.sendall(Frame(Opcode.TEXT, state(n).encode()).serialize(mask=True))
+            time.sleep(0.1)
+        assert server.desk.states >= 2
+
+
+@pytest.mark.parametrize("pieces", [[b"\xff\xfe"], [b'{"type": "\xc3', b'\x28"}']])
+def test_text_that_is_not_utf_8_ends_the_page_without_a_traceback(pieces, capfd):
+    with serving(StandIn()) as (port, _):
+        with connect(port) as ws:
+            ws.recv(5)
+            for k, piece in enumerate(pieces):
+                kind = Opcode.CONT if k else Opcode.TEXT
+                ws.socket.sendall(Frame(kind, piece, fin=k == len(pieces) - 1).serialize(mask=True))
+            with pytest.raises(ConnectionClosed) as closed:
+                ws.recv(5)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1007
+        assert ask(port, "/session")[0] == 200
+    assert capfd.readouterr().err == ""
+
+
+# --- several servers, other names -------------------------------------------------------------------------------------
+def opened(browser: urllib.request.OpenerDirector, address: str) -> int:
+    """Status of a page."""
+    try:
+        with browser.open(address, timeout=5) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def a_browser() -> urllib.request.OpenerDirector:
+    """With a jar of cookies, which are a host's, whatever the port."""
+    jar = http.cookiejar.CookieJar()
+    return urllib.request.build_opener(urllib.request.ProxyHandler({}), urllib.request.HTTPCookieProcessor(jar))
+
+
+def test_two_servers_on_one_host_in_one_browser():
+    browser = a_browser()
+    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
+    with ExitStack() as stack:
+        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
+        for port, token in zip(ports, tokens, strict=True):
+            assert opened(browser, f"http://127.0.0.1:{port}/?token={token}") == 200
+        for _ in range(2):
+            for port in ports:
+                assert opened(browser, f"http://127.0.0.1:{port}/session") == 200
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+def test_two_servers_on_one_host_in_chromium():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
+    tokens = ["the-token-of-the-first-server", "the-token-of-the-second-one"]
+    with ExitStack() as stack:
+        ports = [stack.enter_context(serving(StandIn(), secret=token))[0] for token in tokens]
+        browser = stack.enter_context(playwright.sync_playwright()).chromium.launch(
+            executable_path=CHROMIUM, args=FLAGS
+        )
+        context = browser.new_context()
+        tabs = [context.new_page() for _ in ports]
+        for tab, port, token in zip(tabs, ports, tokens, strict=True):
+            assert tab.goto(f"http://127.0.0.1:{port}/?token={token}").status == 200
+        for _ in range(2):
+            for tab in tabs:
+                assert tab.reload().status == 200
+                assert tab.evaluate("fetch('session').then((answer) => answer.status)") == 200
+        browser.close()
+
+
+def test_cookies_of_other_programs_do_not_hide_ours():
+    with serving(StandIn()) as (port, _):
+        mine = f"space_camera_twin_{port}={SECRET}"
+        for others in ('{"a": 1}; ', "a b=c; ", "x=\xe9\xff; ", "=; ;; ", f"space_camera_twin_{port}=wrong; "):
+            headers = {"Cookie": others + mine}
+            assert ask(port, "/session", cookie=None, **headers)[0] == 200
+
+
+def test_a_restart_with_the_same_token_keeps_the_browser_and_with_another_refuses_it():
+    browser = a_browser()
+    with serving(StandIn()) as (port, _):
+        assert opened(browser, f"http://127.0.0.1:{port}/?token={SECRET}") == 200
+    with serving(StandIn(), port=port):
+        assert opened(browser, f"http://127.0.0.1:{port}/session") == 200
+    with serving(StandIn(), port=port, secret="another-token-of-enough-letters"):
+        assert opened(browser, f"http://127.0.0.1:{port}/session") == 403
+
+
+def test_every_name_of_this_machine_and_no_other():
+    """With ``--host 0.0.0.0``; a request for one of its numbers says so in its Host, and came in at it."""
+    with serving(StandIn(), host="0.0.0.0") as (port, _):
+        for name in ("127.0.0.1", "localhost", *names_of_this_machine()):
+            assert ask(port, "/session", Host=f"{name}:{port}")[0] == 200
+        assert ask(port, "/session", to="127.0.0.2", Host=f"127.0.0.2:{port}")[0] == 200
+        for name in (f"127.0.0.3:{port}", "127.0.0.2", f"evil.example:{port}", "0.0.0.0", f"127.0.0.2:{port + 1}"):
+            assert ask(port, "/session", to="127.0.0.2", Host=name)[0] == 403
+        assert ask(port, "/session", None, to="127.0.0.2", Host=f"127.0.0.2:{port}")[0] == 403
+
+
+def test_the_port_of_http_is_not_written():
+    guard = Guard.of(SECRET, "127.0.0.1", 80)
+    headers = {"host": "127.0.0.1", "origin": "http://127.0.0.1", "cookie": f"space_camera_twin_80={SECRET}"}
+    assert guard.refuses(headers, socket=True) == ""
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="no IPv6")
+def test_over_ipv6():
+    try:
+        with serving(StandIn(), host="::1") as (port, _):
+            assert ask(port, "/session", to="::1", Host=f"[::1]:{port}")[0] == 200
+            assert ask(port, "/session", to="::1", Host=f"[::2]:{port}")[0] == 403
+    except OSError:
+        pytest.skip("no IPv6 here")
+
+
+# --- all at once ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
+def test_a_thousand_connections_that_mean_no_good_beside_one_user(capfd):
+    """What computes is a stand-in: the figures are of the server, and of what else this machine does meanwhile."""
+    with serving(StandIn()) as (port, server), connect(port) as ws:
+        ws.recv(5)
+        alone = answered(port, ws, 100)
+        with crowded(port, 1000, 40.0) as crowd:
+            time.sleep(5.0)
+            among = answered(port, ws, 200)
+            held = len(server.connections)
+            told, _ = crowd.communicate()
+    most, came, served = map(int, told.split())
+    said = capfd.readouterr()
+    with capfd.disabled():
+        for name, seconds in (("alone", alone), (f"{most} open at once, {came} came", among)):
+            figures = ", ".join(f"{1e3 * np.quantile(seconds, q):.0f}" for q in (0.5, 0.95, 1.0))
+            print(f"\n{name}: {figures} ms (median, 95 in 100, longest)", end="")  # noqa: T201
+    assert served == 0
+    assert came >= 1000
+    assert held <= MOST_STRANGERS + MOST_KNOWN
+    assert np.quantile(among, 0.95) < PROMPT
+    assert (said.out, said.err) == ("", "")

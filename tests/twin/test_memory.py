@@ -1,0 +1,127 @@
+"""Memory is estimated before anything is computed: what does not fit is refused with the number that does."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from optics.numerics.backend import Backend
+from scenes.specs.load import EXAMPLES
+from scenes.specs.resolved import resolve
+from scenes.yaml.errors import InputError
+from tests.limits.extremes import STUDIES_BEYOND, Extreme
+from twin.main_job.render_job import render_job
+from twin.monitor import monitor_memory
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import MonitorSize, require_memory
+from twin.run import memory
+from twin.run.memory import LIMIT, amount_text, free_memory, largest
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.study_memory import require_study_memory, study_bytes
+
+
+@pytest.mark.parametrize(("text", "number"), [("8 GB", 8e9), ("500MB", 5e8), (" 1.5 GB ", 1.5e9)])
+def test_the_environment_says_what_may_be_taken(text: str, number: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIMIT, text)
+    assert free_memory() == pytest.approx(number)
+
+
+@pytest.mark.parametrize("text", ["8", "much", "-1 GB", "1 TB"])
+def test_another_text_is_bad_input(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(LIMIT, text)
+    with pytest.raises(InputError, match="no amount of memory"):
+        free_memory()
+
+
+def test_what_the_system_leaves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(LIMIT, raising=False)
+    assert 1e6 < free_memory() < math.inf
+    # a container of 1 GB in one of 2 GB, of which 0.3 and 1.5 GB are taken
+    inner = tmp_path / "outer" / "inner"
+    inner.mkdir(parents=True)
+    for folder, most, used in ((inner.parent, "2000000000", "1500000000"), (inner, "1000000000", "300000000")):
+        (folder / "memory.max").write_text(most)
+        (folder / "memory.current").write_text(used)
+    (tmp_path / "memory.max").write_text("max")
+    group = tmp_path / "cgroup"
+    group.write_text("0::/outer/inner\n")
+    monkeypatch.setattr(memory, "_GROUP", group)
+    monkeypatch.setattr(memory, "_GROUPS", tmp_path)
+    assert free_memory() == 5e8
+
+
+def test_the_largest_that_fits() -> None:
+    assert largest(lambda n: n <= 37, 1000, 1) == 37
+    assert largest(lambda n: False, 1000, 23) == 23
+    assert (amount_text(3.14159e9), amount_text(4.2e8)) == ("3.14 GB", "420 MB")
+
+
+@pytest.fixture(scope="module")
+def experiment(backend: Backend) -> MonitorExperiment:
+    return MonitorExperiment(resolve(EXAMPLES / "aligned.yaml"), backend)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key", "unit"),
+    [
+        ({"frames": 10_000}, "frames", "frames"),
+        ({"rows": 2000, "columns": 3000}, "monitor.area_ccd.columns", "rows and columns"),
+    ],
+    ids=["frames", "ccd"],
+)
+def test_what_would_fit_is_told(changes, key, unit, experiment, monkeypatch) -> None:
+    """The number that is told fits, and the next one does not."""
+    monkeypatch.setenv(LIMIT, "1 GB")
+    monkeypatch.setattr(monitor_memory, "taken_already", lambda: 0.0)
+    resolved, detector = experiment.resolved, experiment.detector
+    size = replace(experiment.size(), **changes)
+    with pytest.raises(InputError, match=r"needs about \d.* and 1 GB may be taken") as caught:
+        require_memory(resolved, size, detector)
+    assert ".".join(map(str, caught.value.key)).endswith(key)
+    told = re.match(rf"at most (\d+) {unit}", caught.value.allowed or "")
+    assert told is not None, caught.value.allowed
+    most = int(told[1])
+
+    def lowered(n: int) -> MonitorSize:
+        return replace(size, **{name: min(value, n) for name, value in changes.items()})
+
+    require_memory(resolved, lowered(most), detector)
+    with pytest.raises(InputError):
+        require_memory(resolved, lowered(most + 1), detector)
+
+
+def test_frames_are_counted_before_anything_is_rendered(experiment, backend, monkeypatch) -> None:
+    monkeypatch.setenv(LIMIT, "500 MB")
+    done: list[str] = []
+    with pytest.raises(InputError, match="10000 frames of area CCDs") as caught:
+        render_job(
+            experiment.resolved, backend, 10_000, advance=lambda part, *_: done.append(part), experiment=experiment
+        )
+    assert caught.value.key == ("render", "frames")
+    assert set(done) == {"build the instrument"}
+
+
+def test_a_large_ccd_is_refused_wherever_an_instrument_is_used(tmp_path, backend, monkeypatch) -> None:
+    monkeypatch.setenv(LIMIT, "4 GB")
+    job = Extreme(((r"rows: 96, columns: 96", "rows: 4096, columns: 4096"),)).write(tmp_path)
+    with pytest.raises(InputError, match=r"instrument\.yaml:11: monitor\.area_ccd\.rows: this needs about [\d.]+ GB"):
+        MonitorExperiment(resolve(job), backend)
+
+
+def test_runs_of_a_study_are_counted(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv(LIMIT, "1 GB")
+    setup = resolve_study(STUDIES_BEYOND["ten million runs"].write(tmp_path))
+    with pytest.raises(InputError, match="10000000 runs need about") as caught:
+        require_study_memory(setup)
+    assert caught.value.key == ("design", "runs")
+    told = re.match(r"at most (\d+) runs", caught.value.allowed or "")
+    assert told is not None
+    assert study_bytes(setup, int(told[1])) <= 1e9 < study_bytes(setup, int(told[1]) + 1)
+    # the study's own limit, where that is less
+    monkeypatch.setenv(LIMIT, "900 GB")
+    with pytest.raises(InputError, match=r"4 GB may be taken; allowed: .* or a larger limits\.memory"):
+        require_study_memory(setup)

@@ -1,0 +1,139 @@
+"""What a report may do: its Content-Security-Policy covers all that it is made of, and nothing that a file brings."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.twin.policed_page import Policed, breaches
+from twin.pictures.viewer import viewer_programs, viewer_scripts
+from twin.run.artefact import SvgFigure, Table
+from twin.run.page import RunFacts, environment, render_report
+from twin.run.page_policy import FIGURES, checksum, page_policy
+from twin.run.report import Report, Section
+from twin.run.svg import look, new_figure, to_svg
+
+ROOT = Path(__file__).resolve().parents[2]
+TEMPLATES = sorted(path for path in (ROOT / "twin").rglob("*.html.j2"))
+EVIL = (
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "</style><script src=https://evil.example/x.js></script>",
+    "</title><svg onload=alert(1)>",
+    "javascript:alert(1)",
+    "{{ 7 * 7 }}{% raw %}",
+    "--> <b>]]>",
+)
+
+
+def page_of(evil: str = "", figure: str = "") -> str:
+    """A test's page with a user's text wherever one can stand."""
+    table = Table("table", f"Title {evil}", f"Caption {evil}", [f"head {evil}"], [[f"cell {evil}"], ["more"]])
+    svg = figure or '<svg viewBox="0 0 9 9"><path d="M0 0H9"/></svg>'
+    sections = (Section(f"Section {evil}", (f"Text {evil}",), (SvgFigure("drawing", "Drawing", evil, svg),)),)
+    told = Report(
+        f"Test {evil}", "One sentence.", (f"Lead {evil}",), ((f"Label {evil}", evil),), table, sections, {}, (evil,) * 3
+    )
+    how = RunFacts(evil, f"{evil}.yaml", evil, 1, 0.0, 1.0, "twin.lab", f"focus {evil}")
+    return render_report("focus", replace(told, verdict=f"Verdict {evil.replace('.', '')}."), how)
+
+
+@pytest.fixture(scope="module")
+def figure() -> str:
+    with look("policy"):
+        drawn = new_figure(1.0)
+        axes = drawn.add_subplot()
+        axes.plot([0, 1], label=EVIL[0])
+        axes.imshow([[0, 1]])
+        axes.set_title(EVIL[-1])
+        axes.legend()
+        return to_svg(drawn)
+
+
+def test_a_report_keeps_its_policy(figure):
+    page = page_of("plain", figure)
+    assert breaches(page) == []
+    assert [tag for tag, _, _ in Policed(page).inline].count("style") == 2  # the page's and the figure's
+    assert "script" not in Policed(page).tags
+
+
+def test_what_matplotlib_writes_into_every_figure_is_what_the_policy_allows(figure):
+    assert re.findall(r"<style[^>]*>(.*?)</style>", figure, re.S) == [FIGURES]
+
+
+@pytest.mark.parametrize("evil", EVIL)
+def test_a_text_of_a_users_file_brings_no_markup(evil):
+    page = page_of(evil)
+    assert breaches(page) == []
+    assert Policed(page).tags == Policed(page_of("plain")).tags
+    assert evil.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace('"', "&#34;") in page
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        "<script>alert(1)</script>",
+        "<style>p { color: red }</style>",
+        "<img src='https://evil.example/x.png'>",
+        "<p onclick='x()'>",
+        "<a href='javascript:x()'>",
+        "<p style='background: url(//evil.example)'>",
+    ],
+)
+def test_a_breach_would_be_found(broken):
+    assert breaches(page_of("plain").replace("<body>", f"<body>{broken}"))
+
+
+def test_the_view_in_three_dimensions_is_in_the_policy():
+    text = '<meta http-equiv="Content-Security-Policy" content="{}"><style>x</style>{}'
+    scripts = str(viewer_scripts(b"glTF"))
+    assert breaches(text.format(page_policy("x", viewer_programs()), scripts)) == []
+    assert breaches(text.format(page_policy("x"), scripts))
+    # the library is put in by the program, as one more script
+    assert checksum(viewer_programs()[1]) in page_policy("x", viewer_programs())
+
+
+@pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.name)
+def test_every_page_is_one_with_a_policy(path):
+    """All pages extend the one that holds it, and no template writes scripts, style sheets or addresses of its own."""
+    text = path.read_text("utf-8")
+    if path.name == "page.html.j2":
+        assert "page_policy(" in text
+        return
+    if path.name != "artefact.html.j2":
+        assert text.startswith("{% extends 'page.html.j2' %}")
+    assert not re.search(r"<script|<style|<link|<iframe|<object|<embed|<base|<form|\|\s*safe\b|autoescape", text)
+    assert not re.search(r"\son[a-z]+\s*=", text)
+    assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:|//)", text)
+    assert environment("twin.run").autoescape is True
+
+
+def test_the_style_of_every_page_is_its_templates_own():
+    """Nothing that a user wrote gets into a style sheet, which the policy then would allow."""
+    for path in TEMPLATES:
+        for block in re.findall(r"{% block style %}(.*?){% endblock %}", path.read_text("utf-8"), re.S):
+            assert "{{" not in block
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_a_browser_finds_no_breach_and_runs_nothing_that_was_put_in(figure, tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
+    place = tmp_path / "report.html"
+    place.write_text(page_of("plain", figure), encoding="utf-8")
+    with playwright.sync_playwright() as made:
+        browser = made.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page()
+        said: list[str] = []
+        page.on("console", lambda told: said.append(told.text))
+        page.goto(place.as_uri())
+        assert said == []
+        assert page.evaluate("getComputedStyle(document.body).maxWidth") == "1290px"
+        page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"window.hit = 1\">')")
+        page.wait_for_timeout(200)
+        assert page.evaluate("window.hit") is None
+        assert "Content Security Policy" in said[0]
+        browser.close()

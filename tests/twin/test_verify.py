@@ -1,0 +1,473 @@
+"""`python -m twin.verify`: whatever is done to a run folder is found, and a run made again is compared in every number.
+
+Every kind of run folder is in test_verify_kinds.py.
+"""
+
+import csv
+import io
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import xarray as xr
+
+from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
+from tests.twin.study_bench import write_study
+from twin.compare.__main__ import app as compare_app
+from twin.run.data_files import FrameFacts, preview_png, tiff
+from twin.run.netcdf_file import netcdf
+from twin.run.run_folder import MANIFEST, RunFolder, write_manifest
+from twin.study.runs.block_result import BlockResult
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import resolve_study
+from twin.study.runs.study_folder import StudyFolder
+from twin.study.study_files import write_data
+from twin.verify.__main__ import app
+from twin.verify.file_difference import (
+    DIFFERENT,
+    GONE,
+    LEFT_OUT,
+    NEW,
+    REDRAWN,
+    ROUNDED,
+    SAME,
+    FileDifference,
+    file_difference,
+)
+from twin.verify.folder_state import folder_state
+from twin.verify.repetition import obstacle, of_rounded, repeat_chunk
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """A run folder with files of several kinds."""
+    with RunFolder(tmp_path / "run") as made:
+        made.write_text("config.yaml", "a: 1\n")
+        made.write_json("numbers.json", {"a": 1.5, "b": [1, 2]})
+        made.write_bytes("images/frame.tiff", tiff(np.arange(12, dtype=np.uint16).reshape(1, 3, 4), FrameFacts()))
+        write_manifest(made, "twin.test", 1.5e9, 2.0, seed=3, again=["twin.test", "config.yaml"], warnings=["mind"])
+    return tmp_path / "run"
+
+
+def flip(place: Path, at: int) -> None:
+    content = bytearray(place.read_bytes())
+    content[at] ^= 1
+    place.write_bytes(content)
+
+
+def test_an_untouched_folder_is_whole(folder) -> None:
+    state = folder_state(folder)
+    assert state.whole
+    assert state.sealed
+    assert obstacle(state) == ""
+
+
+@pytest.mark.parametrize("name", ["config.yaml", "numbers.json", "images/frame.tiff"])
+def test_every_changed_byte_of_a_file_is_found(folder, name) -> None:
+    kept = (folder / name).read_bytes()
+    for at in range(0, len(kept), 5):
+        flip(folder / name, at)
+        state = folder_state(folder)
+        assert (state.changed, state.missing, state.additional) == ((name,), (), ())
+        (folder / name).write_bytes(kept)
+    assert folder_state(folder).whole
+
+
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
+def test_every_changed_byte_of_the_manifest_is_found(folder, step) -> None:
+    """Whatever it hits: a number, a checksum, a name of a file or of a key, white space, a bracket."""
+    kept = (folder / MANIFEST).read_bytes()
+    damaged = 0
+    for at in range(0, len(kept), step):
+        flip(folder / MANIFEST, at)
+        try:
+            found = folder_state(folder).changed
+        except InputError as error:
+            found, damaged = (Path(error.issues[0].file).name,), damaged + 1
+        assert MANIFEST in found, kept[at - 20 : at + 20]
+        (folder / MANIFEST).write_bytes(kept)
+    assert 0 < damaged < len(kept) / step
+    assert folder_state(folder).whole
+
+
+def test_a_manifest_whose_seal_is_taken_off_is_changed(folder) -> None:
+    told = json.loads((folder / MANIFEST).read_text())
+    del told["digest"]
+    (folder / MANIFEST).write_text(json.dumps(told, indent=2) + "\n")
+    assert folder_state(folder).changed == (MANIFEST,)
+
+
+def test_what_is_gone_and_what_was_added_is_named(folder) -> None:
+    (folder / "numbers.json").unlink()
+    (folder / "images/more.tiff").write_text("x")
+    (folder / "link.json").symlink_to("config.yaml")
+    state = folder_state(folder)
+    assert (state.changed, state.missing) == ((), ("numbers.json",))
+    assert state.additional == ("images/more.tiff", "link.json")
+
+
+def test_a_changed_config_is_not_run_again(folder) -> None:
+    (folder / "config.yaml").write_text("a: 2\n")
+    assert obstacle(folder_state(folder)) == "what it was made of is not as it was: config.yaml"
+
+
+def test_inputs_that_changed_or_are_gone_are_named(tmp_path) -> None:
+    for name in ("first.tiff", "second.tiff", "third.tiff"):
+        (tmp_path / name).write_text(name)
+    from twin.run.provenance import inputs_in
+
+    with RunFolder(tmp_path / "run") as made:
+        made.write_text("config.yaml", "a: 1\n")
+        inputs = inputs_in([str(tmp_path / f"{name}.tiff") for name in ("first", "second", "third")])
+        write_manifest(made, "twin.test", 1.5e9, 2.0, again=["twin.test", "config.yaml"], inputs=inputs)
+    (tmp_path / "first.tiff").write_text("First.tiff")
+    state = folder_state(tmp_path / "run")
+    assert state.whole
+    assert obstacle(state) == f"files that it read have changed since: {tmp_path / 'first.tiff'}"
+    (tmp_path / "second.tiff").unlink()
+    state = folder_state(tmp_path / "run")
+    assert (state.inputs_changed, state.inputs_gone) == (
+        (str(tmp_path / "first.tiff"),),
+        (str(tmp_path / "second.tiff"),),
+    )
+    assert obstacle(state) == f"files that it read are gone: {tmp_path / 'second.tiff'}"
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory) -> Path:
+    """The folder of a finished study: numbers that nothing computed, written as the command writes them."""
+    place = tmp_path_factory.mktemp("study")
+    setup = resolve_study(write_study(place / "in"))
+    plan = Plan.of(setup)
+    with StudyFolder(place / "study", setup) as open_folder:
+        store = ChunkStore(open_folder.path, plan)
+        store.open()
+        for first, count in ((0, 1), (1, 2), (3, 1)):
+            store.write(first, [_block(plan, first + k) for k in range(count)])
+        write_data(plan, store.result(), 1.0, plan.runs, open_folder)
+        write_manifest(open_folder, "twin.study", 1.5e9, 2.0, runs=plan.runs, again=["twin.study", "config.yaml"])
+    return place / "study"
+
+
+def _block(plan: Plan, block: int) -> BlockResult:
+    runs = np.array(plan.block(block), float)
+    values = np.stack([runs, -runs], axis=1)
+    return BlockResult(
+        values, 0.1 * np.abs(values), np.full(values.shape, np.nan), ("",) * len(runs), 0.5, ("",) * len(runs)
+    )
+
+
+def test_a_changed_byte_in_each_file_of_a_study_is_found(study, tmp_path) -> None:
+    """Also in its chunks, their index and its lock."""
+    every = sorted(path.relative_to(study).as_posix() for path in study.rglob("*") if path.is_file())
+    assert {"chunks/00001.npz", "chunks/index.txt", ".lock", "study.nc", "study_state.json"} <= set(every)
+    assert folder_state(study).whole
+    for name in every:
+        copy = tmp_path / "copy"
+        shutil.copytree(study, copy)
+        if not (copy / name).stat().st_size:
+            (copy / name).write_bytes(b"x")
+        elif name != MANIFEST:
+            flip(copy / name, (copy / name).stat().st_size // 2)
+        else:
+            (copy / name).write_text((copy / name).read_text().replace('"runs": 100', '"runs": 101'))
+        assert set(folder_state(copy).changed) - {"chunks/index.txt"} == {name} - {"chunks/index.txt"}
+        assert not folder_state(copy).whole
+        (copy / name).unlink()
+        if name == ".lock":
+            assert folder_state(copy).whole
+        elif name != MANIFEST:
+            assert folder_state(copy).missing == (name,)
+        shutil.rmtree(copy)
+
+
+def test_chunks_that_were_taken_out_with_their_lines_are_missed(study, tmp_path) -> None:
+    copy = shutil.copytree(study, tmp_path / "copy")
+    index = copy / "chunks/index.txt"
+    index.write_bytes(b"".join(index.read_bytes().splitlines(keepends=True)[:-1]))
+    (copy / "chunks/00003.npz").unlink()
+    assert folder_state(copy).changed == ("chunks/index.txt",)
+    (copy / "chunks/00007.npz").write_bytes(b"another's")
+    assert folder_state(copy).additional == ("chunks/00007.npz",)
+
+
+def test_nothing_in_a_study_is_touched(study) -> None:
+    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in study.rglob("*")}
+    folder_state(study)
+    assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in study.rglob("*")}
+
+
+@pytest.mark.slow
+def test_numbers_that_no_run_gave_are_found(study) -> None:
+    """The chunks' checksums are right, and study.nc holds what they hold; only computing tells."""
+    made = repeat_chunk(folder_state(study))
+    assert made.what == "runs 25 to 74 of 100"
+    states = {one.file: one.state for one in made.files}
+    assert states == {"chunks/00001.npz": DIFFERENT, "study.nc": SAME, "study.json": SAME}
+    found = next(one for one in made.files[0].quantities if one.key.startswith("true_df["))
+    assert abs(float(found.new)) < 5.0  # a draw of 1 um, read exactly
+    assert float(found.old) <= -25.0
+
+
+# what is compared, and how
+
+
+def json_pair(tmp_path: Path, old: object, new: object):
+    for name, data in (("old.json", old), ("new.json", new)):
+        (tmp_path / name).write_text(json.dumps(data))
+    return file_difference("numbers.json", tmp_path / "old.json", tmp_path / "new.json", False)
+
+
+CASES = {
+    "the same": ({"a": 1.0}, {"a": 1.0}, SAME),
+    "another order of keys": ({"a": 1.0, "b": 2.0}, {"b": 2.0, "a": 1.0}, SAME),
+    "the last digit": ({"a": 1.0}, {"a": 1.0 + 2e-16}, ROUNDED),
+    "the ninth digit": ({"a": 1.0}, {"a": 1.0 + 3e-9}, DIFFERENT),
+    "a whole number": ({"a": 10**12}, {"a": 10**12 + 1}, ROUNDED),
+    "a count": ({"a": 100}, {"a": 101}, DIFFERENT),
+    "a zero among others of its sort": (
+        {"x": {"a": 5.0}, "y": {"a": 0.0}},
+        {"x": {"a": 5.0}, "y": {"a": 1e-16}},
+        ROUNDED,
+    ),
+    "a zero alone": ({"a": 0.0}, {"a": 1e-16}, DIFFERENT),
+    "a part of sigma": ({"a": 1.0, "a_sigma": 1e-3}, {"a": 1.0 + 9e-7, "a_sigma": 1e-3}, ROUNDED),
+    "more than that part": ({"a": 1.0, "a_sigma": 1e-3}, {"a": 1.0 + 1.1e-6, "a_sigma": 1e-3}, DIFFERENT),
+    "a sigma": ({"a_sigma": 1e-3}, {"a_sigma": 1.0000009e-3}, ROUNDED),
+    "another sigma": ({"a_sigma": 1e-3}, {"a_sigma": 1.000002e-3}, DIFFERENT),
+    "a text": ({"a": "yes"}, {"a": "no"}, DIFFERENT),
+    "a truth": ({"a": True}, {"a": 1}, DIFFERENT),
+    "nothing": ({"a": None}, {"a": 0.0}, DIFFERENT),
+    "a key": ({"a": 1.0}, {"a": 1.0, "b": 1.0}, DIFFERENT),
+    "a duration": ({"a": 1.0, "seconds": 1.0}, {"a": 1.0, "seconds": 2.0}, SAME),
+    "a long list": ({"a": [float(k) for k in range(20)]}, {"a": [k + 1e-12 for k in range(20)]}, ROUNDED),
+    "a longer list": ({"a": [float(k) for k in range(20)]}, {"a": [float(k) for k in range(21)]}, DIFFERENT),
+    "a verdict": ({"a": 1.0, "verdict": "Good."}, {"a": 1.0, "verdict": "Bad."}, DIFFERENT),
+    "a verdict's last digit": ({"a": 1.0, "verdict": "1.0"}, {"a": 1.0 + 2e-16, "verdict": "1.1"}, ROUNDED),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_numbers_are_the_same_rounded_or_different(tmp_path, case) -> None:
+    old, new, state = CASES[case]
+    assert json_pair(tmp_path, old, new).state == state
+
+
+def test_terms_are_held_against_the_terms_beside_them(tmp_path) -> None:
+    """A Zernike term of 1e-12 waves beside one of 0.3 is zero but for rounding; and on another processor more is."""
+    old = {"fields": [{"name": "a", "zernike_waves": {"7-foil 0 deg": 1e-12, "coma 90 deg": 0.3}}]}
+    new = {"fields": [{"name": "a", "zernike_waves": {"7-foil 0 deg": 2e-12, "coma 90 deg": 0.3}}]}
+    assert json_pair(tmp_path, old, new).state == ROUNDED
+    alone = [{"fields": [{"name": "a", "zernike_waves": {"7-foil 0 deg": value}}]} for value in (1e-12, 2e-12)]
+    assert json_pair(tmp_path, *alone).state == DIFFERENT
+    for name, value in (("one", 1.0), ("two", 1.0 + 1e-8)):
+        (tmp_path / name).write_text(json.dumps({"a": value}))
+    states = [file_difference("a.json", tmp_path / "one", tmp_path / "two", where).state for where in (False, True)]
+    assert states == [DIFFERENT, ROUNDED]
+
+
+def test_pictures_of_rounded_numbers_are_no_other_results() -> None:
+    rounded, drawn = FileDifference("a.json", ROUNDED), FileDifference("a.svg", DIFFERENT)
+    assert [one.state for one in of_rounded([rounded, drawn])] == [ROUNDED, REDRAWN]
+    same = FileDifference("a.json", SAME)
+    assert [one.state for one in of_rounded([same, drawn])] == [SAME, DIFFERENT]
+    other = FileDifference("b.csv", DIFFERENT)
+    assert [one.state for one in of_rounded([rounded, other, drawn])] == [ROUNDED, DIFFERENT, DIFFERENT]
+
+
+def test_a_difference_names_key_old_and_new(tmp_path) -> None:
+    old = {"cameras": {"forward": {"d_f_um": 4.0, "d_f_um_sigma_noise": 0.5}}, "other": 1.0}
+    new = {"cameras": {"forward": {"d_f_um": 3.0, "d_f_um_sigma_noise": 0.5}}, "other": 1.0 + 1e-15}
+    found = json_pair(tmp_path, old, new)
+    assert (found.state, found.count) == (DIFFERENT, 2)
+    first, second = found.quantities
+    assert (first.key, first.old, first.new) == ("cameras.forward.d_f_um", 4.0, 3.0)
+    assert (first.relative, first.in_sigma, first.rounding) == (0.25, pytest.approx(2.0), False)
+    assert (second.key, second.rounding) == ("other", True)
+
+
+def pair(tmp_path: Path, ending: str, old: bytes, new: bytes, elsewhere: bool = False):
+    for name, content in (("old", old), ("new", new)):
+        (tmp_path / name).write_bytes(content)
+    return file_difference(f"a/b.{ending}", tmp_path / "old", tmp_path / "new", elsewhere)
+
+
+def test_frames_are_the_same_to_the_bit_but_on_another_processor(tmp_path) -> None:
+    frames = np.random.default_rng(1).integers(0, 4000, (2, 96, 96)).astype(np.uint16)
+    other = frames.copy()
+    other[1, 5, 7] += 1
+    old, new = (tiff(some, FrameFacts()) for some in (frames, other))
+    found = pair(tmp_path, "tiff", old, new)
+    assert found.state == DIFFERENT
+    assert found.quantities[0].key == "pixels[1, 5, 7]"
+    assert pair(tmp_path, "tiff", old, new, elsewhere=True).state == ROUNDED
+    other[0] += 1
+    assert pair(tmp_path, "tiff", old, tiff(other, FrameFacts()), elsewhere=True).state == DIFFERENT
+    assert pair(tmp_path, "tiff", old, tiff(frames[:1], FrameFacts())).quantities[0].old == "shape 2 x 96 x 96"
+    tifffile.imwrite(tmp_path / "packed.tiff", frames, compression="lzw", photometric="minisblack")
+    assert pair(tmp_path, "tiff", old, (tmp_path / "packed.tiff").read_bytes()).state == SAME
+
+
+def test_arrays_are_compared_by_their_peak(tmp_path) -> None:
+    photons = np.random.default_rng(1).uniform(0.0, 1e4, (3, 4))
+    files = {}
+    for name, off in (("same", 0.0), ("rounded", 1e-6), ("other", 1e-4)):
+        moved = photons.copy()
+        moved[2, 1] += off
+        files[name] = netcdf(xr.Dataset({"photons": (("row", "column"), moved)}))
+    assert pair(tmp_path, "nc", files["same"], files["rounded"]).state == ROUNDED
+    found = pair(tmp_path, "nc", files["same"], files["other"])
+    assert (found.state, found.quantities[0].key) == (DIFFERENT, "photons[2, 1]")
+    assert pair(tmp_path, "nc", files["same"], b"no netCDF").why.startswith("cannot be read")
+
+
+def test_tables_pictures_and_texts(tmp_path) -> None:
+    def table(value: float) -> bytes:
+        text = io.StringIO()
+        csv.writer(text).writerows([["camera", "x [um]"], ["forward", value], ["backward", 2.0]])
+        return text.getvalue().encode()
+
+    found = pair(tmp_path, "csv", table(1.0), table(1.5))
+    assert (found.state, found.quantities[0].key) == (DIFFERENT, "row 2, x [um]")
+    assert pair(tmp_path, "csv", table(1.0), table(1.0 + 1e-15)).state == ROUNDED
+    picture = np.zeros((1, 60, 60))
+    picture[0, 30, 30] = 1.0
+    moved = np.roll(picture, 3, axis=1)
+    assert pair(tmp_path, "png", preview_png(picture), preview_png(moved)).state == DIFFERENT
+    drawing = '<svg><path d="M 1.25 2.5 L 3 4"/><text>f</text></svg>'
+    assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.5000000001").encode()).state == ROUNDED
+    drawn = (drawing, drawing.replace("2.5", "2.500001"))
+    named = [text.replace("<path ", f'<path id="p{k}" clip-path="url(#c{k})" ') for k, text in enumerate(drawn)]
+    assert pair(tmp_path, "svg", named[0].encode(), named[1].encode()).state == ROUNDED
+    assert pair(tmp_path, "svg", drawing.encode(), drawing.replace("2.5", "2.6").encode()).state == DIFFERENT
+    assert pair(tmp_path, "svg", drawing.encode(), drawing.replace(">f<", ">g<").encode()).state == DIFFERENT
+    assert pair(tmp_path, "html", b"made on Monday", b"made on Tuesday").state == LEFT_OUT
+    assert file_difference("a.json", tmp_path / "old", tmp_path / "none", False).state == GONE
+    assert file_difference("a.json", tmp_path / "none", tmp_path / "old", False).state == NEW
+
+
+# the command
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path, folder) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun/study_state.json").write_text("{}")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/manifest.json").write_text('{"name": "an extension of a browser"}')
+    for name, said in (
+        ("none", "no such folder"),
+        ("run/config.yaml", "is not a folder"),
+        ("empty", "it has no manifest.json of a run; allowed: the folder of a finished run"),
+        ("begun", "a study that is not finished; allowed: the same twin.study command with --resume"),
+        ("other", "other/manifest.json: is not the manifest of a run, or is damaged"),
+    ):
+        result = invoke(app, tmp_path / name)
+        assert result.exit_code == 2
+        assert said in " ".join(result.stderr.split()), result.stderr
+
+
+def test_options_that_do_not_go_together_are_refused(folder) -> None:
+    for words, said in (
+        (("--files", "--all"), "--files makes nothing again"),
+        (("--files", "--keep", folder / "x"), "--files makes nothing again"),
+        (("--all",), "--all is for studies"),
+        (("--keep", folder), "exists; choose another folder"),
+    ):
+        result = invoke(app, folder, *words)
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert said in " ".join(result.stderr.split())
+
+
+def test_the_files_alone_take_no_computing(folder) -> None:
+    result = invoke(app, folder, "--files")
+    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them; it was not made again.\n")
+    flip(folder / "numbers.json", 12)
+    result = invoke(app, folder, "--files", "--json")
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)
+    assert (told["whole"], told["changed"], told["made_again"]) == (False, ["numbers.json"], None)
+    assert told["verdict"].startswith("numbers.json is not as the run wrote it")
+
+
+def test_a_folder_of_an_older_program_is_told(folder) -> None:
+    told = json.loads((folder / MANIFEST).read_text())
+    for key in ("digest", "provenance", "again"):
+        del told[key]
+    (folder / MANIFEST).write_text(json.dumps(told, indent=2) + "\n")
+    result = invoke(app, folder)
+    assert result.exit_code == 2
+    assert "older version, whose manifest does not say by which command" in result.stdout
+    assert "no checksum of itself" in result.stdout
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory) -> Path:
+    """The folder of a real run that takes no second: two hand-made runs compared."""
+    place = tmp_path_factory.mktemp("compared")
+    for name, value in (("one", 1.0), ("two", 1.5)):
+        with RunFolder(place / name) as made:
+            made.write_text("config.yaml", "a: 1\n")
+            made.write_json("numbers.json", {"a": value, "a_sigma": 0.1})
+            write_manifest(made, "twin.test", 1.5e9, 2.0)
+    here = Path.cwd()
+    os.chdir(place)
+    try:
+        result = invoke(compare_app, "one", "two", "--out", "out", "--quiet")
+    finally:
+        os.chdir(here)
+    assert result.exit_code == 1, result.stderr
+    return place
+
+
+def test_a_run_made_again_is_the_same_to_the_byte(compared, tmp_path) -> None:
+    """By its own words, in the folder where it was typed; a numpy.py there is not imported."""
+    (compared / "numpy.py").write_text("raise SystemExit('executed')")
+    result = invoke(app, compared / "out", "--json", "--keep", tmp_path / "again")
+    (compared / "numpy.py").unlink()
+    assert result.exit_code == 0, result.stdout + result.stderr
+    told = json.loads(result.stdout)
+    assert told["made_again"]["state"] == SAME
+    assert (told["made_again"]["other_program"], told["made_again"]["other_processor"]) == ([], [])
+    states = {one["file"]: one["state"] for one in told["made_again"]["files"]}
+    assert set(states.values()) == {SAME}
+    assert "compare.json" in states
+    assert folder_state(tmp_path / "again").whole
+
+
+def test_a_number_that_the_run_does_not_give_is_found(compared, tmp_path) -> None:
+    """Though every checksum is right: whoever wrote the folder wrote another number into it."""
+    doctored = tmp_path / "doctored"
+    manifest = json.loads((compared / "out" / MANIFEST).read_text())
+    with RunFolder(doctored) as made:
+        for name in manifest["sha256"]:
+            made.write_bytes(
+                name, (compared / "out" / name).read_bytes().replace(b'"difference": 0.5', b'"difference": 0.4')
+            )
+        facts = {key: manifest[key] for key in ("again", "started_in", "inputs", "test")}
+        write_manifest(made, manifest["program"], 1.5e9, 2.0, **facts)
+    assert folder_state(doctored).whole
+    result = invoke(app, doctored, "--json")
+    assert result.exit_code == 1
+    told = json.loads(result.stdout)
+    wrong = next(one for one in told["made_again"]["files"] if one["file"] == "compare.json")
+    assert (wrong["state"], wrong["quantities"]) == (DIFFERENT, 1)
+    first = wrong["differ_most"][0]
+    assert (first["key"].rpartition(".")[2], first["old"], first["new"]) == ("difference", 0.4, 0.5)
+
+
+def test_inputs_that_changed_since_end_with_two(compared) -> None:
+    kept = (compared / "two/numbers.json").read_bytes()
+    try:
+        (compared / "two/numbers.json").write_bytes(kept.replace(b"1.5", b"1.6"))
+        result = invoke(app, compared / "out")
+        assert result.exit_code == 2
+        assert f"have changed since: {compared}/two/numbers.json" in result.stdout
+    finally:
+        (compared / "two/numbers.json").write_bytes(kept)

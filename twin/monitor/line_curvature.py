@@ -1,0 +1,141 @@
+"""The states that the monitor's readings stand for, traced again: what they do to spots and cameras exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from analysis.monitor import model_fit
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.curvature import MotionModel, Retraced
+from analysis.monitor.disturbances import Disturbances
+from optics.geometry.tree import Motion, State
+from optics.numerics.physical_error import PhysicalError
+from scenes.models.disturbances import StatedMotions, state_of
+from scenes.models.thermal_model import ThermalModel
+from twin.monitor.monitor_path import MonitorPath
+from twin.monitor.motions import ElementaryMotion, line_family
+from twin.monitor.truth import LineSight
+
+NEAR = 3.0
+"""Shift of a spot, px, up to which stated motions are taken as linear. What is not linear is a product of two motions:
+a shift s by one times an angle by the other, s over the distance of the spots, some 10 000 px. For 3 px that is 1e-3
+px, the noise of a spot, while sigmas of a statement are tens of times larger; the few motions of `model` are traced
+again in every state."""
+LOST = (PhysicalError, ArithmeticError)
+"""What says that a state cannot be traced."""
+
+
+def motion_models(
+    path: MonitorPath,
+    sight: LineSight,
+    cameras: Mapping[str, CameraCalibration],
+    thermal: ThermalModel,
+    stated: StatedMotions | None,
+    disturbances: Disturbances | None,
+) -> dict[str, MotionModel]:
+    """Estimator -> the motions by which it reads: the line families of all cameras, and what is stated to move.
+
+    Args:
+        path: the monitor's light.
+        sight: what the cameras see.
+        cameras: their calibration, in the order of the spots.
+        thermal: of the instrument.
+        stated: what moves, None for nothing.
+        disturbances: the same with its derivatives.
+    """
+    out = {"model": _of_families(path, sight, cameras)}
+    if stated is not None and disturbances is not None:
+        parts = stated.components
+        size = stated.sigma
+        known = disturbances
+
+        def amounts(noise: np.ndarray) -> np.ndarray:
+            return known.best_amounts(noise)
+
+        def state(row: np.ndarray) -> State:
+            return state_of(row * size, parts, thermal)
+
+        out["posterior"] = MotionModel(known.spots, known.parameters, amounts, _tracer(path, sight, state), NEAR)
+    return out
+
+
+def _of_families(path: MonitorPath, sight: LineSight, cameras: Mapping[str, CameraCalibration]) -> MotionModel:
+    """Each camera's four motions of paper 001."""
+    families = {name: line_family(name) for name in cameras}
+    ends = np.cumsum([0, *(2 * len(camera.channels) for camera in cameras.values())]).tolist()
+    own = [slice(a, b) for a, b in pairwise(ends)]
+    count = sum(map(len, families.values()))
+    spots, parameters = np.zeros((ends[-1], count)), np.zeros((4 * len(cameras), count))
+    for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
+        block = slice(4 * k, 4 * k + 4)
+        spots[at, block], parameters[block, block] = camera.spot_jacobian, camera.parameter_jacobian
+
+    def amounts(noise: np.ndarray) -> np.ndarray:
+        out = np.zeros((len(noise), count, ends[-1]))
+        for k, (camera, at) in enumerate(zip(cameras.values(), own, strict=True)):
+            block = slice(4 * k, 4 * k + 4)
+            out[:, block, at] = model_fit.gain(noise[:, at, at], camera.spot_jacobian, np.eye(4), camera.motions)
+        return out
+
+    every = [motion for family in families.values() for motion in family]
+
+    def state(row: np.ndarray) -> State:
+        return _together(every, row)
+
+    return MotionModel(spots, parameters, amounts, _tracer(path, sight, state))
+
+
+def _together(motions: Sequence[ElementaryMotion], amounts: np.ndarray) -> State:
+    """The state in which motions of some bodies, all about one pivot of each, have some amounts, SI."""
+    out: dict[str, Motion] = {}
+    for motion, amount in zip(motions, amounts.tolist(), strict=True):
+        new, old = motion.motion(amount), out.get(motion.body, Motion(pivot=motion.pivot))
+        out[motion.body] = Motion(
+            rotate=_sum(old.rotate, new.rotate),
+            shift=_sum(old.shift, new.shift),
+            scale=old.scale + new.scale,
+            pivot=motion.pivot,
+        )
+    return out
+
+
+def _sum(one: tuple[float, float, float], two: tuple[float, float, float]) -> tuple[float, float, float]:
+    return one[0] + two[0], one[1] + two[1], one[2] + two[2]
+
+
+def _tracer(
+    path: MonitorPath, sight: LineSight, state: Callable[[np.ndarray], State]
+) -> Callable[[np.ndarray], Retraced]:
+    """Amounts of motions (S, P) -> what they do."""
+
+    def traced(rows: np.ndarray) -> Retraced:
+        try:
+            return traced_states(path, sight, [state(row) for row in rows])
+        except LOST:
+            if len(rows) == 1:
+                return Retraced(*(np.full((1, n), np.nan) for n in (2 * len(path.channels), 4 * len(path.cameras))))
+        parts = [traced(rows[k : k + 1]) for k in range(len(rows))]
+        return Retraced(np.concatenate([p.spots for p in parts]), np.concatenate([p.parameters for p in parts]))
+
+    return traced
+
+
+def traced_states(path: MonitorPath, sight: LineSight, states: Sequence[State]) -> Retraced:
+    """Means of the rays on the area CCDs against those at rest, and what the line CCDs see.
+
+    Args:
+        path: the monitor's light.
+        sight: what the cameras see.
+        states: S states.
+
+    Raises:
+        AimError, BeamMissedError: light of one of them is lost.
+    """
+    place = path.coarse_trace([{}, *states]).place
+    shifts = np.moveaxis(place[:, 1:] - place[:, :1], 1, 0).reshape(len(states), -1)
+    changes = sight.truth(states).cameras.values()
+    rows = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=1) for c in changes]
+    return Retraced(shifts, np.concatenate(rows, axis=1))

@@ -1,0 +1,328 @@
+"""The beams of the monitor: from every pinhole through the camera to the return face and back to the area CCD.
+
+A beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state,
+so that its edge is exact; at the CCD each ray is a plane wave. The face is taken as evenly lit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from optics.geometry import zernike
+from optics.geometry.tree import PlacedBodies, State
+from optics.numerics import quadrature
+from optics.numerics.array_math import inverse, product
+from optics.numerics.backend import Backend
+from optics.numerics.quadrature import PupilNodes
+from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
+from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.trace import BeamMissedError, make_rays, trace
+from optics.waves.diffraction import Grid, PupilField
+from optics.waves.wavefront import eikonal
+from scenes.models.instrument_model import Instrument
+from scenes.specs.channel import Channel
+from twin.monitor.image_sampling import UncertainImageError
+from twin.monitor.monitor_rays import Aimed, CcdRays, CoarseTrace, SpotFocus
+
+MAP_TERMS, ROUGH_TERMS = 15, 66
+"""Zernike terms (to orders 4 and 10) of the map from the aperture to direction cosines. Beside the first the rest is
+below 1e-7 of it where surfaces are smooth; figures of prisms and mirrors that have fine structure get the others.
+"""
+
+SMOOTH = 1e-6
+"""Largest rest of that map, of the beam's aperture, that is left out: 5e-5 of the density of rays."""
+
+TOO_ROUGH = 2e-5
+"""Rest beside all terms beyond which no image is given: 1e-3 of the density of rays."""
+
+COARSE_RINGS = 6
+"""Rings of the quadrature for means: exact for polynomials to degree 23."""
+
+SCOUT_RINGS = 4
+"""Rings of the rays that are aimed in every state to find out how far the others have to be turned."""
+
+AIM_TOLERANCE = 1e-9
+"""Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
+radius."""
+
+CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
+"""Likewise of the rays from which those of other states are predicted."""
+
+
+class MonitorBeams:
+    """Traces the beams of the monitor channels of one instrument.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        nodes: pupil quadrature, for all states.
+        cameras: whose channels; None for all. Numbers of a channel do not depend on which others there are.
+    """
+
+    def __init__(
+        self, instrument: Instrument, backend: Backend, nodes: PupilNodes | None, cameras: Collection[str] | None = None
+    ) -> None:
+        self.instrument = instrument
+        self.backend = backend
+        self.cameras = tuple(name for name in instrument.cameras if cameras is None or name in cameras)
+        self.channels: tuple[Channel, ...] = tuple(c for c in instrument.channels if c.camera in self.cameras)
+        ccd = instrument.spec.monitor.area_ccd
+        self.shape = (ccd.rows, ccd.columns)
+        self.pitch: float = ccd.pitch
+        self.wavelength: float = instrument.spec.monitor.wavelength
+        self.face_radius = np.array([0.5 * channel.aperture for channel in self.channels])
+        self._nodes: PupilNodes | None = nodes
+
+    @property
+    def nodes(self) -> PupilNodes:
+        """Pupil quadrature."""
+        assert self._nodes is not None
+        return self._nodes
+
+    @cached_property
+    def numerical_aperture(self) -> float:
+        """Of the returned beam at the CCD, the largest among the cameras."""
+        scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
+        widest = max(channel.aperture for channel in self.instrument.channels)
+        return 0.5 * widest / float(np.min(scales))
+
+    def _with(self, nodes: PupilNodes) -> MonitorBeams:
+        return MonitorBeams(self.instrument, self.backend, nodes, self.cameras)
+
+    @cached_property
+    def coarse(self) -> MonitorBeams:
+        """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
+        return self._with(quadrature.disk(COARSE_RINGS))
+
+    @cached_property
+    def scout(self) -> MonitorBeams:
+        """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
+        return self._with(quadrature.disk(SCOUT_RINGS))
+
+    @cached_property
+    def nominal(self) -> Aimed:
+        """Aimed rays of the unperturbed instrument, the start for all other states."""
+        return self._aim_nominal()
+
+    @cached_property
+    def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N, T)."""
+        return self._series(MAP_TERMS)
+
+    @cached_property
+    def _rough(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The same of functions with fine structure."""
+        return self._series(ROUGH_TERMS)
+
+    def _series(self, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        x, y = self.nodes.x, self.nodes.y
+        basis = zernike.basis(terms, x, y)
+        # the terms are orthonormal over the disk, and the quadrature is exact for their products
+        solve = (basis * self.nodes.share[:, None]).T
+        dx, dy = (zernike.gradient_basis(terms, x, y, axis) for axis in (0, 1))
+        return solve, basis, dx, dy
+
+    def area_ratio(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Determinant d(u, v)/d(x, y) of maps from the unit disk, given on the nodes, (..., N).
+
+        Raises:
+            UncertainImageError: a map that is too rough for all terms.
+        """
+        out, rest = _area_ratio(u, v, self._smooth)
+        rough = rest > SMOOTH
+        if np.any(rough):
+            out[rough], rest = _area_ratio(u[rough], v[rough], self._rough)
+            left = float(np.max(rest))
+            if left > TOO_ROUGH:
+                raise UncertainImageError(
+                    f"figures of mirrors or prisms are too rough for an image: directions of rays leave {left:.2g} of "
+                    f"the aperture beside {ROUGH_TERMS} Zernike terms; smaller figures, or of lower order, would do"
+                )
+        return out
+
+    def _outgoing(self, placed: PlacedBodies, states: Sequence[State]) -> tuple[RayFan, SystemBatch]:
+        """Rays from each pinhole toward the optics, and the systems up to the return face."""
+        position, direction = [], []
+        for channel in self.channels:
+            position.append(placed.translation[:, placed.index[channel.reticle_body]])
+            direction.append(self.instrument.toward_optics(placed, channel.camera))
+        guess = np.concatenate(direction)[:, None]
+        axes = transverse_axes(guess, np.broadcast_to([0.0, 1.0, 0.0], guess.shape))
+        names = [f"{c.key}/outgoing" for c in self.channels]
+        systems = assemble(self.instrument.assembly, names, states, placed=placed)
+        return RayFan(np.concatenate(position)[:, None].real, guess, axes), systems
+
+    @cached_property
+    def target(self) -> np.ndarray:
+        """Nodes on the return faces, (C, N, 2), metres of their nominal sizes."""
+        return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
+
+    def targets(self, states: int) -> np.ndarray:
+        """The same for as many states, channel-major, (C*S, N, 2)."""
+        return np.repeat(self.target, states, axis=0)
+
+    def _aim_nominal(self) -> Aimed:
+        """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
+        fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
+        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=CLOSE_TOLERANCE)
+        near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
+        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, CLOSE_TOLERANCE)
+        place, heading = fan.at(q)
+        return Aimed(place, heading, fan.axes, q, slope)
+
+    def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
+        """Where the spots of S states fall, and how rays have to be turned to meet the face where they did.
+
+        Args:
+            states: S states.
+            placed: their bodies, when already placed.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        scout, count = self.scout, len(states)
+        placed = self.instrument.assembly.place(states) if placed is None else placed
+        fan, outgoing = self._outgoing(placed, states)
+        names = [f"{c.key}/monitor" for c in self.channels]
+        back = assemble(self.instrument.assembly, names, states, placed=placed)
+        nominal = scout.nominal
+        start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
+        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, CLOSE_TOLERANCE)
+        turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
+        uploaded = back.upload(self.backend)
+        traced = trace(self.backend, uploaded, make_rays(self.backend, *fan.at(q)))
+        pitch = self.pitch * back.size[:, None]
+        position, direction, _, valid = traced.numpy()
+        place = np.einsum("n,bnk->bk", scout.nodes.share, position[..., :2])[:, ::-1] / pitch
+        # an aberration of some order grows at least like its third power toward the edge
+        rim = np.max(np.hypot(scout.nodes.x, scout.nodes.y)) ** 3
+        off = np.linalg.norm(position[..., 1::-1] / pitch[..., None] - place[:, None], axis=-1)
+        blur = np.max(np.where(valid, off, 0.0), axis=-1) / rim
+        middle = np.einsum("n,bnk->bk", scout.nodes.share, direction[..., :2])
+        lean = np.linalg.norm(direction[..., :2] - middle[:, None], axis=-1)
+        aperture = np.max(np.where(valid, lean, 0.0) / np.hypot(scout.nodes.x, scout.nodes.y), axis=-1)
+        by_state = (len(self.channels), count)
+        spots = place.reshape(*by_state, 2), blur.reshape(by_state), aperture.reshape(by_state)
+        return CoarseTrace(fan, outgoing, back, uploaded, turn, *spots)
+
+    def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
+        """Rays at the CCDs for C channels x S states, channel-major.
+
+        Args:
+            states: S states.
+            coarse: what ``coarse_trace`` says of them, if it is known.
+
+        Raises:
+            BeamMissedError, AimError: a perturbation moves a beam off the mirrors or a spot off its CCD, named in the
+                message.
+        """
+        known = self.coarse_trace(states) if coarse is None else coarse
+        start, slope = (np.repeat(a, len(states), axis=0) for a in (self.nominal.parameters, self.nominal.jacobian))
+        q = start + np.moveaxis(product(known.turn, self._smooth[1].T), 0, -1)
+        launch = known.fan.at(q)
+        face = len(known.outgoing.structure) - 1
+        traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
+        goal = self.targets(len(states))
+        if not np.max(np.abs(traced.place(face) - known.outgoing.size[:, None, None] * goal)) <= AIM_TOLERANCE:
+            # a change that is not smooth enough for its few terms
+            q, _ = aim(self.backend, known.outgoing, known.fan, goal, q, slope, AIM_TOLERANCE)
+            launch = known.fan.at(q)
+            traced = trace(self.backend, known.uploaded, make_rays(self.backend, *launch), keep=(face,))
+        position, direction, length, valid = traced.numpy()
+        rays = CcdRays(position / known.back.size[:, None, None], direction, length, valid, known.back.size)
+        for i, channel in enumerate(self.channels):
+            own = slice(i * len(states), (i + 1) * len(states))
+            if not np.all(np.any(rays.valid[own], axis=1)):
+                lost = int(np.argmin(np.any(rays.valid[own], axis=1)))
+                first = own.start + lost
+                where = self._where_lost(channel, states[lost], launch[0][first], launch[1][first])
+                raise BeamMissedError(f"the whole beam of the monitor channel {channel.key} misses {where}")
+            middle = np.einsum("n,snk->sk", self.nodes.share, rays.position[own, :, 1::-1])
+            self._require_on_ccd(channel, middle / self.pitch)
+        return rays
+
+    def _where_lost(self, channel: Channel, state: State, position: np.ndarray, direction: np.ndarray) -> str:
+        """The element, and its body, at which the last of a channel's rays (N, 3) are lost."""
+        names = self.instrument.assembly.sequences[f"{channel.key}/monitor"]
+        steps = alive_along(self.backend, self.instrument.assembly, names, position, direction, state)
+        count, element = next((i, element) for i, (element, alive) in enumerate(steps, 1) if not alive.any())
+        return f"{element.name} on {element.body}, at surface {count} of {len(names)} of its way"
+
+    def fields(self, states: Sequence[State]) -> PupilField:
+        """Plane waves at the CCDs for C channels x S states, channel-major, in each chip's own x, y about its centre.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        return self.field_of(self.rays(states))
+
+    def field_of(self, rays: CcdRays) -> PupilField:
+        """Plane waves of traced rays."""
+        direction = rays.direction
+        u, v = direction[..., 0], direction[..., 1]
+        # sqrt(|d(u, v)/dA| / A) dA of the module docstring of optics.waves.diffraction, with A the face's area
+        amplitude = np.sqrt(np.abs(self.area_ratio(u, v)) / np.pi) * self.nodes.weight * rays.valid
+        phase = eikonal(rays.size[:, None, None] * rays.position, direction, rays.path, np.zeros(3))
+        phase = phase - phase[:, :1]
+        return PupilField(u, v, phase, amplitude, self.wavelength).in_lengths_of(rays.size)
+
+    def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
+        """Raise BeamMissedError when the middle of a spot (S, 2), pixels from the middle, is outside its CCD."""
+        half = 0.5 * (np.array(self.shape) - 1)
+        beyond = np.linalg.norm(np.maximum(np.abs(place) - half, 0.0), axis=-1)
+        if np.any(beyond > 0.0):
+            worst = int(np.argmax(beyond))
+            row, column = place[worst] + half
+            raise BeamMissedError(
+                f"the spot {channel.key} falls on row {row:.0f}, column {column:.0f}, outside its area CCD of "
+                f"{self.shape[0]} x {self.shape[1]} pixels: {beyond[worst]:.3g} px or "
+                f"{1e3 * self.pitch * beyond[worst]:.3g} mm beyond its edge"
+            )
+
+    @cached_property
+    def focus(self) -> SpotFocus:
+        """How sharp the unperturbed instrument's spots are.
+
+        Raises:
+            BeamMissedError, AimError: as ``rays``.
+        """
+        rays, weight = self.coarse.rays([{}]), self.coarse.nodes.weight
+        paths = eikonal(rays.position, rays.direction, rays.path, np.zeros(3))
+        error, defocus = np.empty(len(paths)), np.empty(len(paths))
+        for i, (direction, path) in enumerate(zip(rays.direction, paths, strict=True)):
+            root = np.sqrt(weight * rays.valid[i])
+            # light to a point (x, y, z) of the CCD's frame has there an eikonal of -(u x + v y + w z) and a constant
+            basis = np.column_stack([np.ones_like(path), direction - direction[0]]) * root[:, None]
+            scale = np.linalg.norm(basis, axis=0)
+            flat, point = (
+                np.linalg.lstsq(basis[:, :n] / scale[:n], path * root, rcond=None)[0] / scale[:n] for n in (3, 4)
+            )
+            error[i] = np.linalg.norm(path * root - basis[:, :3] @ flat) / np.linalg.norm(root)
+            # the CCD's z is the plane's -Z; the pinhole moves with the CCD, its image the other way
+            defocus[i] = 0.5 * point[3]
+        return SpotFocus(error / self.wavelength, defocus)
+
+    def grid(self, axis: int, margin: int = 0) -> Grid:
+        """Pixel centres of the rows (0) or columns (1) on the chip, from the CCD's centre, in nominal metres."""
+        n = self.shape[axis]
+        return Grid(-(0.5 * (n - 1) + margin) * self.pitch, self.pitch, n + 2 * margin)
+
+    def axis(self, axis: int) -> np.ndarray:
+        """Detector coordinate of the pixel centres of all rows (0) or columns (1), metres from the CCD's centre."""
+        return self.grid(axis).points()
+
+
+def _area_ratio(
+    u: np.ndarray, v: np.ndarray, series: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Determinant d(u, v)/d(x, y) of maps (..., N) by a series, and the largest rest beside it, of the beam's
+    aperture, (...,).
+    """
+    solve, basis, dx, dy = series
+    a, b = product(u, solve.T), product(v, solve.T)
+    ratio = product(a, dx.T) * product(b, dy.T) - product(a, dy.T) * product(b, dx.T)
+    rest = np.maximum(np.abs(u - product(a, basis.T)), np.abs(v - product(b, basis.T))).max(axis=-1)
+    return ratio, rest / np.hypot(u - a[..., :1], v - b[..., :1]).max(axis=-1)

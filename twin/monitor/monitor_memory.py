@@ -1,0 +1,204 @@
+"""What a monitor's images and their measurement take of the memory, told before anything is rendered.
+
+Bytes are counted where they lie: so many for each pixel of a spot, each traced ray, each recorded frame. How many there
+are follows from the instrument alone; of its optics only the aperture of the returned beam matters, by which the nodes
+of the pupil grow with the square of the CCD's diagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from optics.numerics.threads import cores
+from scenes.specs.course import FEWEST
+from scenes.specs.detector import LEAST_SIDE
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import KeyPath
+from scenes.yaml.spec import Spec
+from twin.monitor.image_sampling import NodeClasses
+from twin.run.memory import LIMIT, amount_text, free_memory, largest, taken_already
+from twin.sensors.area_detector import EmvaDetector
+
+CHUNK = 25
+"""States rendered at once, to bound memory; fewer when their frames are large."""
+LARGEST_FRAMES = 200_000_000
+"""Pixels of all frames that are exposed at once."""
+
+
+def largest_piece(each: int) -> int:
+    """How many states of a series are rendered at once.
+
+    Args:
+        each: pixels of all frames of one.
+    """
+    return max(1, min(CHUNK, LARGEST_FRAMES // each))
+
+
+STARTED = 220e6
+"""Of a job of any size until its spots are measured, beside the imported program: kernels and their compiler; bytes."""
+DRAWN = 410e6
+"""The same when it is drawn and written, the most of a small one; bytes."""
+PIXEL = 380.0
+"""Of a spot's image while it is measured and while it is worked out what limits that, for each pixel: photons 24, fixed
+pattern 16, mean frames and maps of the fits before and after 64, images and maps of a stated state 85, the fit at work
+190; bytes."""
+RAY = 600.0
+"""Of a traced ray with its derivatives, its aiming and the polynomials of the pupil at its node, bytes."""
+GREY = 2.0
+"""Of a pixel of a recorded frame."""
+OF_COURSE = 6.0
+"""Of a pixel of each time of a course: expected photons in single precision, and a first frame."""
+IN_FILES = 2.0
+"""Of a pixel of the frames of one channel, while they become a file."""
+WRITTEN = 60.0
+"""Of a pixel of a spot's image when it is drawn and written: photons, their file, means."""
+OF_STATE = 24.0
+"""Of a pixel of each state that is rendered at once: photons, and what its noise does to the spot."""
+
+ORDINARY = 600e6
+"""A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
+gives must not depend on that.
+"""
+
+
+@dataclass(frozen=True)
+class MonitorSize:
+    """Numbers that decide what a monitor takes.
+
+    Attributes:
+        spots: channels of all cameras.
+        rows, columns: of an area CCD.
+        phase: from the middle to the edge of the pupil for one pixel, radians.
+        frames: of each state.
+        times: of a course, 0 for none.
+        pictures: pixels of the frames of all other images.
+    """
+
+    spots: int
+    rows: int
+    columns: int
+    phase: float
+    frames: int = 1
+    times: int = 0
+    pictures: int = 0
+
+    @property
+    def rays(self) -> int:
+        """Of sharp spots of all channels, wherever on their CCDs."""
+        return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
+
+    def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
+        """What the CCDs, frames, times and other pictures take, bytes.
+
+        Args:
+            detector: of the area CCDs.
+        """
+        image = self.rows * self.columns
+        every, frames = self.spots * image, self.frames
+        states = min(self.times, largest_piece(every * frames)) if self.times else 1
+        threads = min(cores(), 8, self.spots * states)  # that expose images
+        return {
+            "ccd": every * (PIXEL + (states - 1) * OF_STATE) + self.rays * RAY,
+            "frames": (1 + states) * every * frames * GREY + threads * detector.exposing_bytes(frames, image),
+            "times": self.times * every * OF_COURSE,
+            "pictures": self.pictures * GREY,
+        }
+
+    def bytes(self, detector: EmvaDetector) -> float:
+        """Of all together, above the imported program.
+
+        Args:
+            detector: of the area CCDs.
+        """
+        parts = self.parts(detector)
+        every = self.spots * self.rows * self.columns
+        written = every * (WRITTEN + 2.0 * self.frames * GREY) + every / self.spots * self.frames * IN_FILES
+        return max(STARTED + sum(parts.values()), DRAWN + written + parts["times"] + parts["pictures"])
+
+
+def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetector) -> None:
+    """See whether a job fits into the memory that is free.
+
+    Args:
+        resolved: the job, for what its files say of its numbers.
+        size: of it.
+        detector: of its area CCDs.
+
+    Raises:
+        InputError: it does not; at the key of what takes most, with the number that would fit.
+    """
+    free, there = free_memory(), min(taken_already(), STARTED)
+
+    def fits(other: MonitorSize) -> bool:
+        need = other.bytes(detector)
+        return need <= ORDINARY or need - there <= free
+
+    if fits(size):
+        return
+    parts = size.parts(detector)
+    worst = max(parts, key=lambda name: parts[name])
+    one = _lowered(resolved, size, worst)
+    most = largest(lambda n: fits(one.at(n)), one.number, one.least - 1)
+    more = f"more memory (the environment variable {LIMIT}, as 8 GB, says how much may be taken)"
+    raise one.owner.error(
+        f"this needs about {amount_text(size.bytes(detector))} of memory, "
+        f"{amount_text(parts[worst])} of it {one.what}, and {amount_text(free)} may be taken",
+        one.key,
+        found=str(one.number),
+        allowed=f"at most {most} {one.unit}, or {more}" if most >= one.least else more,
+    )
+
+
+@dataclass(frozen=True)
+class _Lowered:
+    """A number of a job that can be made smaller.
+
+    Attributes:
+        owner, key: the file and where in it the number stands.
+        number: as it is.
+        least: that it may be.
+        at: the job's size with another number.
+        what: the memory is for, for messages.
+        unit: of the number, for messages.
+    """
+
+    owner: Spec
+    key: KeyPath
+    number: int
+    least: int
+    at: Callable[[int], MonitorSize]
+    what: str
+    unit: str
+
+
+def _lowered(resolved: ResolvedJob, size: MonitorSize, part: str) -> _Lowered:
+    """What decides one of the ``parts``."""
+    job, rows, columns = resolved.job, size.rows, size.columns
+    if part == "ccd":
+        return _Lowered(
+            resolved.instrument,
+            ("monitor", "area_ccd", "rows" if rows >= columns else "columns"),
+            max(rows, columns),
+            LEAST_SIDE,
+            lambda n: replace(size, rows=min(rows, n), columns=min(columns, n)),
+            f"for the images of area CCDs of {rows} x {columns} pixels",
+            "rows and columns",
+        )
+    if part == "times":
+        assert job.course is not None
+        times = size.times
+        what = f"for {times} times of the course"
+        return _Lowered(job.course, ("times",), times, FEWEST, lambda n: replace(size, times=n), what, "times")
+    frames = size.frames
+    if part == "pictures":
+        recorded = resolved.targets.frames or frames
+        each, what = size.pictures // recorded, f"for {recorded} frames of test targets"
+        key: KeyPath = ("render", "targets", "frames")
+        return _Lowered(job, key, recorded, 1, lambda n: replace(size, pictures=n * each), what, "frames")
+    what = f"for {frames} frames of area CCDs of {rows} x {columns} pixels"
+    own = job.render.frames is not None
+    owner: Spec = job if own else resolved.instrument
+    return _Lowered(
+        owner, ("render" if own else "monitor", "frames"), frames, 1, lambda n: replace(size, frames=n), what, "frames"
+    )

@@ -1,0 +1,128 @@
+"""Memory that a command may take, and the refusal of a job that needs more before anything of it is computed.
+
+Each subject estimates what a job will take from its numbers of pixels, frames, rays and runs alone
+(`twin.monitor.monitor_memory`, `twin.study.runs.study_memory`). Estimates are of the largest resident memory above that
+of the started program, and within a factor of 1.5 of what is used (tests/limits).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+from collections.abc import Callable
+from pathlib import Path
+
+from scenes.yaml.errors import InputError, Issue, shown
+
+LIMIT = "TWIN_MEMORY"
+"""Environment variable with the memory that a command may take, as ``8 GB`` or ``500 MB``, in place of what is free."""
+
+_AMOUNT = re.compile(r"\s*(?P<number>[0-9]{1,6}(\.[0-9]{1,3})?)\s*(?P<unit>MB|GB)\s*")
+_UNITS = {"MB": 1e6, "GB": 1e9}
+_FREE, _PAGES = Path("/proc/meminfo"), Path("/proc/self/statm")
+_GROUP, _GROUPS = Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")
+
+
+def free_memory() -> float:
+    """Bytes that this process may still take: those of the environment variable, else what the system has free for it
+    and its control group and limits leave; infinite where nobody says.
+
+    Raises:
+        InputError: the variable holds something else.
+    """
+    named = os.environ.get(LIMIT)
+    if named:
+        amount = _AMOUNT.fullmatch(named)
+        if amount is None:
+            problem = f"the environment variable {LIMIT} is no amount of memory"
+            raise InputError(Issue(problem, found=shown(named), allowed="a number with MB or GB, as 8 GB"))
+        return float(amount["number"]) * _UNITS[amount["unit"]]
+    return min(_of_system(), _of_group(), _of_limits())
+
+
+def _of_system() -> float:
+    """What the system says to be free for new work without swapping."""
+    try:
+        lines = _FREE.read_text("ascii").splitlines()
+        return 1024.0 * int(next(line for line in lines if line.startswith("MemAvailable:")).split()[1])
+    except (OSError, StopIteration, ValueError):
+        return float("inf")
+
+
+def _of_group() -> float:
+    """What the limits of the control group and of those above it leave."""
+    least = float("inf")
+    try:
+        groups = [line.split(":", 2) for line in _GROUP.read_text("utf-8").splitlines()]
+    except OSError:
+        return least
+    for _, controllers, path in (group for group in groups if len(group) == 3):
+        if controllers not in ("", "memory"):
+            continue
+        root, most, used = (
+            (_GROUPS, "memory.max", "memory.current")
+            if not controllers
+            else (_GROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes")
+        )
+        place = root / path.lstrip("/")
+        for folder in (place, *place.parents):
+            if folder != root and root not in folder.parents:
+                break
+            limit, taken = _number(folder / most), _number(folder / used)
+            least = min(least, max(limit - taken, 0.0) if taken < float("inf") else limit)
+    return least
+
+
+def _number(file: Path) -> float:
+    try:
+        return float(file.read_text("ascii"))
+    except (OSError, ValueError):  # no such control group, or ``max``
+        return float("inf")
+
+
+def _of_limits() -> float:
+    """What the limit of the process's addresses (``ulimit -v``) leaves."""
+    most = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if most == resource.RLIM_INFINITY:
+        return float("inf")
+    return max(float(most) - _own(0), 0.0)
+
+
+def _own(which: int) -> float:
+    """Bytes of this process: of its addresses (0), or resident (1); 0 where the system does not say."""
+    try:
+        return float(int(_PAGES.read_text("ascii").split()[which]) * resource.getpagesize())
+    except (OSError, ValueError):
+        return 0.0
+
+
+PROGRAM = 140e6
+"""Resident memory of the imported program, bytes."""
+
+
+def taken_already() -> float:
+    """Resident memory of this process beyond that of the imported program, bytes: kernels of jobs that it did before,
+    for instance, which the next job takes over.
+    """
+    return max(_own(1) - PROGRAM, 0.0)
+
+
+def largest(fits: Callable[[int], bool], most: int, least: int = 0) -> int:
+    """The largest whole number that fits, below one that does not.
+
+    Args:
+        fits: whether a number does; if it does, all smaller ones do.
+        most: a number that does not.
+        least: one below which none is looked for; the result is this where even the next larger one does not fit.
+    """
+    low, high = least, most
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low
+
+
+def amount_text(number: float) -> str:
+    """An amount of memory for people: ``3.1 GB``, ``420 MB``."""
+    return f"{1e-9 * number:.3g} GB" if number >= 1e9 else f"{1e-6 * number:.3g} MB"

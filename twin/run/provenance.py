@@ -1,0 +1,231 @@
+"""Where a run was made: by which source, on which processor, with which linear algebra; and its own checks of itself.
+
+The same program gives the same bytes on the same processor (docs/promises.md). What may differ elsewhere follows from
+what stands here.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+from threadpoolctl import threadpool_info
+
+from optics.numerics.threads import LIMIT, cores
+from twin.run.owned_files import digest
+from twin.run.versions import other_packages, program_digest
+
+Checksum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+SETTINGS = (
+    LIMIT,
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "OPENBLAS_CORETYPE",
+    "NPY_DISABLE_CPU_FEATURES",
+)
+"""Of the environment, which change how numbers are rounded or how fast they come."""
+
+
+class Blas(BaseModel):
+    """A library of linear algebra that the process had loaded.
+
+    Attributes:
+        name: ``openblas``.
+        version: of it.
+        kernels: processor whose kernels it chose, ``Haswell``; it decides how sums are rounded.
+        threads: that it used.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+
+    name: str
+    version: str
+    kernels: str
+    threads: int
+
+
+class Provenance(BaseModel):
+    """Where a run was made. What is added has a default: folders of earlier programs stay run folders.
+
+    Attributes:
+        source: SHA-256 of all files of the program, however it was installed.
+        system: operating system.
+        libc: C library, whose functions are not rounded alike in all versions.
+        processor: model that the operating system names.
+        cores: that the run could use.
+        simd: sets of instructions of the processor that NumPy uses.
+        blas: libraries of linear algebra, in the order of their names.
+        settings: variables of the environment that were set and matter.
+        packages: version of every package that the program asks for and whose numbers no result depends on: what reads,
+            writes and draws.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+
+    source: Checksum
+    system: str
+    libc: str = ""
+    processor: str
+    cores: int
+    simd: list[str]
+    blas: list[Blas]
+    settings: dict[str, str]
+    packages: dict[str, str] = {}
+
+    @classmethod
+    def here(cls) -> Provenance:
+        """Of this process."""
+        loaded = [one for one in threadpool_info() if one["user_api"] == "blas"]
+        found = [
+            Blas(
+                name=one["internal_api"],
+                version=str(one["version"]),
+                kernels=str(one.get("architecture", "")),
+                threads=one["num_threads"],
+            )
+            for one in loaded
+        ]
+        return cls(
+            source=program_digest(),
+            system=f"{platform.system()} {platform.release()}",
+            libc=" ".join(platform.libc_ver()).strip(),
+            processor=_processor(),
+            cores=cores(),
+            simd=_simd(),
+            blas=sorted(found, key=lambda one: (one.name, one.version)),
+            settings={name: os.environ[name] for name in SETTINGS if name in os.environ},
+            packages=other_packages(),
+        )
+
+
+def _processor() -> str:
+    """Model of the processor; Linux says it in a file, Python itself does not."""
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8") as lines:
+            named = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
+    except OSError:
+        named = ""
+    return f"{named or platform.processor() or 'unknown'}, {platform.machine()}"
+
+
+def _simd() -> list[str]:
+    found: Any = np.show_config(mode="dicts")
+    told = found.get("SIMD Extensions", {})
+    return [*told.get("baseline", []), *told.get("found", [])]
+
+
+@dataclass(frozen=True)
+class SelfCheck:
+    """Something that a run worked out to see whether its own numbers can be right.
+
+    Attributes:
+        name: what was checked.
+        value: what came out.
+        limit: what it must not exceed; None where nothing is refused for it, or the limit is another for every run.
+        unit: of both, empty for a pure number.
+        says: what it means that the limit holds, or not; in one sentence.
+    """
+
+    name: str
+    value: float
+    limit: float | None
+    unit: str = ""
+    says: str = ""
+
+    @property
+    def holds(self) -> bool | None:
+        """Whether the limit does, None without one."""
+        return None if self.limit is None else bool(self.value <= self.limit)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data."""
+        return {**asdict(self), "holds": self.holds}
+
+
+CHI_SQUARE, WITHIN = re.compile(r"(^|_)chi_square$|^relative_error$|^worst_relative$"), ("chi_square_limit", "limit")
+TRUE = ("converged", "agrees", "holds", "sigma_holds")
+MOST_CHECKS = 50
+"""Of one run."""
+
+
+def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
+    """What stands in a run's own numbers of whether they can be right: chi-squares of fits, with their limits where
+    these are stated, relative errors, and what converged, agrees or holds.
+
+    Args:
+        numbers: of the run, nested.
+    """
+    return tuple(islice(_checks(numbers, ""), MOST_CHECKS))
+
+
+def _checks(tree: Any, path: str) -> Iterator[SelfCheck]:
+    if isinstance(tree, Mapping):
+        limit = next((float(tree[name]) for name in WITHIN if isinstance(tree.get(name), int | float)), None)
+        for key, value in tree.items():
+            name = f"{path}.{key}" if path else str(key)
+            if key in TRUE and isinstance(value, bool):
+                yield SelfCheck(name, 0.0 if value else 1.0, 0.0, "", "0 for yes, 1 for no")
+            elif CHI_SQUARE.search(str(key)) and isinstance(value, int | float) and not isinstance(value, bool):
+                yield SelfCheck(name, float(value), limit if "chi_square" in str(key) else None)
+            else:
+                yield from _checks(value, name)
+    elif isinstance(tree, list | tuple):
+        for k, value in enumerate(tree):
+            yield from _checks(value, f"{path}[{k}]")
+
+
+def inputs_in(tree: Any, given: Iterable[Path] = ()) -> dict[str, str]:
+    """Checksums of the files that a resolved set-up names; its paths are absolute.
+
+    What is in the set-up itself, in full, is no input any more: neither the file of the test nor those of the library.
+
+    Args:
+        tree: the set-up as plain data; every text in it that is the absolute path of a file, or of a folder, is one.
+        given: further files and folders.
+
+    Returns:
+        Absolute path -> SHA-256, of a folder those of all its files.
+    """
+    out: dict[str, str] = {}
+    for place in (*map(Path, dict.fromkeys(_paths(tree))), *given):
+        for file in _files(place.absolute()):
+            if str(file) not in out:
+                out[str(file)] = digest(file)
+    return dict(sorted(out.items()))
+
+
+MOST_FILES = 10_000
+"""Of a folder that is named as an input."""
+
+
+def _files(place: Path) -> Iterable[Path]:
+    try:
+        if place.is_file():
+            return (place,)
+        if place.is_dir():
+            found = (path for path in sorted(place.rglob("*")) if path.is_file())
+            return [path for path, _ in zip(found, range(MOST_FILES), strict=False)]
+    except (OSError, ValueError):  # a text that only looks like a path
+        pass
+    return ()
+
+
+def _paths(tree: Any) -> Iterable[str]:
+    if isinstance(tree, Mapping):
+        for below in tree.values():
+            yield from _paths(below)
+    elif isinstance(tree, str):
+        if tree.startswith("/") and len(tree) > 1 and "\n" not in tree:
+            yield tree
+    elif isinstance(tree, Sequence) and not isinstance(tree, bytes):
+        for below in tree:
+            yield from _paths(below)

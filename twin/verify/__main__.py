@@ -1,0 +1,114 @@
+"""``python -m twin.verify``: is a run folder as its run left it, and does the run come out the same again."""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    from scenes.yaml.interrupt import end_quietly
+
+    end_quietly()
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from scenes.yaml.standard_output import Terminal, print_json, to_stdout
+from twin.run.cli import AsJson, InputErrorText, Quiet, explained, print_verdict
+from twin.run.ending_signals import exit_on_terminate
+
+if TYPE_CHECKING:  # what computes is imported when it is needed
+    from twin.verify.folder_state import FolderState
+    from twin.verify.repetition import Repetition
+
+app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    run: Annotated[Path, typer.Argument(readable=False, help="Run folder of any command.")],
+    files: Annotated[
+        bool, typer.Option("--files", help="Only look at the files; make nothing again. A second for most folders.")
+    ] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="Of a study make all runs again on all cores, not one chunk of them.")
+    ] = False,
+    keep: Annotated[
+        Path | None,
+        typer.Option("--keep", readable=False, metavar="DIR", help="Keep what is made again as this run folder."),
+    ] = None,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Verify a run folder: every file against the checksum that the run left of it, then the run itself, which is made
+    again from the config.yaml and the inputs that the folder names, and compared number by number.
+
+        python -m twin.verify runs/perturb-001
+
+        python -m twin.verify runs/perturb-001 --files
+
+    **The files.** A changed byte, a file that is gone, and one that the run did not write are named, also in the
+    chunks of a study, and in the manifest itself. Files outside the folder that the run read, such as measured frames,
+    are held against what they were then.
+
+    **The run made again** takes as long as the run did, which is said first; of a study one chunk is computed, a few
+    seconds, and all its chunks are held against study.nc. Every number is the same to the bit, the same but for
+    rounding (1e-9 of the largest of its sort, on another processor 1e-6, or 1e-3 of its sigma), or different, with key,
+    old and new value.
+    Pages are left out: they name the time. What was made by another version of the program, with other packages or on
+    another processor, is said to be so.
+
+    Nothing is written, but for `--keep`. `python -m twin.compare RUN DIR` then shows both beside each other.
+
+    Exit codes: 0 everything is as it was, 1 something differs, 2 it cannot be told: no run folder, an unfinished run,
+    inputs that are gone or have changed.
+    """
+    errors = Console(stderr=True)
+    silent = as_json or quiet
+    with explained(errors), exit_on_terminate():
+        from twin.verify.folder_state import folder_state
+        from twin.verify.repetition import CannotRepeat, obstacle, repeat_chunk
+        from twin.verify.verification import Verification, expected_time
+
+        if files and (every or keep is not None):
+            raise InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
+        if keep is not None and (keep.exists() or keep.is_symlink()):
+            raise InputErrorText(f"--keep: {keep} exists; choose another folder")
+        state = folder_state(run)
+        if every and not state.is_study:
+            raise InputErrorText("--all is for studies; of other runs everything is made again anyway")
+        chunk = state.is_study and not every and keep is None
+        why, made = "" if files else obstacle(state), None
+        if not files and not why:
+            if not silent:
+                text = "one chunk of the study" if chunk else f"the run, which took {expected_time(state)}"
+                errors.print(f"making again {text}", markup=False, highlight=False, soft_wrap=True)
+            try:
+                made = repeat_chunk(state) if chunk else _whole(state, keep, silent)
+            except CannotRepeat as error:
+                why = str(error)
+        done = Verification(state, made, why)
+    with to_stdout(errors):
+        if as_json:
+            print_json(done.numbers())
+        elif not quiet:
+            console = Terminal()
+            print_verdict(console, done.verdict)
+            for line in done.lines():
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if done.code:
+        raise typer.Exit(done.code)
+
+
+def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
+    from twin.run.unfinished import scratch
+    from twin.verify.repetition import repeat
+
+    if keep is not None:
+        return repeat(state, keep, silent)
+    with scratch("twin-verify") as place:
+        return repeat(state, place / "again", silent)
+
+
+if __name__ == "__main__":
+    app()
