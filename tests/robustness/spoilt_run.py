@@ -238,7 +238,7 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
     spoilt, depth = spoilt or mutant(case, number), depth or depth_of(case, number)
     folder = Path(tempfile.mkdtemp(dir=root, prefix=f"{case.name}-{number}-"))
     given = write_files(case, folder, spoilt.content)
-    before, threads = listing(folder), set(threading.enumerate())
+    before, threads, children = listing(folder), set(threading.enumerate()), _children()
     told, raw = [], root / f"raw-{os.getpid()}"
     code, text, wrong, printed = None, "", "", ""
     old, seconds = Path.cwd(), SECONDS[depth]
@@ -279,7 +279,7 @@ def run_mutant(case: Case, number: int, root: Path, spoilt: Mutant | None = None
     if not wrong and seen:
         wrong = f"reached beyond its folder: {seen[:3]}"
     if not wrong and depth == "whole":
-        wrong = _running(threads, case)
+        wrong = _running(threads, children, case)
     shutil.rmtree(folder)
     shown = text.replace(str(folder), "DIR")
     return Outcome(case.name, case.kind, number, spoilt.how, depth, code, shown, spent, wrong)
@@ -365,11 +365,16 @@ def _open(folder: Path) -> list[str]:
     return found
 
 
-def _running(threads: set[threading.Thread], case: Case) -> str:
-    """Processes and threads that go on."""
+def _children() -> dict[int, str]:
+    """Processes that this one has started and that have not ended, by number."""
+    return {one.pid: one.name() for one in psutil.Process().children() if one.status() != psutil.STATUS_ZOMBIE}
+
+
+def _running(threads: set[threading.Thread], before: dict[int, str], case: Case) -> str:
+    """Processes and threads that the case started and that go on; others' of the same process do not count."""
     until = time.monotonic() + (10.0 if case.starts else 2.0)
     while True:
-        children = [one.name() for one in psutil.Process().children() if one.status() != psutil.STATUS_ZOMBIE]
+        children = [name for number, name in _children().items() if number not in before]
         # a scheduler's threads and Python's own keeper of shared memory serve the next study, too
         others = [one.name for one in set(threading.enumerate()) - threads if not case.starts and not one.daemon]
         if case.starts:
