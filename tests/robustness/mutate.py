@@ -303,7 +303,7 @@ def _on_json(one: Callable[[str, random.Random], str]) -> Mutator:
     return changed
 
 
-FAILED = (InputError, LookupError, ValueError, OSError, struct.error, TypeError)
+FAILED = (InputError, LookupError, ValueError, OSError, struct.error, TypeError, RuntimeError)
 """Of a mutator that finds nothing to change."""
 _TOKENS = _of_text(TOKENS)
 KINDS: Mapping[str, Mapping[str, tuple[int, tuple[Mutator, ...]]]] = {

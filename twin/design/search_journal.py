@@ -50,15 +50,22 @@ class Journal:
 
     def __enter__(self) -> Journal:
         """Read what is there."""
-        if self.file is None:
-            return self
+        if self.file is not None:
+            try:
+                self._read(self.file)
+            except BaseException:
+                self._close()
+                raise
+        return self
+
+    def _read(self, file: Path) -> None:
         try:
-            make_folders(self.file.parent)
-            self._out = self.file.open("r+b" if self.file.exists() else "x+b")
+            make_folders(file.parent)
+            self._out = file.open("r+b" if file.exists() else "x+b")
             lines = self._out.read().splitlines(keepends=True)
             if lines and lines[0] != f"{self._head}\n".encode():
                 raise RunFolderError(
-                    f"{self.file} is of another search, or of another version of this program; remove it to begin anew"
+                    f"{file} is of another search, or of another version of this program; remove it to begin anew"
                 )
             whole = len(lines[0]) if lines else 0
             for line in lines[1:]:
@@ -73,13 +80,15 @@ class Journal:
             self._out.truncate(whole)
             self._out.seek(whole)
         except OSError as error:
-            raise RunFolderError(f"{self.file}: {error.strerror}") from error
+            raise RunFolderError(f"{file}: {error.strerror}") from error
         if not whole:
             self._write(self._head)
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Close the file."""
+        self._close()
+
+    def _close(self) -> None:
         if self._out is not None:
             with suppress(OSError):  # what could not be written has been told
                 self._out.close()
