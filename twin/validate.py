@@ -63,6 +63,12 @@ STYLES: dict[Verdict, str] = {
     FAILED: "bold red",
 }
 
+LISTED = (
+    "id", "paper", "equation", "statement", "also", "printed", "unit", "comparison", "tolerance", "because", "tells",
+    "against", "basis", "expected",
+)  # fmt: skip
+"""What ``--list --json`` tells of a row."""
+
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
 
@@ -221,20 +227,7 @@ def _print_list(selections: Sequence[Selection], fast: bool, as_json: bool) -> N
     if as_json:
         rows = [
             {
-                "id": check.id,
-                "paper": check.paper,
-                "equation": check.equation,
-                "statement": check.statement,
-                "also": list(check.also),
-                "printed": check.printed,
-                "unit": check.unit,
-                "comparison": check.comparison,
-                "tolerance": check.tolerance,
-                "because": check.reason,
-                "tells": check.separation,
-                "against": check.alternative,
-                "basis": check.basis,
-                "expected": check.expected,
+                **{name: getattr(check, name) for name in LISTED},
                 "group": selection.group.prefix,
                 "group_seconds": selection.group.rough_seconds(fast),
             }

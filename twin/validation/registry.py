@@ -8,13 +8,18 @@ from dataclasses import dataclass
 
 from scenes.yaml.errors import nearest
 from twin.validation.checks.group import CheckGroup, matches
-from twin.validation.paper_000 import groups as paper_000
+from twin.validation.checks.printed import group_of
+from twin.validation.paper_000 import equations_000, figures, suppositions, table1, uses
 from twin.validation.paper_001 import budget_checks, formulas, joint, ranges, table2
 from twin.validation.paper_003 import fields, model
-from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks, unprinted
+from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
 
 GROUPS: tuple[CheckGroup, ...] = (
-    *paper_000.GROUPS,
+    equations_000.GROUP,
+    suppositions.GROUP,
+    table1.GROUP,
+    figures.GROUP,
+    uses.GROUP,
     formulas.GROUP,
     ranges.GROUP,
     joint.GROUP,
@@ -26,7 +31,7 @@ GROUPS: tuple[CheckGroup, ...] = (
     equations_004.GROUP,
     turntable_checks.GROUP,
     distortion_checks.GROUP,
-    unprinted.GROUP,
+    group_of("004.figures"),
 )
 """Every group, in the order in which they run. A new one is added here."""
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from scenes.yaml.errors import Problem, shown
+from scenes.yaml.spec import Number, Spec, Text
 from twin.validation.checks.chosen import Chosen, InputRange, Supposed
 
 
@@ -69,8 +72,6 @@ AGREED: dict[Basis, Verdict] = {"printed": CONFIRMED, "chosen": REPRODUCED, "the
 """What a row rests on -> its verdict where simulation and claim agree: a print that could have failed, a print with
 inputs chosen here, or a theory beside which nothing is printed.
 """
-OF_AGREEMENT = cast(Verdict, "")
-"""What a check expects by default: the verdict of agreement."""
 
 
 @dataclass(frozen=True)
@@ -157,31 +158,23 @@ class CheckResult:
         return replace(self, seconds=seconds)
 
 
-@dataclass(frozen=True)
-class Explanation:
-    """A value that the check would give for a known reason other than the printed one.
+class Explanation(Spec):
+    """A known reason for a value other than the claimed one.
 
     Attributes:
-        value: what the measurement should then be, in the check's unit.
         verdict: CORRECTED if the reason is a fault, a gap or an ambiguity of the print, else REFUTED.
-        text: the reason, a sentence.
+        text: the reason in sentences; ``{name}`` stands for a fact that `Check.evaluate` is given.
     """
 
-    value: float
-    verdict: Verdict
-    text: str
-
-    def __post_init__(self) -> None:
-        """Only these two can be explained."""
-        if self.verdict not in (CORRECTED, REFUTED):
-            raise ValueError(f"an explanation is of {CORRECTED!r} or {REFUTED!r}, not of {self.verdict!r}")
+    verdict: Literal["confirmed with correction", "refuted"]
+    text: Text
 
 
-@dataclass(frozen=True)
-class Check:
-    """A check of a paper: what it states and prints, a tolerance with its reason, the alternative that it has to be
-    told from, and what agreement rests on. All of it is known before anything is computed, so that no tolerance can
-    follow a result; `evaluate` compares what was measured, with the inputs that were chosen for it, and gives the row.
+class Check(Spec):
+    """A row: what a paper states and prints, a tolerance with its reason, the alternative that it has to be told from,
+    and what agreement rests on. It stands in the paper's ``printed.yaml`` and is known before anything is computed, so
+    that no tolerance can follow a result; `evaluate` compares what was measured, with the inputs that were chosen for
+    it, and gives the result.
 
     Attributes:
         id: dotted, beginning with the paper's number, for instance ``001.table3.centroid``.
@@ -190,55 +183,75 @@ class Check:
         unit: of printed, measured and tolerance; "1" for a ratio.
         printed: the paper's number; None where it prints none.
         tolerance: how far apart printed and measured may be and still agree, without the noise.
-        reason: why that tolerance.
+        because: why that tolerance.
         comparison: ``two-sided``: off to either side counts; or what the paper claims of the measured value: ``at
             most`` or ``at least`` the printed, so that whatever lies on the other side agrees, however far away.
         expected: the verdict that is known from earlier work; any other one is reported and fails the command. By
             default that of agreement.
-        separation: how far away the nearest other statement is that the row is to tell from this one, in its unit; with
-            a tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
-        alternative: that other statement, a phrase that goes on "told from".
+        tells: how far away the nearest other statement is that the row is to tell from this one, in its unit; with a
+            tolerance plus noise above that it confirms nothing. None only where nothing can be compared.
+        against: that other statement, a phrase that goes on "told from".
         basis: what agreement rests on, see AGREED; the inputs of ``chosen`` are given to `evaluate`.
-        theory: for the basis ``theory``: which one, a phrase.
+        theory: which theory agreement rests on, a phrase; the basis is then ``theory``.
         also: further ids of the same row, where one comparison is of two equations.
+        not_checkable: why nothing can be compared; empty where something can.
+        explanations: known reasons for other values, the likeliest first; `evaluate` is given the values.
+        otherwise: what can be said where neither claim nor explanation agrees.
     """
 
-    id: str
-    equation: str
-    statement: str
-    unit: str
-    printed: float | None
-    tolerance: float
-    reason: str
+    id: Text
+    equation: Text
+    statement: Text
+    unit: Text = "1"
+    printed: Number | None = None
+    tolerance: Annotated[Number, Field(ge=0.0)] = 0.0
+    because: Text = "nothing is compared"
     comparison: Comparison = "two-sided"
-    expected: Verdict = OF_AGREEMENT
-    separation: float | None = None
-    alternative: str = ""
+    expected: Verdict
+    tells: Annotated[Number, Field(gt=0.0)] | None = None
+    against: Text = ""
     basis: Basis = "printed"
-    theory: str = ""
-    also: tuple[str, ...] = ()
+    theory: Text = ""
+    also: tuple[Text, ...] = ()
+    not_checkable: Text = ""
+    explanations: tuple[Explanation, ...] = ()
+    otherwise: Text = ""
 
-    def __post_init__(self) -> None:
-        """Refuse ids that nobody can select, tolerances that are none, and rows that cannot tell what they are for."""
+    @model_validator(mode="before")
+    @classmethod
+    def _follow(cls, row: Any) -> Any:
+        """What follows from other keys: a basis from a theory, the expected verdict from the basis."""
+        if not isinstance(row, dict):
+            return row
+        basis = row.get("basis", "theory" if row.get("theory") else "printed")
+        agreed = NOT_CHECKABLE if row.get("not_checkable") else AGREED.get(basis, CONFIRMED)
+        return {"basis": basis, "expected": agreed, **row}
+
+    @model_validator(mode="after")
+    def _can_tell(self) -> Check:
+        """Refuse ids that nobody can select and rows that cannot tell what they are for."""
         for name in self.names:
             parts = name.split(".")
             if parts[0] not in PAPERS or len(parts) < 2 or not all(p and p.replace("_", "").isalnum() for p in parts):
-                raise ValueError(f"check id {name!r} must be a paper ({', '.join(PAPERS)}) and names, joined by dots")
-        if self.expected == OF_AGREEMENT:
-            object.__setattr__(self, "expected", self.agreed)
-        if not (math.isfinite(self.tolerance) and self.tolerance >= 0):
-            raise ValueError(f"{self.id}: the tolerance must be finite and >= 0, found {self.tolerance!r}")
-        if self.expected not in VERDICTS or self.expected == FAILED:
-            raise ValueError(f"{self.id}: {self.expected!r} is no verdict to expect")
-        if self.expected == NOT_CHECKABLE:
-            return
-        apart = self.separation
-        if apart is None or not (math.isfinite(apart) and apart > 0) or not self.alternative:
-            raise ValueError(f"{self.id}: say what the row tells from what: `separation` > 0 and `alternative`")
-        if self.tolerance > apart:
-            raise ValueError(f"{self.id}: a tolerance of {self.tolerance:g} can never tell {apart:g}")
+                allowed = f"a paper ({', '.join(PAPERS)}) and names, joined by dots"
+                raise Problem("not an id of a check", shown(name), allowed)
+        if self.expected == FAILED or (self.expected == NOT_CHECKABLE) != bool(self.not_checkable):
+            allowed = "a verdict that the row can have; `not_checkable` says why nothing can be compared"
+            raise Problem("no verdict to expect", shown(self.expected), allowed, within=("expected",))
+        if self.not_checkable:
+            return self
+        if self.tells is None or not self.against:
+            raise Problem(
+                "what the row tells from what is missing", None, "tells: a number above 0, and against: a phrase"
+            )
+        if self.tolerance > self.tells:
+            raise Problem(
+                "can never tell that", f"{self.tolerance:g}", f"at most {self.tells:g}", within=("tolerance",)
+            )
         if (self.basis == "theory") != bool(self.theory) or (self.theory and self.printed is not None):
-            raise ValueError(f"{self.id}: a theory is named where the row rests on it and nothing is printed")
+            allowed = "a theory where the row rests on one and nothing is printed"
+            raise Problem("not what the row rests on", shown(self.theory), allowed, within=("theory",))
+        return self
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -261,24 +274,24 @@ class Check:
         sigma: float | None,
         how: str,
         implied: float | None = None,
-        explanations: Sequence[Explanation] = (),
+        explained: Sequence[float | None] = (),
         inputs: Sequence[Chosen | Supposed] = (),
-        otherwise: str = "",
+        **facts: object,
     ) -> CheckResult:
         """The result, with the verdict that the numbers give.
 
         It agrees if ``measured`` is the claimed value within ``tolerance`` + 3 ``sigma``; else the first explanation
         whose value it is within the same limit gives verdict and reason; else it is refuted. A limit above
-        ``separation`` makes of either agreement ``undecided``.
+        ``tells`` makes of either agreement ``undecided``.
 
         Args:
             measured: the simulation's number.
             sigma: its standard deviation, None without noise.
             how: how it was measured and what else was found, in sentences.
             implied: what the paper's statement implies, where it prints no number.
-            explanations: values that known reasons would give, the likeliest first.
+            explained: values that the row's explanations would give, in their order; None where one is no reason here.
             inputs: chosen here; needed where the row's basis is ``chosen``.
-            otherwise: what can be said where neither claim nor explanation agrees.
+            facts: what the texts of the explanations and of ``otherwise`` name in braces, beside ``measured``.
 
         Raises:
             ValueError: a number is not finite, there is nothing to compare with, or inputs are missing.
@@ -289,20 +302,20 @@ class Check:
             raise ValueError(f"{self.id}: the paper prints no number, so `evaluate` needs `implied`")
         if not (math.isfinite(measured) and math.isfinite(noise) and math.isfinite(goal)):
             raise ValueError(f"{self.id}: {measured!r} with sigma {sigma!r} against {goal!r} is no comparison")
-        if self.separation is None or (self.basis == "chosen") != bool(inputs):
+        if self.tells is None or (self.basis == "chosen") != bool(inputs):
             raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
         goal, allowed = float(goal), self.tolerance + noise
-        verdict, reason = self._verdict(measured, goal, allowed, explanations, otherwise)
+        verdict, reason = self._verdict(measured, goal, allowed, explained, facts | {"measured": measured})
         agrees = verdict == self.agreed
         ranges = tuple(i.range(lambda value: self.outside(value, goal) <= allowed, agrees) for i in inputs)
         chosen = f"Chosen here: {'; '.join(r.text for r in ranges)}." if ranges else ""
         name = "printed" if self.printed is not None else f"implied ({goal:.6g})"
         sign = {"two-sided": "±", "at most": "up to +", "at least": "down to -"}[self.comparison]
         limit = f"Measured minus {name}: {measured - goal:+.3g}; allowed {sign}{allowed:.3g}, that is "
-        limit += f"{self.tolerance:.3g} ({self.reason})" + (" + 3 sigma." if noise else ".")
+        limit += f"{self.tolerance:.3g} ({self.because})" + (" + 3 sigma." if noise else ".")
         if self.comparison != "two-sided":
             limit += f" One-sided: whatever is {'less' if self.comparison == 'at most' else 'more'} agrees."
-        limit += f" To be told from {self.alternative}, {self.separation:.3g} away."
+        limit += f" To be told from {self.against}, {self.tells:.3g} away."
         text = "\n".join(part for part in (how, chosen, reason, limit) if part)
         found = self._result(measured, sigma, verdict, text)
         return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
@@ -315,9 +328,9 @@ class Check:
         """The result when it could not be computed."""
         return self._result(None, None, FAILED, f"Could not be computed: {why}")
 
-    def not_checkable(self, why: str) -> CheckResult:
+    def without_comparison(self) -> CheckResult:
         """The result where the text does not print what a comparison needs."""
-        return self._result(None, None, NOT_CHECKABLE, why)
+        return self._result(None, None, NOT_CHECKABLE, self.not_checkable)
 
     def outside(self, measured: float, goal: float) -> float:
         """By how much a value is not what is claimed, on the claim's side."""
@@ -325,46 +338,45 @@ class Check:
         return {"two-sided": abs(distance), "at most": distance, "at least": -distance}[self.comparison]
 
     def _verdict(
-        self, measured: float, goal: float, allowed: float, explanations: Sequence[Explanation], otherwise: str
+        self,
+        measured: float,
+        goal: float,
+        allowed: float,
+        explained: Sequence[float | None],
+        facts: Mapping[str, object],
     ) -> tuple[Verdict, str]:
-        assert self.separation is not None
+        assert self.tells is not None
         weak = (
-            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.alternative} is "
-            f"{self.separation:.3g} away and would have passed as well."
+            f"tolerance plus three sigma, {allowed:.3g}, is more than what the row is to tell: {self.against} is "
+            f"{self.tells:.3g} away and would have passed as well."
         )
         if self.outside(measured, goal) <= allowed:
-            return (self.agreed, "") if allowed <= self.separation else (UNDECIDED, f"It agrees, but {weak}")
-        for reason in explanations:
-            if abs(measured - reason.value) <= allowed:
-                text = f"{reason.text} That gives {reason.value:.6g}."
-                if reason.verdict == CORRECTED and allowed > self.separation:
+            return (self.agreed, "") if allowed <= self.tells else (UNDECIDED, f"It agrees, but {weak}")
+        known = [
+            (value, reason)
+            for value, reason in zip(explained, self.explanations[: len(explained)], strict=True)
+            if value is not None
+        ]
+        for value, reason in known:
+            if abs(measured - value) <= allowed:
+                text = f"{reason.text.format(**facts)} That gives {value:.6g}."
+                if reason.verdict == CORRECTED and allowed > self.tells:
                     return UNDECIDED, f"{text} But {weak}"
                 return reason.verdict, text
-        tried = ", ".join(f"{e.value:.6g}" for e in explanations)
+        tried = ", ".join(f"{value:.6g}" for value, _ in known)
         unknown = f"The cause is not known{f'; what was thought of gives {tried}' if tried else ''}."
-        return REFUTED, otherwise or unknown
+        return REFUTED, self.otherwise.format(**facts) or unknown
 
     def _result(self, measured: float | None, sigma: float | None, verdict: Verdict, how: str) -> CheckResult:
+        printed = {name: getattr(self, name) for name in _OF_THE_ROW}
         return CheckResult(
-            id=self.id,
-            also=self.also,
-            paper=self.paper,
-            equation=self.equation,
-            statement=self.statement,
-            printed=self.printed,
-            implied=None,
-            measured=measured,
-            sigma=sigma,
-            unit=self.unit,
-            tolerance=self.tolerance,
-            comparison=self.comparison,
-            because=self.reason,
-            power=None,
-            tells=self.separation,
-            against=self.alternative,
-            theory=self.theory,
-            inputs=(),
-            verdict=verdict,
-            how=how,
+            **printed, implied=None, measured=measured, sigma=sigma, power=None, inputs=(), verdict=verdict, how=how,
             seconds=0.0,
-        )
+        )  # fmt: skip
+
+
+_OF_THE_ROW = (
+    "id", "also", "paper", "equation", "statement", "printed", "unit", "tolerance", "comparison", "because", "tells",
+    "against", "theory",
+)  # fmt: skip
+"""What a result repeats of its row."""

@@ -1,23 +1,49 @@
-"""Numbers that a paper prints: a YAML file beside the paper's checks, and the one way to read it.
+"""What a paper prints and the rows that compare it: a YAML file beside the paper's computations, and its reader.
 
-Keys end in the unit in which the paper prints the number, so that it is read as printed and converted where it is used.
+Keys of numbers end in the unit in which the paper prints them, so that they are read as printed and converted where
+they are used. Below ``groups`` stand the rows by group and id, with the keys of `Check`; a row's ``printed`` is a
+number, or the dotted key of one in the same file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
+from scenes.yaml.spec import Number, Spec, Text
+from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.validation.checks.check import Check
+from twin.validation.checks.group import CheckGroup, Run
 
 FILE = "printed.yaml"
 """Name of the file in each paper's folder."""
 _FOLDER = Path(__file__).parents[1]
+_Seconds = Annotated[Number, Field(gt=0.0)]
+
+
+class GroupRows(Spec):
+    """Rows that share work; the attributes are those of `CheckGroup`."""
+
+    title: Text
+    seconds: _Seconds
+    fast_seconds: _Seconds | None = None
+    rows: dict[str, Check]
+
+
+class PaperRows(Spec):
+    """The rows of a file, whose other keys are what the paper prints."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    groups: dict[str, GroupRows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +77,42 @@ class Printed:
     def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
         """A mapping of lists, in the order of the file."""
         return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
+
+    @cached_property
+    def groups(self) -> Mapping[str, GroupRows]:
+        """Prefix -> rows, in the order of the file, checked."""
+        return FrozenMap(validate(PaperRows, replace(self.content, data=self._named(self.content.data))).groups)
+
+    def group(self, prefix: str, run: Run) -> CheckGroup:
+        """The group of that prefix, whose rows a function computes.
+
+        Raises:
+            InputError: there is no such group.
+        """
+        if prefix not in self.groups:
+            known = nearest(prefix, self.groups)
+            raise InputError(Issue(f"no group {prefix!r}", self.content.file, key=("groups",), suggestion=known))
+        found = self.groups[prefix]
+        return CheckGroup(prefix, found.title, found.seconds, tuple(found.rows.values()), run, found.fast_seconds)
+
+    def _named(self, data: Any) -> Any:
+        """The data with each row's id in it, and the number in place of the key that stands for what is printed."""
+        groups = data.get("groups") if isinstance(data, dict) else None
+        if not isinstance(groups, dict):
+            return data
+        named: dict[str, Any] = {}
+        for prefix, group in groups.items():
+            rows = group.get("rows") if isinstance(group, dict) else None
+            if isinstance(rows, dict):
+                group = {**group, "rows": {name: self._row(name, row) for name, row in rows.items()}}
+            named[prefix] = group
+        return {**data, "groups": named}
+
+    def _row(self, name: str, row: Any) -> Any:
+        if not isinstance(row, dict):
+            return row
+        printed = {"printed": self.number(row["printed"])} if isinstance(row.get("printed"), str) else {}
+        return {"id": name, **row, **printed}
 
     def _at(self, key: str) -> Any:
         value, path = self.content.data, _path(key)
@@ -101,6 +163,13 @@ def load_printed(paper: str) -> Printed:
         InputError: there is no file of that paper, or it cannot be read.
     """
     return Printed(read_yaml(_FOLDER / f"paper_{paper}" / FILE))
+
+
+def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
+    """A group by its prefix, with the rows that its paper's file holds, and what computes those that can be checked;
+    errors as of `load_printed`.
+    """
+    return load_printed(prefix.partition(".")[0]).group(prefix, run)
 
 
 def _path(key: str) -> KeyPath:

@@ -15,56 +15,15 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_run import values_of
-from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.paper_000.passes import TENTH, TEST, Passes, planes_of, repeated, setup_of, worst
+from twin.validation.checks.check import CheckResult, mean_of
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
+from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of, worst
 
 Array = NDArray[np.float64]
 _STEP = 1e-3
 TWIST = np.radians(10.0 / 60.0)
 """How far the forward array is turned about its line of sight for eq6.parallel, radians."""
-
-_ROUNDING = "rounding of coordinates of 6.4e6 m, 1e-9 m over 500 km, and a hundred for the sums"
-
-CHECKS = (
-    Check("000.eq1", "eq. (1)", "A line's plane goes through the station, a2 = z0 − a0 x0 − a1 y0: RMS distance of the "
-          "true ground points from the plane of noisy ones", "m", None, 0.75, "half of a point's own error of 1.5 m",
-          separation=1000.0, alternative="a wrong sign or factor in (1), which puts the plane kilometres away"),
-    Check("000.eq2", "eqs. (2), (5)", "The plane that makes S least, and that (5) gives without the minus signs on its "
-          "right side, is the line's plane: its pitch minus the true one, the line farthest off", "arcsec", None, 0.05,
-          TENTH,
-          separation=0.44, alternative="a difference as large as the smaller one of Table 1", also=("000.eq5.sign",)),
-    Check("000.eq3", "eq. (3)", "Both derivatives of S vanish at the plane: at (5)'s solution, over those 1 arcsec "
-          "beside it", "1", None, 1e-3, "0.001 arcsec is a hundredth of what the points' noise leaves",
-          separation=1.0, alternative="slopes that are 1 arcsec off"),
-    Check("000.eq4", "eq. (4)", "The printed sums are the derivatives of S: over numerical ones of (2), the ratio "
-          "farthest from 1", "1", 1.0, 1e-6, "rounding of differences of S, 1e-16 over a step of 1e-3, squared terms",
-          separation=0.5, alternative="sums with a factor 2 too many or too few"),
-    Check("000.eq5", "eq. (5)", "(5) as printed gives the forward line's plane: angle from the true plane", "deg", None,
-          0.001, "ten times the noise of a normal, 2 arcsec about the line of sight", expected=CORRECTED,
-          separation=40.0, alternative="a plane with its slopes negated"),
-    Check("000.eq5.angles", "eqs. (5)-(7)", "The angles by (5) as printed are those by (5) with the right sign: "
-          "largest difference", "arcsec", None, 1e-6, _ROUNDING,
-          separation=0.44, alternative="a difference as large as the smaller one of Table 1", basis="theory",
-          theory="a half turn about the z axis, as two wrong signs make it, keeps all angles between planes"),
-    Check("000.eq5.vertical", "section 1.3", "z = a0 x + a1 y + a2 can describe any line's plane: slope found over the "
-          "true one, in a frame where the nadir plane is an arc second from vertical", "1", 1.0, 0.03,
-          "2/n of n = 60 points, the order that the law for many points leaves out", expected=CORRECTED,
-          separation=0.5, alternative="half of the slope"),
-    Check("000.eq6", "eq. (6)", "α by (5) and (6) minus the camera's true dihedral angle", "arcsec", None, 0.05,
-          TENTH,
-          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
-    Check("000.eq6.arccos", "eqs. (6), (7)", "The arccos keeps its digits: largest difference from an exact evaluation",
-          "arcsec", None, 1e-6, "a millionth of the arc second in which the paper counts",
-          separation=0.03, alternative="single precision", basis="theory",
-          theory="rounding of float64 in the cosine, over the sine of the angle"),
-    Check("000.eq6.parallel", "section 1.2", "The angle between the planes is the angle between the looks, also when "
-          "an array is 10 arcmin off parallel: their difference", "arcsec", None, 0.05, TENTH, expected=CORRECTED,
-          separation=1.8, alternative="an angle between looks that differs by twist² / (2 tan α)"),
-    Check("000.eq7", "eq. (7)", "β by (5) and (7) minus the camera's true dihedral angle", "arcsec", None, 0.05,
-          TENTH,
-          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
-)  # fmt: skip
 
 
 def sum_of_squares(slopes: Array, points: Array, station: Array) -> float:
@@ -269,13 +228,7 @@ def _printed_plane(context: Context, planes: Planes) -> CheckResult:
     half = float(np.degrees(np.arccos(abs(true @ (np.array([-1.0, -1.0, 1.0]) * true)))))
     places = ", ".join(f"{line} {v / 1e3:.0f} km" for line, v in away.items())
     how = f"{planes.said}. The planes as printed miss their ground points by {places} RMS."
-    reason = Explanation(
-        half,
-        CORRECTED,
-        "The minus signs on the right side of (5) do not follow from (4) and negate both slopes: every plane is turned "
-        "by half a turn about the z axis. Without them (5) gives the plane, see 000.eq2.",
-    )
-    return context.check("000.eq5").evaluate(value, sigma, how, 0.0, [reason])
+    return context.check("000.eq5").evaluate(value, sigma, how, 0.0, [half])
 
 
 def _printed_angles(context: Context, planes: Planes) -> CheckResult:
@@ -309,13 +262,8 @@ def _vertical(context: Context, planes: Planes) -> CheckResult:
         "line's plane. In Earth-fixed axes the slopes are true (000.eq2); in the orbital frame the plane of a "
         "camera that looks straight down is vertical. Total least squares does not depend on the frame."
     )
-    reason = Explanation(
-        reach * np.tan(tilt) ** 2 / (reach * np.tan(tilt) ** 2 + noise),
-        CORRECTED,
-        "The form has no vertical planes, and the paper does not say which frame to take. Near the vertical x − x0 of "
-        "the points is as small as its errors, which (5) takes for exact: the slope shrinks by x²/(x² + σ²).",
-    )
-    return context.check("000.eq5.vertical").evaluate(value, sigma, how, None, [reason])
+    expected = reach * np.tan(tilt) ** 2 / (reach * np.tan(tilt) ** 2 + noise)
+    return context.check("000.eq5.vertical").evaluate(value, sigma, how, None, [expected])
 
 
 def _alpha(context: Context, planes: Planes) -> CheckResult:
@@ -370,13 +318,7 @@ def _parallel(context: Context, planes: Planes) -> CheckResult:
         f"{2 * len(off[0])} measurements with the forward array turned by ±10′ about its line of sight; mean of both "
         f"senses. With the arrays as they are, 35″ off parallel, the difference is {aligned:.4f}″."
     )
-    reason = Explanation(
-        law,
-        CORRECTED,
-        "Right for parallel arrays, which the paper supposes. Else cos(angle of planes) = cos(twist) cos(angle of "
-        "looks), larger by twist² / (2 tan α).",
-    )
-    return context.check("000.eq6.parallel").evaluate(value, sigma, how, 0.0, [reason])
+    return context.check("000.eq6.parallel").evaluate(value, sigma, how, 0.0, [law])
 
 
 def _normal(slopes: Array) -> Array:
@@ -388,4 +330,4 @@ def _by_line(errors: Mapping[str, tuple[float, float]]) -> str:
     return ", ".join(f"{line} {mean:+.3f}″ ± {sigma:.3f}″" for line, (mean, sigma) in errors.items())
 
 
-GROUP = CheckGroup("000.equations", "Planes and angles, equations (1)-(7)", 18.0, CHECKS, run, 5.0)
+GROUP = group_of("000.equations", run)

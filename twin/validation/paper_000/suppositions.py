@@ -16,37 +16,13 @@ from twin.orbit.angle.angle_flight import Measurement
 from twin.orbit.angle.angle_run import centred, effect_rows
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.flight.line_camera import dihedral_angle
-from twin.validation.checks.check import CORRECTED, Check, CheckResult, Explanation, mean_of
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.paper_000.passes import TENTH, TEST, TRACED, Passes, repeated, setup_of
+from twin.validation.checks.check import CheckResult, mean_of
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
+from twin.validation.paper_000.passes import TEST, TRACED, Passes, repeated, setup_of
 
 SCALE_HEIGHT = 8435.0
 """Of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""
-_FIRST_ORDER = "the formulas for what is expected are of first order, 6 % of half an arc second"
-
-CHECKS = (
-    Check("000.light.aberration", "section 1.2", "Ground points lie in the plane of the line that sees them, whatever "
-          "its velocity: α from true points minus the camera's, aberration alone", "arcsec", None, 0.03, _FIRST_ORDER,
-          expected=CORRECTED,
-          separation=0.4, alternative="points that aberration has moved"),
-    Check("000.light.refraction", "section 1.2", "Ground points lie in the plane of the line that sees them, also "
-          "through air: α from true points minus the camera's, refraction alone", "arcsec", None, 0.03, _FIRST_ORDER,
-          expected=CORRECTED,
-          separation=0.4, alternative="points that air has moved"),
-    Check("000.light.beta", "section 2.1", "The procedure needs no correction for the light: β from true points minus "
-          "the camera's, all effects together", "arcsec", None, 0.05, "the two effects' 0.03 arcsec in "
-          "quadrature, rounded up",
-          expected=CORRECTED,
-          separation=0.9, alternative="points that both have moved"),
-    Check("000.traced", "eqs. (5), (6)", "Change of the angle of gf7_pair as the planes show it, minus the change by "
-          "exact trace of the instrument", "arcsec", None, 0.05,
-          TENTH,
-          separation=0.44, alternative="a difference as large as the smaller one of Table 1"),
-    Check("000.centres", "section 1.2", "The lines may be taken to have one projection centre: the same of gf7_pair, "
-          "whose centres lie 2.8 m apart", "arcsec", None, 0.05,
-          TENTH, expected=CORRECTED,
-          separation=1.0, alternative="what centres so far apart make"),
-)  # fmt: skip
 
 
 def make_passes(context: Context) -> Passes:
@@ -90,27 +66,13 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
         )
 
     cases = {
-        "000.light.aberration": (
-            "aberration", 0, predicted["alpha"][0],
-            "The velocity tilts each line of sight by v/c times the sine of its angle from it, the nadir line by "
-            f"{speed / ARCSEC:.2f}″ and the forward one by cos α of that. The points have to be corrected for it.",
-        ),
-        "000.light.refraction": (
-            "refraction", 0, predicted["alpha"][1],
-            "Air bends the inclined looks toward the nadir by (n − 1) times its scale height times tan z sec z over "
-            "the slant range. The points have to be corrected for it.",
-        ),
-        "000.light.beta": (
-            "all", 1, sum(predicted["beta"]),
-            "Aberration and refraction add up in β and cancel in α. The paper says nothing of either; left in, they "
-            "are as large as the differences of its Table 1.",
-        ),
-    }  # fmt: skip
-    for identifier, (what, which, value, text) in cases.items():
-        if identifier in context.selected:
-            measured = float(rows[what].bias[which] / ARCSEC)
-            reason = Explanation(value, CORRECTED, text)
-            yield context.check(identifier).evaluate(measured, None, statement(what), 0.0, [reason])
+        "000.light.aberration": ("aberration", 0, predicted["alpha"][0]),
+        "000.light.refraction": ("refraction", 0, predicted["alpha"][1]),
+        "000.light.beta": ("all", 1, sum(predicted["beta"])),
+    }
+    for identifier, (what, which, value) in cases.items():
+        measured = float(rows[what].bias[which] / ARCSEC)
+        yield context.check(identifier).evaluate(measured, None, statement(what), 0.0, [value], tilt=speed / ARCSEC)
 
 
 def _refraction(passes: Passes, angle: str, line: str) -> float:
@@ -143,29 +105,15 @@ def _traced(context: Context, passes: Passes) -> Iterator[CheckResult]:
     common = [centred(m, section) for m, section in zip(passes.measured, passes.sections, strict=True)]
     value, sigma = off(common)
     many = f"{len(common)} measurements of a pass of gf7_pair"
-    if "000.traced" in context.selected:
-        how = (
-            f"{many}, whose focal plane has turned and moved and whose base has warmed: the trace changes the angle by "
-            f"{trace / ARCSEC:.3f}″ and the planes by {trace / ARCSEC + value:.3f}″ ± {sigma:.3f}″. Points are moved "
-            "to a common projection centre by what the laboratory knows."
-        )
-        yield context.check("000.traced").evaluate(value, sigma, how, 0.0)
-    if "000.centres" in context.selected:
-        apart = {line: _seen(passes, line) for line in (first, second)}
-        yield context.check("000.centres").evaluate(
-            *off(list(passes.measured)),
-            f"{many}; the planes go through one station, as the paper has it.",
-            0.0,
-            [
-                Explanation(
-                    (apart[first] - apart[second]) / ARCSEC,
-                    CORRECTED,
-                    "Every centre's distance from the station, square to its plane, turns the plane by that over the "
-                    "range. One lens before three CCDs has one centre, as the paper supposes; cameras of their own "
-                    "need the points moved to it first.",
-                )
-            ],
-        )
+    how = (
+        f"{many}, whose focal plane has turned and moved and whose base has warmed: the trace changes the angle by "
+        f"{trace / ARCSEC:.3f}″ and the planes by {trace / ARCSEC + value:.3f}″ ± {sigma:.3f}″. Points are moved "
+        "to a common projection centre by what the laboratory knows."
+    )
+    yield context.check("000.traced").evaluate(value, sigma, how, 0.0)
+    apart = _seen(passes, first) - _seen(passes, second)
+    how = f"{many}; the planes go through one station, as the paper has it."
+    yield context.check("000.centres").evaluate(*off(list(passes.measured)), how, 0.0, [apart / ARCSEC])
 
 
 def _seen(passes: Passes, line: str) -> float:
@@ -181,6 +129,4 @@ def _seen(passes: Passes, line: str) -> float:
     return float(np.mean(origin @ ahead) / np.mean(reach))
 
 
-GROUP = CheckGroup(
-    "000.suppositions", "What the method supposes: light, centres, the camera itself", 14.0, CHECKS, run, 9.0
-)
+GROUP = group_of("000.suppositions", run)

@@ -18,10 +18,10 @@ from twin.orbit.angle.angle_flight import Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of
 from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.validation.checks.check import NOT_CHECKABLE, REFUTED, SIGMAS, Check, CheckResult, Explanation
+from twin.validation.checks.check import SIGMAS, CheckResult
 from twin.validation.checks.chosen import Chosen
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of, load_printed
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
 
 Array = NDArray[np.float64]
@@ -35,41 +35,6 @@ POINTS = float(setup_of(TEST).test.strips.points)
 
 LIMIT = 3.44
 """Distance in two dimensions that 99.7 % keep, as three standard deviations in one."""
-
-_LIMIT = "the points' error of 2.6 m is itself known to 0.3 m, a ninth of what three standard deviations reach"
-
-CHECKS = (
-    Check("000.table1.angles", "Table 1", "α and β by resection and by planes", "arcsec", None, 0.0, "nothing "
-          "to compare",
-          expected=NOT_CHECKABLE),
-    *(
-        Check(f"000.table1.{name}", "Table 1", "Given the same points and station, of which the paper says nothing, "
-              f"resection and planes differ in {letter} by: standard deviation of their difference", "arcsec", None,
-              0.003, "a quarter: both sigmas are propagated to first order, and it is the root of their squares' "
-              "difference", separation=0.18, alternative="two methods whose errors have nothing in common",
-              basis="theory", theory="of two estimates from the same data, one of them the best, the difference has "
-              "the difference of their variances")
-        for name, letter in (("alpha", "α"), ("beta", "β"))
-    ),
-    Check("000.table1.alpha_own", "Table 1", "0.44 arcsec in α are within reach when each method has points of its own "
-          "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", ALPHA, 0.1, _LIMIT,
-          "at least",
-          separation=0.4, alternative="the reach of methods that share their points, 0.03 arcsec", basis="chosen"),
-    Check("000.table1.beta_own", "Table 1", "1.53 arcsec in β are within reach when each method has points of its own "
-          "and the planes leave the light as it is: bias + 3 standard deviations", "arcsec", BETA, 0.1, _LIMIT,
-          "at least",
-          separation=0.7, alternative="the reach without the light's effects", basis="chosen"),
-    Check("000.table1.pair", "Table 1", "0.44 and 1.53 arcsec of one sign are within reach together: distance of the "
-          "pair from such differences, in standard deviations of two dimensions", "1", None, 0.2,
-          "a twentieth of the limit, which 99.7 % of pairs keep", "at most", expected=REFUTED,
-          separation=0.85, alternative="a pair as rare as one in 10 000"),
-    Check("000.accuracy", "abstract, section 2.2", "The result is good to the order of 1 arcsec or better: larger RMS "
-          "error of α and β, light corrected", "arcsec", 1.0, 0.1, "a tenth of the order that is printed", "at most",
-          separation=2.1, alternative="the next order of magnitude, which begins at √10", basis="chosen"),
-    Check("000.accuracy.light", "abstract, section 2.2", "The result is good to the order of 1 arcsec or better: "
-          "larger RMS error of α and β, light left as it is", "arcsec", 1.0, 0.5, "the order of 1 arcsec", "at most",
-          separation=2.1, alternative="the next order of magnitude, which begins at √10", basis="chosen"),
-)  # fmt: skip
 
 
 def differences_svg(same: NDArray[np.float64], own: NDArray[np.float64], printed: tuple[float, float]) -> str:
@@ -155,13 +120,6 @@ def _at(measured: Measurement, position: Array) -> Measurement:
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
     """All checks of the group."""
-    if "000.table1.angles" in context.selected:
-        yield context.check("000.table1.angles").not_checkable(
-            "The table prints the letters α1, α2, β1, β2 in place of the angles; only their differences are numbers. "
-            "Number and spread of the ground points, place and date are not printed either."
-        )
-    if not context.selected - {"000.table1.angles"}:
-        return
     context.progress(0.1, "measure ground points for both methods")
     data = make_data(context)
     same, own = differences(data.same, data.same), differences(data.light, data.own)
@@ -252,13 +210,8 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
         f"{len(own.values)} pairs of measurements it is {distance:.1f}. With opposite signs, −{ALPHA}″ and {BETA}″, it "
         f"is {apart:.1f}; {LIMIT:.2f} is the limit."
     )
-    reason = Explanation(
-        _distance(np.array([ALPHA, BETA]) - bias, 2.0 * simple),
-        REFUTED,
-        "Planes are wrong by σ/√n over their range, and an error of the common nadir plane moves α and β oppositely, "
-        "so that differences of one sign are unlikely: either signs are not printed, or there is a further cause.",
-    )
-    return context.check("000.table1.pair").evaluate(together, None, how, LIMIT, [reason])
+    expected = _distance(np.array([ALPHA, BETA]) - bias, 2.0 * simple)
+    return context.check("000.table1.pair").evaluate(together, None, how, LIMIT, [expected])
 
 
 def _pitch_variance(passes: Passes, line: str) -> float:
@@ -296,4 +249,4 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
         yield context.check(identifier).evaluate(float(rms[worst]), noise, how, inputs=inputs)
 
 
-GROUP = CheckGroup("000.table1", "Planes against resection, Table 1", 20.0, CHECKS, run, 4.0)
+GROUP = group_of("000.table1", run)

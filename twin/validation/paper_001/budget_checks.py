@@ -9,11 +9,12 @@ from analysis.units import ARCSEC
 from twin.monitor.simulated_budget import BudgetLine
 from twin.run.artefact import Cell, Data, SvgFigure, Table
 from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
-from twin.validation.checks.check import NOT_CHECKABLE, SIGMAS, Check, CheckResult
+from twin.validation.checks.check import SIGMAS, CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
 from twin.validation.paper_001 import budget, monitored_errors
-from twin.validation.paper_001.budget import FEW_DRAWS, INPUTS, TABLE_3, TABLE_4, BudgetImages
+from twin.validation.paper_001.budget import FEW_DRAWS, TABLE_3, BudgetImages
 
 _LINES = {
     "centroid": "Energy centre of one image",
@@ -36,39 +37,6 @@ _INPUT_OF = {
     "central_prism_thermal": "gradient in the central prism",
 }
 """What a line's input is; those of rotations act through the prisms' residual angle errors, which are chosen too."""
-
-CHECKS = (
-    *(
-        Check(f"001.table3.{name}", "Table 3", f"{text}, error of one spot", "arcsec", TABLE_3[name],
-              0.2 * TABLE_3[name], INPUTS,
-              separation=0.5 * TABLE_3[name], alternative="half as much or half as much again", basis="chosen")
-        for name, text in _LINES.items()
-    ),
-    Check("001.table3.prism_180_thermal.halved", "Table 3, section 3.2.1 item 3",
-          "The 180° prism's error is that of its glass path: with half the path across the gradient, half the error",
-          "1", None, 0.02, "the short legs in the roof stay as they are",
-          separation=0.5, alternative="an error that does not follow the path"),
-    Check("001.eq12", "eq. (12)", "The causes add as the root of a sum of squares: all at once / (12)", "1", 1.0, 0.15,
-          "half of what a full correlation of the two largest lines would add",
-          separation=0.6, alternative="a plain sum of the lines", basis="chosen"),
-    Check("001.eq12.frames", "eq. (12), section 3.2.2",
-          "The mean of 9 frames has a third of the centroid's random error: scatter of means / (single / 3)", "1", 1.0,
-          0.12, "7 or 12 frames instead of 9 would give 13 %",
-          separation=0.5, alternative="the mean of four frames in place of nine"),
-    Check("001.eq12.gravity", "section 3.2.1 item 5, section 3.2.2",
-          "In orbit the bending of the optics by gravity can be left out of (12)", "arcsec", None, 0.0,
-          "nothing is printed to compare with", expected=NOT_CHECKABLE),
-    Check("001.table4.printed_lines", "Table 4, from Table 3", "(12) of the printed lines of Table 3", "arcsec",
-          TABLE_4, 0.0005, "half of the last printed digit",
-          separation=0.0013, alternative="(12) without the mean over the frames"),
-    Check("001.table4.root_sum", "Table 4, eq. (12)", "(12) of the simulated lines, the centroid's over 9 frames",
-          "arcsec", TABLE_4, 0.029, INPUTS,
-          separation=0.07, alternative="half as much or half as much again", basis="chosen"),
-    Check("001.table4.together", "Table 4", "Error of one spot with all causes at once in the images", "arcsec",
-          TABLE_4, 0.029, INPUTS,
-          separation=0.07, alternative="half as much or half as much again", basis="chosen"),
-    *monitored_errors.CHECKS,
-)  # fmt: skip
 
 
 def budget_svg(lines: Mapping[str, tuple[float, float, float]]) -> str:
@@ -185,12 +153,6 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         )
         ratio = mean / should
         yield context.check("001.eq12.frames").evaluate(ratio, ratio * hypot(s_sigma / single, m_sigma / mean), how)
-    if "001.eq12.gravity" in context.selected:
-        yield context.check("001.eq12.gravity").not_checkable(
-            "Weightlessness is no approximation in orbit, so that leaving the term out follows from the statement "
-            "itself. How large it is on the ground is not printed: Table 3 has no line for it, and neither mass nor "
-            "mounting of the prisms is given."
-        )
     if "001.table4.printed_lines" in context.selected:
         how = "Arithmetic of the printed numbers alone: Table 4 follows from Table 3 by (12) with 9 frames."
         yield context.check("001.table4.printed_lines").evaluate(budget.root_sum(TABLE_3), None, how)
@@ -232,4 +194,4 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     context.add(SvgFigure("table3-figure", "Table 3, printed and simulated", caption, budget_svg(shown)))
 
 
-GROUP = CheckGroup("001.budget", "Error budget (section 3.2)", 150.0, CHECKS, run, fast_seconds=25.0)
+GROUP = group_of("001.budget", run)

@@ -10,108 +10,13 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from twin.run.artefact import Cell, SvgFigure, Table
-from twin.validation.checks.check import CORRECTED, REFUTED, Check, CheckResult, Explanation
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.check import CheckResult
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
 from twin.validation.paper_001 import formulas_images
-from twin.validation.paper_001.formulas import ANGLE_DIGIT, FOCAL_DIGIT, INSTRUMENT, ROLL_DIGIT, without_cos2
+from twin.validation.paper_001.formulas import INSTRUMENT, without_cos2
 from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, Ratio, ratios_svg
 from twin.validation.paper_001.joint_images import AMOUNTS, JointMotions
-
-_LINEAR = "0.2 %, a fifth of what Table 5 can tell of such changes"
-_COLUMN = "Table 1, uncertain changes"
-
-CHECKS = (
-    Check(
-        "001.eq8.y", "eq. (8)", "Δf and Δβ at once move a spot along the line by the sum of what each does: both / sum",
-        "1", 1.0, 0.002, _LINEAR,
-        separation=0.01, alternative="1 %, what Table 5 can tell",
-    ),
-    Check(
-        "001.eq8.x", "section 2.5, 2), as eq. (8)",
-        "Δα and Δγ at once move a spot across the line by the sum of what each does: both / sum", "1", 1.0, 0.002,
-        _LINEAR,
-        separation=0.01, alternative="1 %, what Table 5 can tell",
-    ),
-    Check(
-        "001.eq8.d_gamma_alone", "section 2.5", "Δγ moves the spots across the line alone: common Y / X", "1", 0.0,
-        0.01, ROLL_DIGIT,
-        separation=0.02, alternative="twice what Table 5 can tell",
-    ),
-    Check(
-        "001.eq8.d_f_alone", "section 2.5", "Δf moves the spots along the line alone: common X / Y", "1", 0.0, 0.01,
-        FOCAL_DIGIT,
-        separation=0.02, alternative="twice what Table 5 can tell",
-    ),
-    Check(
-        "001.eq9.d_f", "eq. (9)", "A change of the focal length alone moves the spots apart: Y_R / (−Y_L)", "1", 1.0,
-        0.01, FOCAL_DIGIT,
-        separation=2.0, alternative="spots that move the same way",
-    ),
-    Check(
-        "001.eq9.d_beta", "eq. (9)", "A turn about X alone moves both spots alike along the line: Y_R / Y_L", "1", 1.0,
-        0.01, ANGLE_DIGIT,
-        separation=2.0, alternative="spots that move opposite ways",
-    ),
-    Check(
-        "001.eq10.d_f", "eq. (10)", "(Y_L − Y_R)/2 of all four changes over Y_L of Δf alone", "1", 1.0, 0.01,
-        FOCAL_DIGIT,
-        separation=0.5, alternative="sums or differences without their half",
-    ),
-    Check(
-        "001.eq10.d_beta", "eq. (10)", "(Y_L + Y_R)/2 of all four changes over Y_L of Δβ alone", "1", 1.0, 0.01,
-        ANGLE_DIGIT,
-        separation=0.5, alternative="sums or differences without their half",
-    ),
-    Check(
-        "001.eq11.d_alpha", "eq. (11)", "(X_L + X_R)/2 of all four changes over X_L of Δα alone", "1", 1.0, 0.01,
-        ANGLE_DIGIT,
-        separation=0.5, alternative="sums or differences without their half",
-    ),
-    Check(
-        "001.eq11.d_gamma", "eq. (11)", "(X_L − X_R)/2 of all four changes over X_L of Δγ alone", "1", 1.0, 0.01,
-        ROLL_DIGIT,
-        separation=0.5, alternative="sums or differences without their half",
-    ),
-    Check(
-        "001.table1.d_beta", _COLUMN, "Joint Δβ read per true Δβ, all four changing", "1", 1.0, 5e-4,
-        "a quarter of 1 − cos²β", expected=CORRECTED,
-        separation=0.00225, alternative="a reading without the factor cos²β",
-    ),
-    Check(
-        "001.table1.d_alpha", _COLUMN, "Joint Δα read per true Δα, all four changing", "1", 1.0, 0.01, ANGLE_DIGIT,
-        expected=CORRECTED,
-        separation=0.03, alternative="the other focal length, f across the line",
-    ),
-    Check(
-        "001.table1.d_gamma", _COLUMN, "Joint Δγ read per true Δγ, all four changing", "1", 1.0, 0.01, ROLL_DIGIT,
-        expected=CORRECTED,
-        separation=1.0, alternative="twice as much: the doubling by the reflection",
-    ),
-    Check(
-        "001.table1.d_f", _COLUMN, "Joint Δf read per true Δf, all four changing, Y_L signed as in (7)", "1", 1.0,
-        0.01,
-        FOCAL_DIGIT, expected=CORRECTED,
-        separation=0.5, alternative="half of it", also=("001.table1.sign",),
-    ),
-    Check(
-        "001.table1.d_gamma_by_d_beta", "section 2.5, Table 1",
-        "The four changes do not mix: joint Δγ read per true Δβ", "1", 0.0, 0.02,
-        "0.1 arcsec in a change of 5 arcsec, a twentieth of Table 5's error of Δγ", expected=REFUTED,
-        separation=0.5, alternative="the line tilt of another field",
-    ),
-    Check(
-        "001.table1.d_f_by_d_alpha", "section 2.5, Table 1",
-        "The four changes do not mix: joint Δf read per true Δα", "µm/arcsec", 0.0, 0.2,
-        "1 µm in a change of 5 arcsec, a fortieth of Table 5's error of Δf", expected=REFUTED,
-        separation=6.0, alternative="the plate scale of another field",
-    ),
-    Check(
-        "001.fig4.angle", "Fig. 4, section 3.2.3",
-        "Both cameras' images by Table 1 give the change of their intersection angle: read / traced", "1", 1.0, 0.01,
-        ANGLE_DIGIT, expected=CORRECTED,
-        separation=0.03, alternative="the other focal length, f across the line",
-    ),
-)  # fmt: skip
 
 
 def run(context: Context) -> Iterator[CheckResult]:
@@ -187,28 +92,10 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
         f"rendered, {FRAMES} frames each; readings fitted to the traced changes of line of sight, roll and principal "
         "distance, mean of both cameras."
     )
-    anamorphic = f"f along the line is {f:.3f} m, f_x across it {f_x:.3f} m in this field-biased camera"
-    reasons = {
-        "d_alpha": [Explanation(f_x / f, CORRECTED, f"The formula knows one f; {anamorphic}, and with f_x it holds.")],
-        "d_beta": [without_cos2(g, images.local_share)],
-        "d_gamma": [
-            Explanation(
-                2.0 * f_x / f,
-                CORRECTED,
-                "The doubling by the reflection is left out as in (5), a factor 2; the rest is the camera's "
-                f"anamorphism, for Δγ is here the turn of the imaged line: {anamorphic}.",
-            )
-        ],
-        "d_f": [
-            Explanation(
-                0.5,
-                CORRECTED,
-                "Table 1 has (Y_L − Y_R)/2 · δf/(2L) where (7), from which it is said to follow, has "
-                "(Y_L − Y_R)/2 · δf/L. And one Y_L serves Δβ and Δf there: with the y01 − y11 that Δβ needs Δf has the "
-                "wrong sign besides.",
-            )
-        ],
-    }
+    facts = {"f": f, "f_x": f_x, "local": images.local_share}
+    explained = {
+        "d_alpha": f_x / f, "d_beta": without_cos2(g, images.local_share), "d_gamma": 2.0 * f_x / f, "d_f": 0.5,
+    }  # fmt: skip
     for k, parameter in enumerate(PARAMETERS):
         identifier = f"001.table1.{parameter}"
         if identifier in context.selected:
@@ -218,7 +105,8 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
                     f" Table 1 does not say what Y_L is. (2) has y01 − y11 on the left side, by which this is "
                     f"{-matrix[k, k]:.4f}, and (7) y11 − y01; for X, (3) and (5) agree."
                 )
-            yield context.check(identifier).evaluate(matrix[k, k], sigma[k, k], text, None, reasons[parameter])
+            value, noise = matrix[k, k], sigma[k, k]
+            yield context.check(identifier).evaluate(value, noise, text, None, [explained[parameter]], **facts)
     yield from _couplings(context, images, how, matrix, sigma, right)
     rows: list[list[Cell]] = [
         [
@@ -245,20 +133,15 @@ def _couplings(
 ) -> Iterator[CheckResult]:
     g = images.first
     f, f_x = g.focal_length_m, g.focal_length_x_m or g.focal_length_m
-    common = (
-        "In this field-biased camera a shift of the line CCD brings it to a field of another {what}; the spots, which "
-        "stand still in that coordinate, cannot tell. The calibrated gradient of the distortion predicts it."
-    )
     cases = (
-        ("d_gamma_by_d_beta", 2, 1, -2.0 * f_x / f * g.d_gamma_per_beta, "line tilt"),
-        ("d_f_by_d_alpha", 3, 0, -0.5 * g.d_f_per_alpha_m * ARCSEC / 1e-6, "plate scale"),
+        ("d_gamma_by_d_beta", 2, 1, -2.0 * f_x / f * g.d_gamma_per_beta),
+        ("d_f_by_d_alpha", 3, 0, -0.5 * g.d_f_per_alpha_m * ARCSEC / 1e-6),
     )
-    for name, k, n, predicted, what in cases:
-        if f"001.table1.{name}" not in context.selected:
-            continue
-        text = f"{how} With that gradient added (corrected form): {right[k, n]:.4f}."
-        reason = Explanation(predicted, REFUTED, common.format(what=what))
-        yield context.check(f"001.table1.{name}").evaluate(matrix[k, n], sigma[k, n], text, None, [reason])
+    for name, k, n, predicted in cases:
+        if f"001.table1.{name}" in context.selected:
+            text = f"{how} With that gradient added (corrected form): {right[k, n]:.4f}."
+            check = context.check(f"001.table1.{name}")
+            yield check.evaluate(matrix[k, n], sigma[k, n], text, None, [predicted])
 
 
 def _angle(context: Context, images: JointMotions) -> CheckResult:
@@ -273,9 +156,7 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
         f"over: {rest / ARCSEC:.4f} arcsec rms; corrected factors: slope {better[0]:.4f}, left over "
         f"{better[2] / ARCSEC:.4f} arcsec rms."
     )
-    text = "The angle is the difference of two Δα, and both are too large by f_x/f, see 001.table1.d_alpha."
-    reason = Explanation(f_x / g.focal_length_m, CORRECTED, text)
-    return context.check("001.fig4.angle").evaluate(slope, sigma, how, None, [reason])
+    return context.check("001.fig4.angle").evaluate(slope, sigma, how, None, [f_x / g.focal_length_m])
 
 
-GROUP = CheckGroup("001.joint", "Joint form (8)–(11), Table 1 and Fig. 4", 3.0, CHECKS, run, fast_seconds=1.0)
+GROUP = group_of("001.joint", run)

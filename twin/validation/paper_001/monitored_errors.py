@@ -8,60 +8,21 @@ from dataclasses import replace
 from analysis.units import ARCSEC
 from twin.monitor.simulated_budget import Together
 from twin.run.artefact import Cell, Table
-from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation
+from twin.validation.checks.check import CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import Context
-from twin.validation.checks.printed import load_printed
 from twin.validation.paper_001 import budget
-from twin.validation.paper_001.budget import INPUTS, BudgetImages
+from twin.validation.paper_001.budget import BudgetImages
 
-_PRINTED = load_printed("001")
 _TABLE_4 = budget.TABLE_4 * ARCSEC
-_DIGITS = "half of the last printed digit"
 _PARAMETERS = {
-    "d_beta": ("d_beta_rad", "Δβ, 3σ", _PRINTED.number("table5.d_beta_arcsec"), "arcsec", 0.005, _DIGITS),
-    "d_alpha": ("d_alpha_rad", "Δα, 3σ", _PRINTED.number("table5.d_alpha_arcsec"), "arcsec", 0.005, _DIGITS),
-    "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", _PRINTED.number("table5.d_gamma_arcsec"), "arcsec", 0.03,
-                "f/L is not printed, the camera's is 0.6 % above the one that Table 5 implies; half of a digit"),
-    "d_f": ("d_f_m", "Δf by (7), 3σ", _PRINTED.number("table5.d_f_mm"), "mm", 0.005, _DIGITS),
-}  # fmt: skip
+    "d_beta": ("d_beta_rad", "Δβ, 3σ", "arcsec"),
+    "d_alpha": ("d_alpha_rad", "Δα, 3σ", "arcsec"),
+    "d_gamma": ("d_gamma_rad", "Δγ by (5), 3σ", "arcsec"),
+    "d_f": ("d_f_m", "Δf by (7), 3σ", "mm"),
+}
 _UNIT = {"arcsec": ARCSEC, "mm": 1e-3}
-_OF_GEOMETRY = ("d_gamma", "d_f")
-"""Parameters whose printed factors hold f or L, which are not printed and were chosen after Table 5."""
 _SHOWN = ("paper_single", "paper_joint", "derived")
-
-CHECKS = (
-    *(
-        Check(f"001.table5.{name}", "Table 5", f"{text}, all causes at once through images", unit, value, 0.2 * value,
-              INPUTS, separation=0.5 * value, alternative="half as much or half as much again", basis="chosen")
-        for name, (_, text, value, unit, *_) in _PARAMETERS.items()
-    ),
-    *(
-        Check(f"001.table5.{name}.propagated", "Table 5, section 3.2.3", f"{text}, from the printed Table 4", unit,
-              value, tolerance, why, separation=0.4 * value, alternative="spots whose errors are one and the same",
-              basis="chosen" if name in _OF_GEOMETRY else "printed")
-        for name, (_, text, value, unit, tolerance, why) in _PARAMETERS.items()
-    ),
-    Check("001.table5.d_f.by_table1", "Table 5, section 3.2.3",
-          "Table 5 follows from Tables 1 and 4: Δf by Table 1's last column from the printed Table 4", "mm",
-          _PRINTED.number("table5.d_f_mm"), 0.005, _DIGITS, expected=CORRECTED,
-          separation=0.02, alternative="half of it"),
-    Check("001.table5.x_and_y", "section 3.2.3, abstract",
-          "The turns about X and Y are determined to better than 0.1″: the larger, 3σ", "arcsec", 0.1, 0.02, INPUTS,
-          "at most",
-          separation=0.045, alternative="the error of a single spot, 0.145 arcsec", basis="chosen"),
-    Check("001.table5.d_gamma.positioning", "section 3.2.3",
-          "The error of Δγ has little influence on positioning: 2.15″ moves the line's end by at most one pixel", "px",
-          None, 0.1, "a tenth of a pixel; the text gives no limit, one ground sample is taken for little", "at most",
-          separation=1.0, alternative="two pixels", basis="chosen"),
-    Check("001.table5.d_gamma.removable", "section 3.2.3",
-          "Later photogrammetric processing removes the error of Δγ well", "arcsec", None, 0.0,
-          "nothing is printed to compare with", expected=NOT_CHECKABLE),
-    Check("001.table5.d_f.field", "section 3.2.3",
-          "Δf is less accurate than from a calibration field: its 3σ is at least the 0.01 mm of paper 003", "mm", None,
-          0.0, "the bound itself", "at least",
-          separation=0.009, alternative="a monitor ten times as good as a field", basis="chosen"),
-)  # fmt: skip
 
 
 def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
@@ -79,8 +40,7 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
     if "001.table5.d_f.by_table1" in context.selected:
         value = budget.propagated(_TABLE_4, images.geometry, "paper_joint")["d_f"] / 1e-3
         how = "Table 1's joint factors on the printed Table 4; the other three rows come out alike by both columns."
-        reason = Explanation(0.02, CORRECTED, "Table 1's joint Δf is half of (7), and Table 5 was made with (7).")
-        yield context.check("001.table5.d_f.by_table1").evaluate(value, None, how, None, [reason])
+        yield context.check("001.table5.d_f.by_table1").evaluate(value, None, how, None, [0.02])
     if images.roll_pixels is not None:
         how = (
             "Line CCD turned by 2.15 arcsec, traced; the shift of the line of sight of its end. At the middle of the "
@@ -91,14 +51,10 @@ def results(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         limit = Supposed("one pixel taken for little", f"holds down to {images.roll_pixels:.2f} px")
         check = context.check("001.table5.d_gamma.positioning")
         yield check.evaluate(images.roll_pixels, None, how, 1.0, inputs=[pixel, limit])
-    if "001.table5.d_gamma.removable" in context.selected:
-        yield context.check("001.table5.d_gamma.removable").not_checkable(
-            "The text names neither a method nor what remains after it."
-        )
 
 
 def _simulated(context: Context, images: BudgetImages, together: Together, name: str) -> CheckResult:
-    field, _, _, unit, *_ = _PARAMETERS[name]
+    field, _, unit = _PARAMETERS[name]
     size = _UNIT[unit]
     values = {e: tuple(v / size for v in p[field]) for e, p in together.parameters.items()}
     formula = budget.propagated(together.spot[0], images.geometry)[name] / size
@@ -123,7 +79,7 @@ def all_causes(value: float) -> Chosen:
 
 
 def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResult:
-    unit = _PARAMETERS[name][3]
+    unit = _PARAMETERS[name][2]
     value = budget.propagated(_TABLE_4, images.geometry)[name] / _UNIT[unit]
     g = images.geometry
     how = (
@@ -131,7 +87,8 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
         f"{g.focal_length_m:.3f} m, L = {g.separation_m:.4f} m of the camera made after Table 5."
     )
     inputs = []
-    if name in _OF_GEOMETRY:
+    check = context.check(f"001.table5.{name}.propagated")
+    if check.basis == "chosen":
         for what, field, size in (("f", "focal_length_m", g.focal_length_m), ("L", "separation_m", g.separation_m)):
 
             def response(factor: float, field: str = field, size: float = size) -> float:
@@ -139,7 +96,7 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
                 return budget.propagated(_TABLE_4, changed)[name] / _UNIT[unit]
 
             inputs.append(Chosen(what, size, "m", response))
-    return context.check(f"001.table5.{name}.propagated").evaluate(value, None, how, inputs=inputs)
+    return check.evaluate(value, None, how, inputs=inputs)
 
 
 def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
@@ -166,9 +123,10 @@ def _claims(context: Context, together: Together) -> Iterator[CheckResult]:
 def _show(context: Context, images: BudgetImages, together: Together) -> None:
     formula = budget.propagated(together.spot[0], images.geometry)
     rows: list[list[Cell]] = []
-    for name, (field, text, printed, unit, *_) in _PARAMETERS.items():
+    for name, (field, text, unit) in _PARAMETERS.items():
         size = _UNIT[unit]
         cells = [tuple(v / size for v in together.parameters[e][field]) for e in _SHOWN]
+        printed = context.check(f"001.table5.{name}").printed
         rows.append([f"{text} [{unit}]", f"{printed:g}", f"{formula[name] / size:.3g}",
                      *(f"{value:.4g} ± {sigma:.2g}" for value, sigma in cells)])  # fmt: skip
     context.add(

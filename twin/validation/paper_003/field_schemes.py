@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.orbit.angles import height_error
 from scenes.specs.orbit.setup import CalibrationSetup
-from twin.validation.checks.check import SIGMAS, Check, CheckResult
+from twin.validation.checks.check import SIGMAS, CheckResult
 from twin.validation.checks.chosen import Chosen, Supposed
 from twin.validation.checks.group import Context
 from twin.validation.paper_003.exact import all_errors
@@ -22,86 +22,6 @@ NAMES = {
     4: "six fields, all but Jiangxi",
     5: "each field its own",
 }
-_FINDING = "section 4.5"
-
-CHECKS = (
-    *(
-        Check(
-            f"003.scheme{k}.plan", "Table 6, section 4.4",
-            f"Scheme {k}, {name}: RMS in plan without ground control, mean of the seven fields, against what the true "
-            "biases imply", "m", None, 0.6, "0.3 m of the orbit and 0.12″ = 0.3 m of an estimated bias, both axes",
-            separation=2.4, alternative="biases that are 1″ off", basis="theory",
-            theory="roll and pitch less their mean times the height of flight",
-        )
-        for k, name in NAMES.items()
-    ),
-    Check(
-        "003.scheme1.height", "Table 7, section 4.4",
-        "Scheme 1: RMS in height over that with the true camera and the true biases", "1", None, 0.1,
-        "an RMS over 100 check points is known to 7 %", "at most",
-        separation=1.0, alternative="twice the error", basis="theory",
-        theory="a calibration that gives back the true camera",
-    ),
-    *(
-        Check(
-            f"003.scheme{k}.height", _FINDING,
-            f"Height hardly differs between the schemes: RMS by scheme {k} over that by scheme 1", "1", None, 0.1,
-            "an RMS over 100 check points is known to 7 %",
-            separation=0.5, alternative="heights worse or better by half", basis="chosen",
-        )
-        for k in (2, 3, 4, 5)
-    ),
-    *(
-        Check(
-            f"003.scheme{k}.uneven", _FINDING,
-            f"With the parameters of {'one field' if k == 1 else 'two fields'} the accuracy is uneven over the fields: "
-            "scatter of the RMS in plan over that by six fields", "1", None, 0.1, "less than a tenth is no difference",
-            "at least", separation=1.0, alternative="an even accuracy", basis="chosen",
-        )
-        for k in (1, 2)
-    ),
-    Check(
-        "003.scheme4.even", _FINDING,
-        "With more fields the accuracy evens out: largest over smallest RMS in plan by scheme 4, over that by scheme 1",
-        "1", None, 0.1, "less than a tenth is no difference", "at most",
-        separation=1.0, alternative="twice as uneven", basis="chosen",
-    ),
-    Check(
-        "003.scheme4.improves", _FINDING,
-        "Plan improves clearly, by a tenth, with the number of fields: mean RMS by scheme 4 over that by scheme 1", "1",
-        None, 0.03, "seven RMS over 100 points each know their mean to 3 %", "at most",
-        separation=0.2, alternative="a tenth worse in place of better", basis="chosen",
-    ),
-    Check(
-        "003.scheme4.unseen", _FINDING,
-        "The same in Jiangxi, the one field that is in no mean", "1", None, 0.1,
-        "less than a tenth is no difference", "at most",
-        separation=1.0, alternative="twice as bad", basis="chosen",
-    ),
-    Check(
-        "003.scale50000.plan", "section 5, conclusion",
-        "With mean parameters of several fields, scheme 4, plan without ground control suffices for 1:50 000: RMS of "
-        "the worst field", "m", None, 1.0, "a fifth of a pixel; the limit is assumed, the paper prints none", "at most",
-        separation=25.0, alternative="1:100 000, twice the limit", basis="chosen",
-    ),
-    Check(
-        "003.scale50000.height", "section 5, conclusion",
-        "Height by scheme 4 without ground control suffices for 1:50 000: RMS of the worst field", "m", None, 0.6,
-        "a tenth of the limit, which is assumed, the paper prints none", "at most",
-        separation=6.0, alternative="contours of 40 m, twice the limit", basis="chosen",
-    ),
-    Check(
-        "003.before.plan", "section 1", "Before calibration errors are of the class of 100 m: RMS in plan", "m", 100.0,
-        100.0 - 10**1.5, "a class reaches down to 1/√10 of its number",
-        separation=90.0, alternative="the class of 10 m", basis="chosen",
-    ),
-    Check(
-        "003.before.height", "section 1", "Before calibration errors are of the class of 100 m: RMS in height", "m",
-        100.0, 100.0 - 10**1.5,
-        "a class reaches down to 1/√10 of its number",
-        separation=90.0, alternative="the class of 10 m", basis="chosen",
-    ),
-)  # fmt: skip
 
 
 def results(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:

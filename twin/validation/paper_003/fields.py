@@ -12,8 +12,9 @@ from optics.numerics.threads import one_blas_thread
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.validation.checks.check import NOT_CHECKABLE, Check, CheckResult
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.check import CheckResult
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
 from twin.validation.paper_003 import field_schemes, stability
 from twin.validation.paper_003 import flights as flown_fields
 from twin.validation.paper_003.exact import FIELDS, setup_of, without_light
@@ -24,13 +25,6 @@ _MARKERS = "osD^vPX"
 _CURVES = 40
 FULL, FAST = 150, 24
 """Campaigns."""
-LOST = {
-    "003.table1": "The table is not in the text. Names of the fields and the schemes are; latitudes, longitudes, "
-    "dates, heights and relief in scenes/orbit/calibrate.yaml are chosen after the names, from 28° to 46° of latitude.",
-    "003.fig3": "The map is not in the text; the fields lie where scenes/orbit/calibrate.yaml puts them.",
-    "003.table6": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
-    "003.table7": "The numbers are not in the text. What section 4.5 says of them is 003.scheme1 to 003.scheme5.",
-}
 
 
 def schemes_svg(found: Flights, plan: float, height: float) -> str:
@@ -86,28 +80,9 @@ def latitude_svg(found: Flights) -> str:
         return to_svg(figure)
 
 
-def _lost(identifier: str, equation: str, statement: str) -> Check:
-    return Check(identifier, equation, statement, "1", None, 0.0, "the numbers are lost", expected=NOT_CHECKABLE)
-
-
-CHECKS = (
-    _lost("003.table1", "Table 1", "Extent, terrain and images of the seven fields"),
-    _lost("003.fig3", "Fig. 3", "Where the seven fields lie"),
-    *stability.CHECKS,
-    _lost("003.table6", "Table 6", "Accuracy by scheme and field"),
-    _lost("003.table7", "Table 7", "Accuracy by scheme and field, continued"),
-    *field_schemes.CHECKS,
-)
-
-
 @one_blas_thread()
 def run(context: Context) -> Iterator[CheckResult]:
     """Fly, calibrate, test; drawn image points, whose noise 003.model.points justifies."""
-    for identifier, why in LOST.items():
-        if identifier in context.selected:
-            yield context.check(identifier).not_checkable(why)
-    if not context.selected - set(LOST):
-        return
     setup = without_light(setup_of(FIELDS))
     count = context.count(FULL, FAST)
     seed = np.random.SeedSequence(context.seed, spawn_key=(3, 2))
@@ -121,7 +96,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     yield from stability.results(context, campaigns, found, setup)
     yield from field_schemes.results(context, found, setup)
     limits = setup.test.limits
-    if context.wants(*(c.id for c in field_schemes.CHECKS)):
+    if context.wants("003.before", "003.scale50000", *(f"003.scheme{k}" for k in field_schemes.NAMES)):
         context.add(
             SvgFigure(
                 "schemes",
@@ -177,4 +152,4 @@ def _bias_table(found: Flights) -> Table:
     )
 
 
-GROUP = CheckGroup("003.fields", "Seven fields and five schemes", 170.0, CHECKS, run, 28.0)
+GROUP = group_of("003.fields", run)

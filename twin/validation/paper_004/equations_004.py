@@ -21,33 +21,13 @@ from optics.numerics.backend import Backend
 from scenes.models.camera_assembly import ROOT, build_camera_under_test
 from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
 from twin.targets.target_path import TargetPath
-from twin.validation.checks.check import Check, CheckResult
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.check import CheckResult
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
 from twin.validation.paper_004.orientation import ACCURACY_UM, POINTS
 
 Array = NDArray[np.float64]
 TEST = "distortion"
-
-_ROUNDING = "rounding of float64, 2e-16 f, over tan W of the edge, 0.02, and ten for the sums"
-
-CHECKS = (
-    Check("004.eq2.solution", "eq. (2)", "f and p of (2) make the sum of D² least: largest difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          separation=1.0, alternative="half of the accuracy that the paper claims"),
-    Check("004.eq3.solution", "eq. (3)", "With p = 0, f of (3) makes the sum of D² least: difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          separation=1.0, alternative="half of the accuracy that the paper claims"),
-    Check("004.eq4.solution", "eq. (4)", "With f known, p of (4) makes the sum of D² least: difference from a "
-          "least-squares solution", "µm", None, 1e-6, _ROUNDING,
-          separation=1.0, alternative="half of the accuracy that the paper claims"),
-    Check("004.eq3.ignored", "section 3.1, eq. (3)", "A principal point one pixel from the middle of the line can be "
-          "ignored: largest change of D by (3)", "µm", ACCURACY_UM, 0.05,
-          "half of the last printed digit", "at most",
-          separation=2.3, alternative="twice the accuracy that the paper claims"),
-    Check("004.turntable.range", "section 3.2", "The test turns the camera by no more than 5°: angle between the "
-          "directions that are imaged to the ends of the line", "deg", 5.0, 0.0, "the bound itself", "at most",
-          separation=5.0, alternative="twice the bound"),
-)  # fmt: skip
 
 
 def chief_rays(setup: DistortionSetup, backend: Backend) -> Callable[[Array], Array]:
@@ -78,16 +58,14 @@ def run(context: Context) -> Iterator[CheckResult]:
     rough = float(places(np.array([1e-3]))[0]) / 1e-3
     edge = float(np.arctan(half / rough))
     yield from _solutions(context, places, edge)
-    if "004.eq3.ignored" in context.selected:
-        yield _ignored(context, places, edge * np.linspace(-1.0, 1.0, test.points), band.pitch)
-    if "004.turntable.range" in context.selected:
-        end, most = 0.5 * band.pixels * band.pitch, 1.02 * edge / test.reach
-        whole = _turn_to(places, end, most) - _turn_to(places, -end, most)
-        how = (
-            f"Traced chief rays of gf7 to both ends of the {band.pixels} pixels. Paper 004 does not print the field; "
-            "the camera file has it from other publications."
-        )
-        yield context.check("004.turntable.range").evaluate(float(np.degrees(whole)), None, how)
+    yield _ignored(context, places, edge * np.linspace(-1.0, 1.0, test.points), band.pitch)
+    end, most = 0.5 * band.pixels * band.pitch, 1.02 * edge / test.reach
+    whole = _turn_to(places, end, most) - _turn_to(places, -end, most)
+    how = (
+        f"Traced chief rays of gf7 to both ends of the {band.pixels} pixels. Paper 004 does not print the field; "
+        "the camera file has it from other publications."
+    )
+    yield context.check("004.turntable.range").evaluate(float(np.degrees(whole)), None, how)
 
 
 def _turn_to(places: Callable[[Array], Array], wanted: float, most: float) -> float:
@@ -133,11 +111,10 @@ def _solutions(context: Context, places: Callable[[Array], Array], edge: float) 
         "004.eq4.solution": (known - second, f"p = {MM * known:.4f} mm with f of (3)"),
     }
     for identifier, (difference, values) in found.items():
-        if identifier in context.selected:
-            how = f"{rays}; {values}, against a singular value decomposition of (1)."
-            if identifier != "004.eq3.solution":
-                how += " Over points that are not even about the middle, p takes up radial distortion."
-            yield context.check(identifier).evaluate(UM * float(np.max(np.abs(difference))), None, how, 0.0)
+        how = f"{rays}; {values}, against a singular value decomposition of (1)."
+        if identifier != "004.eq3.solution":
+            how += " Over points that are not even about the middle, p takes up radial distortion."
+        yield context.check(identifier).evaluate(UM * float(np.max(np.abs(difference))), None, how, 0.0)
 
 
-GROUP = CheckGroup("004.equations", "Interior orientation and distortion: equations (section 3.1)", 1.0, CHECKS, run)
+GROUP = group_of("004.equations", run)

@@ -25,15 +25,15 @@ from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import NYQUIST
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.targets.edge_images import TRACK
-from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, Check, CheckResult, Explanation, mean_of
+from twin.validation.checks.check import Check, CheckResult, mean_of
 from twin.validation.checks.chosen import Chosen
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of, load_printed
 from twin.validation.paper_004.plots_004 import alignment_svg
 
 Array = NDArray[np.float64]
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
-CONFOCAL_UM = load_printed("004").number("alignment.confocal_um")
+CONFOCAL_MM = load_printed("004").number("alignment.confocal_mm")
 LINE_LEVEL_ARCMIN = load_printed("004").number("alignment.line_level_arcmin")
 PARAMETERS = ("Δα", "Δβ", "Δγ", "Δx", "Δy", "Δz")
 ADJUSTMENTS = ("tilt about the surface's x", "tilt about its y", "turn in it", "slide along x", "slide along y", "lift")
@@ -44,53 +44,6 @@ TEST = "focus"
 ALIGNMENTS, FAST_ALIGNMENTS = 12, 1
 """Alignments from random mis-settings."""
 
-_MTF = "10 %: two digits are printed, and neither wavefront error nor detector: "
-_REASONS = {
-    "P": _MTF + "0.01 waves more or less of 0.06 are 5 % (Maréchal), 0.2 µm of charge diffusion of 1.4 µm as much",
-    "B": _MTF + "a tenth of the line period more or less of exposure is 8 %",
-}
-
-CHECKS = (
-    *(
-        Check(f"004.table1.{band}", "Table 1", f"MTF of the camera at the Nyquist frequency of {band}", "1", value,
-              0.1 * value, _REASONS[band[0]],
-              separation=0.3 * value, alternative="a third more or less", basis="chosen")
-        for band, value in MTF_NYQUIST.items()
-    ),
-    Check("004.table1.frequency", "Table 1", "The values are those at the Nyquist frequency, which the table does not "
-          "print: frequency at which the rendered edges have them, over Nyquist", "1", None, 0.1,
-          "10 % of an MTF, the tolerance of the values, is 5 to 10 % of the frequency",
-          separation=0.5, alternative="half the Nyquist frequency", basis="chosen"),
-    Check("004.table1.average", "Table 1", "The values are averages", "1", None, 0.0, "nothing is compared",
-          expected=NOT_CHECKABLE),
-    Check("004.alignment.coupling", "section 1.2", "The six parameters of the assembly are coupled with one another "
-          "when it is adjusted: most of them that adjustments tie together", "1", 6.0, 0.0, "they are counted",
-          expected=CORRECTED,
-          separation=1.0, alternative="five, and one that is adjusted by itself", basis="chosen"),
-    Check("004.alignment.defocus", "section 2.1", "MTF through focus gives the defocus of every CCD in every field and "
-          "band: RMS error before and after", "µm", None, 4.0, "a tenth of the 0.04 mm that is to be reached",
-          separation=40.0, alternative="a defocus as large as what is to be reached"),
-    Check("004.alignment.plane", "section 2.2", "A turn about X' and Y' and a shift along Z' make up for the defocus: "
-          "largest true distance from best focus after exactly the motion found", "mm", 1e-3 * CONFOCAL_UM, 0.0,
-          "the bound itself", "at most",
-          separation=0.04, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.constraint", "section 2.2", "The motion found keeps the line level: true turn of the line "
-          "after it", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          separation=1.0, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.shims", "section 2.2", "The motion gives the shims' changes at the holes: RMS difference from "
-          "those that the traced defocus asks for", "µm", None, 5.0, "the steps to which the shims are ground",
-          separation=50.0, alternative="a shim that is turned or swapped with another"),
-    Check("004.alignment.confocal", "section 2.3", "One round of shims brings every CCD to within 0.04 mm of best "
-          "focus: largest true distance of any alignment", "mm", 1e-3 * CONFOCAL_UM, 0.0, "the bound itself",
-          "at most",
-          separation=0.04, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.level", "section 2.3", "One round of shims leaves the line level to 1 arcmin: largest true "
-          "turn of any alignment", "arcmin", LINE_LEVEL_ARCMIN, 0.0, "the bound itself", "at most",
-          separation=1.0, alternative="twice the bound", basis="chosen"),
-    Check("004.alignment.rounds", "section 2.3", "One round of shims is enough: rounds until both bounds are kept, "
-          "most of any alignment", "1", 1.0, 0.0, "they are counted", "at most",
-          separation=1.0, alternative="two rounds", basis="chosen"),
-)  # fmt: skip
 _ALL_LOSSES = "what the scene file assumes beyond the paper, in waves, pixels or line periods, times"
 
 
@@ -148,18 +101,11 @@ def evaluate_coupling(check: Check, bench: FocusBench) -> CheckResult:
         f"surface, {np.degrees(bench.setup.test.mount.tilt):g}°, and its distance from the focal plane are assumed, "
         "for the paper prints neither."
     )
-    reason = Explanation(
-        3.0,
-        CORRECTED,
-        "A surface inclined about one axis leaves the mount a plane of symmetry, and motions that keep it do not mix "
-        "with those that do not: the six fall into two families of three. All six are coupled with one another only "
-        "where it is inclined about both axes, of which nothing is printed.",
-    )
     inclination = Chosen(
         "inclination of the mounting surface", float(np.degrees(bench.setup.test.mount.tilt)), "deg",
         lambda factor: coupled(effects(bench, factor)),
     )  # fmt: skip
-    return check.evaluate(coupled(change), None, how, explanations=[reason], inputs=[inclination])
+    return check.evaluate(coupled(change), None, how, explained=[3.0], inputs=[inclination])
 
 
 def coupled(change: Array) -> float:
@@ -234,26 +180,16 @@ def measured_defocus(state: State) -> tuple[Array, Array]:
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Align mis-set focal planes, one if only the MTF is wanted."""
-    if "004.table1.average" in context.selected:
-        yield context.check("004.table1.average").not_checkable(
-            "The table says average and prints neither of what: fields, frames or exposures, nor the direction, along "
-            "the line or along the track. 004.table1.P to B4 take the mean over five fields, along the track, where "
-            "the motion of the image takes part of it."
-        )
-    if not context.selected - {"004.table1.average"}:
-        return
     context.progress(0.0, "build the bench")
     with one_blas_thread():
         bench = FocusBench(resolve_focus(TEST), context.backend)
         if "004.alignment.coupling" in context.selected:
             yield evaluate_coupling(context.check("004.alignment.coupling"), bench)
-        if not context.selected - {"004.table1.average", "004.alignment.coupling"}:
-            return
+            if len(context.selected) == 1:
+                return
         alignments = measured_alignments(context, bench)
         for evaluate in (_mtf, _measured, _reached):
-            for result in evaluate(context, alignments):
-                if result.id in context.selected:
-                    yield result
+            yield from evaluate(context, alignments)
 
 
 def measured_alignments(context: Context, bench: FocusBench) -> list[Alignment]:
@@ -434,7 +370,7 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
     )
     value = float(np.max(turns[:, -1]))
     yield context.check("004.alignment.level").evaluate(value, None, how, inputs=[_theodolite(alignments, value)])
-    kept = (far <= 1e-3 * CONFOCAL_UM) & (turns <= LINE_LEVEL_ARCMIN)
+    kept = (far <= CONFOCAL_MM) & (turns <= LINE_LEVEL_ARCMIN)
     rounds = np.where(kept.any(axis=1), np.argmax(kept, axis=1), far.shape[1])
     more = [_second_round(a) for a in alignments]
     how = (
@@ -443,7 +379,7 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
         f"{UM * plan.mount.step:g} µm."
     )
     value = float(np.max(rounds))
-    share = max(float(np.max(far[:, -1])) / (1e-3 * CONFOCAL_UM), float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
+    share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
     chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: value if k * share <= 1.0 else value + 1.0)
     yield context.check("004.alignment.rounds").evaluate(value, None, how, inputs=[chosen])
     context.add(
@@ -451,7 +387,7 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
             "alignments",
             "One round of shims",
             "Every alignment before and after, true values. Grey: within what the paper reached.",
-            alignment_svg(far, turns, 1e-3 * CONFOCAL_UM, LINE_LEVEL_ARCMIN),
+            alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN),
         )
     )
 
@@ -476,4 +412,4 @@ def _list(values: Array, digits: int) -> str:
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
-GROUP = CheckGroup("004.focus", "Focal-plane alignment (section 2)", 380.0, CHECKS, run, 33.0)
+GROUP = group_of("004.focus", run)

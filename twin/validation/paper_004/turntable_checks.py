@@ -23,10 +23,10 @@ from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.laboratory.turntable_run import run_turntable
 from twin.run.artefact import Cell, Table
-from twin.validation.checks.check import CORRECTED, NOT_CHECKABLE, REFUTED, Check, CheckResult, Explanation, median_of
+from twin.validation.checks.check import Check, CheckResult, median_of
 from twin.validation.checks.chosen import Chosen
-from twin.validation.checks.group import CheckGroup, Context
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of, load_printed
 
 Array = NDArray[np.float64]
 TEST = "turntable"
@@ -44,52 +44,6 @@ NETWORK = "network"
 _REPEATED = tuple(f"004.turntable.{name}" for name in ("repeat", "criterion", "chauvenet", "chauvenet_mean"))
 CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 
-_ONE_TABLE = (
-    "20 %: the paper's is of one table, and the largest of 41 RMS of ten readings scatters by a tenth without any "
-    "gross error and by more with a few"
-)
-
-CHECKS = (
-    Check("004.turntable.repeat", "section 3.3", "Ten repeats of the dividing error: largest RMS of 41 angles",
-          "arcsec", REPEAT_RMS_ARCSEC, 0.2 * REPEAT_RMS_ARCSEC, _ONE_TABLE,
-          separation=0.04, alternative="half as much or half as much again", basis="chosen"),
-    Check("004.turntable.criterion", "section 3.3", "Chauvenet's criterion rejects a reading where so large a "
-          "deviation is expected fewer than half a time: deviation at which it begins, of ten readings, over their RMS",
-          "1", None, 0.01, "textbooks tabulate it to two decimals",
-          separation=0.3, alternative="one tail for two", basis="theory",
-          theory="Chauvenet's criterion, the root of 10 P(|z| > x) = 1/2"),
-    Check("004.turntable.chauvenet", "section 3.3", "After Chauvenet's criterion, largest RMS of 41 angles: of the "
-          "single readings that are kept", "arcsec", CHAUVENET_RMS_ARCSEC, 0.2 * CHAUVENET_RMS_ARCSEC, _ONE_TABLE,
-          separation=0.0185, alternative="half as much or half as much again", basis="chosen"),
-    Check("004.turntable.chauvenet_mean", "section 3.3, Fig. 8", "The same number, as an RMS of the averages: of the "
-          "mean of ten readings, nothing rejected", "arcsec", CHAUVENET_RMS_ARCSEC,
-          0.2 * REPEAT_RMS_ARCSEC / REPEATS**0.5, _ONE_TABLE, expected=CORRECTED,
-          separation=0.011, alternative="averaging alone"),
-    Check("004.turntable.interpolation", "section 3.2", "Interpolated between calibrated angles, the dividing error is "
-          "better than 2 arcsec: straight lines, largest RMS at held-out angles of any table", "arcsec", 2.0, 0.0,
-          "the bound itself", "at most",
-          separation=2.0, alternative="twice the bound", basis="chosen"),
-    Check("004.turntable.fit", "section 3.3", "The fitted dividing error is better than 0.2 arcsec: largest RMS at "
-          "held-out angles of any table", "arcsec", FIT_RMS_ARCSEC, 0.0, "the bound itself", "at most",
-          separation=0.2, alternative="twice the bound", basis="chosen"),
-    Check("004.turntable.network", "section 3.3", "The BP network fits the dividing error more precisely than other "
-          "fits, by a tenth or more: its RMS at held-out angles over that of the one cross-validation takes, median",
-          "1", None, 0.02, "by so much the ratio hangs on which of two equal fits cross-validation prefers", "at most",
-          REFUTED,
-          separation=0.1, alternative="no advantage"),
-    Check("004.turntable.architecture", "section 3.3", "A BP network fits the dividing error", "1", None, 0.0,
-          "nothing is compared", expected=NOT_CHECKABLE),
-    Check("004.turntable.time", "section 3.3", "The prediction of the dividing error halves the time of the test", "%",
-          50.0, 0.0, "nothing is compared", expected=NOT_CHECKABLE),
-)  # fmt: skip
-_UNPRINTED = {
-    "004.turntable.architecture": "The text prints neither layers and neurons nor training, start or stop of the "
-    "network, nor which angles it was fitted to and judged at. 004.turntable.network takes one hidden layer of tanh "
-    "with weight decay.",
-    "004.turntable.time": "The text prints no time, neither with the prediction nor without it, nor how many angles "
-    "would otherwise have been calibrated.",
-}
-
 
 @dataclass(frozen=True, eq=False)
 class FittedTable:
@@ -106,9 +60,6 @@ class FittedTable:
 
 def run(context: Context) -> Iterator[CheckResult]:
     """Calibrate many tables; fit some of them."""
-    for identifier, why in _UNPRINTED.items():
-        if identifier in context.selected:
-            yield context.check(identifier).not_checkable(why)
     spec = resolve_turntable(TEST).test
     # two streams, so that what one part draws does not hang on whether the other runs
     first, second = np.random.SeedSequence(context.seed).spawn(2)
@@ -182,11 +133,6 @@ def _repeats(
         f"{good:.1f} of them expected without any gross error. Repeatability is chosen for this number too.",
         "004.turntable.chauvenet_mean": f"The mean of the readings that the criterion keeps has {kept:.4f}″ at worst.",
     }
-    text = (
-        "Ambiguous: the sentence speaks of averages, but averaging alone gives less, 0.081″/√10. The printed number "
-        "is of single readings."
-    )
-    reasons = {"004.turntable.chauvenet_mean": [Explanation(alone, CORRECTED, text)]}
     for identifier, found in values.items():
         if identifier in context.selected:
             low, high = np.percentile(found, [25.0, 75.0])
@@ -196,7 +142,7 @@ def _repeats(
             )
             check, (value, sigma) = context.check(identifier), median_of(found)
             inputs = _readings(spec, seeds[:FAST_TABLES], identifier, value) if check.basis == "chosen" else []
-            yield check.evaluate(value, sigma, how, None, reasons.get(identifier, ()), inputs)
+            yield check.evaluate(value, sigma, how, None, [alone] if identifier.endswith("mean") else [], inputs)
 
 
 def _readings(spec: TurntableTestSpec, seeds: NDArray[np.integer], identifier: str, value: float) -> list[Chosen]:
@@ -275,14 +221,10 @@ def _network(check: Check, tables: Sequence[FittedTable]) -> CheckResult:
         f"other fit, known afterwards only: mean {np.mean(best):.3f}. The network is the best of five on "
         f"{np.sum(rank == 1.0)} tables, its mean rank is {np.mean(rank):.1f}."
     )
-    text = (
-        "The network has no advantage: every fit but the polynomial can follow the curve, and most of what they leave "
-        "is the subdivision error, which no fit can follow."
-    )
     # of a median, by the median distance from it: a training that ends in a bad minimum now and then is far off
     middle = float(np.median(ratio))
     sigma = float(np.sqrt(0.5 * np.pi / len(ratio)) * np.median(np.abs(ratio - middle)) / norm.ppf(0.75))
-    return check.evaluate(middle, sigma, how, 0.9, [Explanation(1.0, REFUTED, text)])
+    return check.evaluate(middle, sigma, how, 0.9, [1.0])
 
 
 def _table(tables: Sequence[FittedTable]) -> Table:
@@ -308,4 +250,4 @@ def _table(tables: Sequence[FittedTable]) -> Table:
     )
 
 
-GROUP = CheckGroup("004.turntable_fits", "Dividing error of the turntable (sections 3.2, 3.3)", 80.0, CHECKS, run, 15.0)
+GROUP = group_of("004.turntable_fits", run)

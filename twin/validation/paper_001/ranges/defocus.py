@@ -40,7 +40,7 @@ _NOTES = {
     "roof along": "the ridge lies along the line; the area CCD stands beside its pinhole along the line",
     "corner": "the spot falls on its own pinhole: the area CCD must see it through a beam splitter",
 }
-CONFOCAL = load_printed("004").number("alignment.confocal_um") / 1e6
+CONFOCAL = load_printed("004").number("alignment.confocal_mm") / 1e3
 """How well paper 004 sets the line CCD to the focus, metres."""
 SMALL = {"d_alpha": 2.0, "d_beta": 2.0, "d_gamma": 40.0, "d_f": 1500.0}
 """Single changes whose readings are compared in a defocused camera and at other fields: a third of the area CCD."""

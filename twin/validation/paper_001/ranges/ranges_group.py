@@ -12,140 +12,15 @@ from analysis.units import ARCSEC
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.run.artefact import Data
-from twin.validation.checks.check import CONFIRMED, CORRECTED, REFUTED, Check, CheckResult, Explanation
-from twin.validation.checks.group import CheckGroup, Context
+from twin.validation.checks.check import CheckResult
+from twin.validation.checks.group import Context
+from twin.validation.checks.printed import group_of
 from twin.validation.paper_001.ranges import defocus, show, turns
 from twin.validation.paper_001.ranges import defocus as returns
 from twin.validation.paper_001.ranges.curves import CALIBRATED, JOINT, PRINTED, Bench
 from twin.validation.paper_001.ranges.curves import CORRECTED as FORM
 from twin.validation.paper_001.ranges.defocus import variant
 from twin.validation.paper_001.ranges.turns import NAMES, Range, criterion
-
-_INTERPOLATED = "the interpolation of the limit is good to 0.1 %, the first-order prediction to 1 %"
-_TABLE_1 = "Table 1, uncertain changes"
-_BOX = "the first-order prediction leaves out the distortion and the smaller couplings"
-_TABLE_5 = "Table 5 states this as the error of the method"
-
-CHECKS = (
-    Check(
-        "001.eq2.range", "eq. (2), section 3.3", "(2) reads Δβ within 0.1″ over all that the area CCDs can record: "
-        "largest Δβ for which it does", "arcsec", None, 0.05, _INTERPOLATED, "at least",
-        separation=2.0, alternative="a third of the window less",
-    ),
-    Check(
-        "001.eq3.range", "eq. (3), section 3.3", "(3) reads Δα within 0.1″ over all that the area CCDs can record: "
-        "largest Δα for which it does", "arcsec", None, 0.05, _INTERPOLATED, "at least", expected=CORRECTED,
-        separation=2.0, alternative="a third of the window less",
-    ),
-    Check(
-        "001.eq5.range", "eq. (5), Table 5", "(5) reads Δγ within Table 5's 2.15″ over all that the area CCDs can "
-        "record: largest Δγ for which it does", "arcsec", None, 0.05, _INTERPOLATED, "at least", expected=CORRECTED,
-        separation=100.0, alternative="a sixth of the window",
-    ),
-    Check(
-        "001.eq7.range", "eq. (7), Table 5", "(7) reads Δf within Table 5's 0.04 mm over all that the area CCDs can "
-        "record: largest Δf for which it does", "mm", None, 0.05, _INTERPOLATED, "at least",
-        separation=2.0, alternative="half of the window less",
-    ),
-    Check(
-        "001.small_angles.range", "section 2.5", "The angles are small, so tan x ≈ x: largest share by which (2), (3) "
-        "and (5) change without their arctangent, over all that the area CCDs can record", "1", None, 0.01,
-        "1 % is 0.06″ at the largest Δβ that the area CCDs can record, as much as Table 5 allows", "at most",
-        separation=0.03, alternative="an error as large as that of (3) in this camera",
-    ),
-    Check(
-        "001.eq2.range.field", "eq. (2)", "(2) with its cos²β holds wherever the area CCDs stand: its reading over "
-        "the truth at the largest field, divided by the same at the smallest", "1", None, 5e-4,
-        "a quarter of what cos²β changes between the two", expected=CORRECTED,
-        separation=0.002, alternative="a factor cos²β too many",
-    ),
-    Check(
-        "001.table1.range.d_beta", _TABLE_1,
-        "All four at once, in any combination: Table 1 reads Δβ within 0.1″ over all "
-        "that the area CCDs can record: largest box, over the one that fills them",
-        "1", None, 0.05, _BOX, "at least",
-        separation=0.2, alternative="four fifths of the box",
-    ),
-    Check(
-        "001.table1.range.d_alpha", _TABLE_1,
-        "All four at once, in any combination: Table 1 reads Δα within 0.1″ over all "
-        "that the area CCDs can record: largest box, over the one that fills them",
-        "1", None, 0.05, _BOX, "at least", expected=CORRECTED,
-        separation=0.2, alternative="four fifths of the box",
-    ),
-    Check(
-        "001.table1.range.d_gamma", _TABLE_1,
-        "All four at once, in any combination: Table 1 reads Δγ within Table 5's 2.15″ over all "
-        "that the area CCDs can record: largest box, over the one that fills them",
-        "1", None, 0.01, _BOX, "at least", expected=CORRECTED,
-        separation=0.9, alternative="a tenth of the box",
-    ),
-    Check(
-        "001.table1.range.d_f", _TABLE_1,
-        "All four at once, in any combination: Table 1 reads Δf within Table 5's 0.04 mm over all "
-        "that the area CCDs can record: largest box, over the one that fills them",
-        "1", None, 0.01, _BOX, "at least", expected=CORRECTED,
-        separation=0.9, alternative="a tenth of the box",
-    ),
-    Check(
-        "001.table1.range.d_alpha.by_d_f", "eqs (8)–(11)", "Δf moves the spots along Y only, so that Δα is read free "
-        "of it: error of Δα per Δf", "arcsec/mm", None, 0.01,
-        "0.05″, Table 5's, at the largest Δf that the area CCDs can record",
-        separation=0.0217, alternative="an error of 0.1″, section 3.3's, at the largest Δf",
-    ),
-    Check(
-        "001.table1.range.d_beta.by_d_gamma", "eqs (8)–(11)", "Δγ moves the spots along X only, so that Δβ is read "
-        "free of it: error of Δβ per Δγ", "1", None, 4e-4,
-        "0.05″, Table 5's, at the largest Δγ that the area CCDs can record",
-        separation=8.4e-4, alternative="an error of 0.1″, section 3.3's, at the largest Δγ",
-    ),
-    Check(
-        "001.eq2.defocus", "section 2.4, eq. (2)", "A motion of the line CCD parallel to itself does not change the "
-        "visual axis: Δβ read minus true at a defocus of 2λN²", "arcsec", None, 0.05, _TABLE_5, expected=CONFIRMED,
-        separation=0.1, alternative="the accuracy of section 3.3 lost",
-    ),
-    Check(
-        "001.eq3.defocus", "section 2.4, eq. (3)", "A motion of the line CCD parallel to itself does not change the "
-        "visual axis: Δα read minus true at a defocus of 2λN²", "arcsec", None, 0.05, _TABLE_5, expected=REFUTED,
-        separation=0.1, alternative="the accuracy of section 3.3 lost",
-    ),
-    Check(
-        "001.eq5.defocus", "section 2.4, eq. (5)", "A motion of the line CCD parallel to itself does not turn the "
-        "camera: Δγ read minus true at a defocus of 2λN²", "arcsec", None, 2.15, _TABLE_5, expected=CONFIRMED,
-        separation=2.15, alternative="an error as large as Table 5's",
-    ),
-    Check(
-        "001.eq7.defocus", "section 2.4, eq. (7)", "(7) reads the change of the focal length of a defocused camera: "
-        "Δf read minus true change of the principal distance at a defocus of 2λN²", "um", None, 40.0, _TABLE_5,
-        expected=CONFIRMED,
-        separation=40.0, alternative="an error as large as Table 5's",
-    ),
-    Check(
-        "001.returns.plane", "section 1.2, eqs (2), (3)", "Return by a plane face: motion of the spots over that of "
-        "the line CCD, the axis where it differs more from −2", "1", None, 2e-3,
-        "0.1 %: the camera's distortion over the 3 mm from pinhole to area CCD",
-        separation=2.0, alternative="no motion, as after a corner cube",
-    ),
-    Check(
-        "001.returns.roof", "section 1.2, eq. (2)", "Return by a roof prism with its ridge across the line: motion of "
-        "the spots over that of the line CCD, along the line", "1", None, 2e-3, "as for the plane face",
-        expected=CORRECTED,
-        separation=2.0, alternative="no motion",
-    ),
-    Check(
-        "001.returns.roof_along", "section 1.2, eq. (3)", "Return by a roof prism with its ridge along the line: "
-        "motion of the spots over that of the line CCD, across the line", "1", None, 2e-3, "as for the plane face",
-        expected=CORRECTED,
-        separation=2.0, alternative="no motion",
-    ),
-    Check(
-        "001.returns.corner", "section 1.2, eqs (2), (3)", "Return by a corner cube, which sends light back on its "
-        "own way: motion of the spots over that of the line CCD, the larger of both axes", "1", None, 2e-3,
-        "as for the plane face", expected=CORRECTED,
-        separation=2.0, alternative="no motion",
-    ),
-)  # fmt: skip
-
 
 INSTRUMENT, OTHER = "monitor_pair", "gf7_pair"
 """The camera that Table 5 implies; and one of another focal length, in full runs."""
@@ -215,20 +90,10 @@ def _range(context: Context, identifier: str, both: list[Range], geometry: Monit
     claimed = turns.CLAIMED[name]
     limit, whence = min(r.limit(criterion(PRINTED, "claimed")) for r in both)
     window = min(r.window for r in both)
-    anamorphism = (geometry.focal_length_x_m or geometry.focal_length_m) / geometry.focal_length_m
-    known = {
-        "d_alpha": (
-            claimed / (anamorphism - 1.0),
-            f"(3) divides by f = {geometry.focal_length_m:.3f} m where the camera's f across the line is "
-            f"{geometry.focal_length_x_m:.3f} m: an error of {100 * (anamorphism - 1):.2f} % of Δα.",
-        ),
-        "d_gamma": (
-            claimed / (2.0 * anamorphism - 1.0),
-            "(5) leaves out the doubling by the reflection, and takes f for f across the line: an error of "
-            f"{100 * (2 * anamorphism - 1):.1f} % of Δγ.",
-        ),
-    }
-    explanations = [Explanation(v * per, CORRECTED, text) for v, text in [known[name]]] if name in known else []
+    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    share = {"d_alpha": f_x / f - 1.0, "d_gamma": 2.0 * f_x / f - 1.0}.get(name)
+    explained = [] if share is None else [claimed / share * per]
+    error = 100.0 * (share or 0.0)
     images = sum(len(r.images.size) for r in both)
     gap = max(r.trace_gap for r in both)
     lost, why = min((r.lost, r.lost_why) for r in both)
@@ -242,7 +107,9 @@ def _range(context: Context, identifier: str, both: list[Range], geometry: Monit
         f"Printed: 1 % holds {show.limit_text(both, PRINTED, '1 %', per)}, the limit here is known from {whence}. "
         f"Corrected: 1 % {best['1 %']}, {show.fine_text(name)} {best['fine']}."
     )
-    return context.check(identifier).evaluate(limit * per, None, how.replace(" ″", "″"), window * per, explanations)
+    return context.check(identifier).evaluate(
+        limit * per, None, how.replace(" ″", "″"), window * per, explained, f=f, f_x=f_x, error=error
+    )
 
 
 def _small(context: Context, own: Mapping[str, list[Range]]) -> CheckResult:
@@ -284,8 +151,7 @@ def _field(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[str
         )
         + ". cos²β would be wrong by 1 % at a field of 5.7°."
     )
-    text = "The factor cos²β does not belong to a shift of the line CCD, see 001.eq2.cos2."
-    return context.check("001.eq2.range.field").evaluate(ratio, None, how, 1.0, [Explanation(cos2, CORRECTED, text)])
+    return context.check("001.eq2.range.field").evaluate(ratio, None, how, 1.0, [cos2])
 
 
 def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
@@ -302,7 +168,7 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
         f"{trials} random states of both cameras, all four uniform in ±(4″, 4″, 24″, 0.95 mm), through "
         f"{bench.frames} noisy frames each; reading = K · true + constant by least squares."
     )
-    reasons = _box_reasons(geometry)
+    explained = _box_limits(geometry)
     for k, name in enumerate(NAMES):
         if f"001.table1.range.{name}" not in context.selected:
             continue
@@ -316,30 +182,22 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
             f"{diagonal[0][0]:.4f} by Table 1, {diagonal[1][0]:.4f} corrected; it leaves "
             f"{found.scatter[FORM][k]:.2g} {_plain(turns.UNITS[name])} rms."
         ).replace(" ″", "″")
-        yield context.check(f"001.table1.range.{name}").evaluate(share, None, how, 1.0, reasons.get(name, ()))
+        yield context.check(f"001.table1.range.{name}").evaluate(share, None, how, 1.0, explained.get(name, ()))
     yield from _crosstalk(context, found, setup)
 
 
-def _box_reasons(geometry: MonitorGeometry) -> dict[str, list[Explanation]]:
+def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
     """To first order, the box in which Table 1 stays within the claims, from the factors that it lacks."""
     anamorphism = (geometry.focal_length_x_m or geometry.focal_length_m) / geometry.focal_length_m
     alpha, beta, gamma, f = turns.BOX
     roll = abs(geometry.d_gamma_per_beta) * beta
     growth = abs(geometry.d_f_per_alpha_m) * ARCSEC * 1e6 * alpha
     worst = {
-        "d_alpha": ((anamorphism - 1.0) * alpha, "One f for both directions: with f_x it holds."),
-        "d_gamma": (
-            (2.0 * anamorphism - 1.0) * gamma + roll,
-            "Table 1 leaves out the doubling by the reflection and takes f for f_x; and Δβ brings the line to a field "
-            "where its image is turned, which no spot shows.",
-        ),
-        "d_f": (
-            0.5 * f + growth,
-            "Table 1 has half of (7), from which it is said to follow; and Δα brings the line to a field where the "
-            "plate scale differs, which no spot shows.",
-        ),
+        "d_alpha": (anamorphism - 1.0) * alpha,
+        "d_gamma": (2.0 * anamorphism - 1.0) * gamma + roll,
+        "d_f": 0.5 * f + growth,
     }
-    return {n: [Explanation(float(turns.CLAIMED[n] / v), CORRECTED, text)] for n, (v, text) in worst.items()}
+    return {name: [float(turns.CLAIMED[name] / value)] for name, value in worst.items()}
 
 
 def _crosstalk(context: Context, found: turns.Separation, setup: str) -> Iterator[CheckResult]:
@@ -393,37 +251,22 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
             + " The motion also changes the reading of a change of 1 by less than "
             f"{max(abs(g[FORM][k] / constant[0.0][FORM][k] - 1.0) for g in constant.values()):.0e}."
         ).replace(" ″", "″")
-        reasons = []
+        explained = []
         if name in theory:
             how += (
                 f" Over {len(places)} places of the sub-aperture it changes by {gradient:.3f}/f_x² along X; along Y Δβ "
                 f"changes by {across:.3f}/f²."
             )
-            text = (
-                "A beam through the pupil at a distance h from its middle meets the line CCD at a slope h/f, and a "
-                "defocus z moves its spot by 2zh/f: read as a turn of zh/f² that is none. The print does not know it; "
-                "four spot coordinates cannot tell it from Δα."
-            )
-            reasons = [Explanation(theory[name] * depth, REFUTED, text)]
+            explained = [theory[name] * depth]
         elif name == "d_beta":
             how += f" A sub-aperture off along Y would read zh/f² here ({across:.3f} of it by images)."
-        yield context.check(identifier).evaluate(abs(slope[k]) * depth, None, how, 0.0, reasons)
+        yield context.check(identifier).evaluate(abs(slope[k]) * depth, None, how, 0.0, explained)
 
 
 def _returns(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[str, object]) -> Iterator[CheckResult]:
     context.progress(0.92, "other kinds of return")
     found = {r.kind: r for r in returns.responses(resolved, context.backend, bench)}
     show.returns_shown(context, list(found.values()), data)
-    only = (
-        "The text asks of the prism that light goes back on its own way, and does not say which kind it is. (2) to (7) "
-        "hold for a plane face only: "
-    )
-    retro = {
-        "roof": only + "a roof sends light back parallel to itself along the line, so that Δβ and Δf are not seen.",
-        "roof along": only
-        + "a roof sends light back parallel to itself across the line, so that Δα and Δγ are not seen.",
-        "corner": only + "a corner cube sends light back parallel to itself, so that nothing is seen.",
-    }
     for kind, identifier in (("plane", "001.returns.plane"), ("roof", "001.returns.roof"),
                              ("roof along", "001.returns.roof_along"), ("corner", "001.returns.corner")):  # fmt: skip
         if identifier not in context.selected:
@@ -441,8 +284,7 @@ def _returns(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
             f"{returns.SHIFT * 1e6:g} µm: {_four(across)} across the line, {_four(along)} along it. Corrected readings "
             "over truth: " + ", ".join(f"{name} {_four(g)}" for name, g in zip(NAMES, r.gain, strict=True)) + "."
         )
-        reasons = [Explanation(0.0, CORRECTED, retro[kind])] if kind in retro else []
-        yield context.check(identifier).evaluate(value, None, how, -2.0, reasons)
+        yield context.check(identifier).evaluate(value, None, how, -2.0, [] if kind == "plane" else [0.0])
 
 
 def _four(value: float) -> str:
@@ -455,6 +297,4 @@ def _plain(unit: str) -> str:
     return {"arcsec": "″", "um": "µm"}[unit]
 
 
-GROUP = CheckGroup(
-    "001.ranges", "Ranges of the formulas: size, combination, defocus, pupil, field, return", 75.0, CHECKS, run, 25.0
-)
+GROUP = group_of("001.ranges", run)
