@@ -978,8 +978,9 @@ def test_an_orbit_force(monkeypatch: pytest.MonkeyPatch) -> None:
 
 GROUPS = "twin.validation.registry.GROUPS"
 SUM = Check(
-    "001.toy.sum", "none", "One and one are two.", "1", 2.0, 1e-12, "rounding", separation=1.0, alternative="three"
-)
+    id="001.toy.sum", equation="none", statement="One and one are two.", printed=2.0, tolerance=1e-12,
+    because="rounding", tells=1.0, against="three",
+)  # fmt: skip
 
 
 @extends(GROUPS)

@@ -236,7 +236,7 @@ def test_mean_differences(reader: Reader, benches: list[ReadingTable], backend: 
 
 
 def test_the_printed_columns_about_z_are_one() -> None:
-    (row,) = (check for check in table2.CHECKS if check.id == "001.table2.z_columns")
+    (row,) = (check for check in table2.GROUP.checks if check.id == "001.table2.z_columns")
     one, two = (np.array(mirror["Z"]) for mirror in (table2.MIRROR_1, table2.MIRROR_2))
     assert row.printed == pytest.approx(np.max(np.abs(2 / math.sqrt(3) * one - two)), abs=5e-10)
     assert row.printed < 5e-7  # half of the last printed digit

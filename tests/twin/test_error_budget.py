@@ -15,11 +15,11 @@ from scenes.yaml.errors import InputError
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, _shifts
 from twin.validate import app
 from twin.validation.paper_001.budget import propagated, root_sum_of_squares
-from twin.validation.paper_001.budget_checks import CHECKS
+from twin.validation.paper_001.budget_checks import GROUP
 
 TRIALS = 40
 LINES = ("centroid", *load_disturbances("paper_001").causes)
-PRINTED = {c.id.rpartition(".")[2]: c.printed for c in CHECKS if c.id.startswith("001.table3") and c.printed}
+PRINTED = {c.id.rpartition(".")[2]: c.printed for c in GROUP.checks if c.id.startswith("001.table3") and c.printed}
 
 
 def make(backend, seed=3, causes=(), **changes):
@@ -195,5 +195,5 @@ def test_the_command_gives_every_line():
     done = CliRunner().invoke(app, ["--only", "001.eq12,001.table3,001.table4,001.table5", "--fast", "--json"])
     assert done.exit_code == 0
     found = json.loads(done.stdout)
-    assert {c["id"] for c in found["checks"]} == {c.id for c in CHECKS}
+    assert {c["id"] for c in found["checks"]} == {c.id for c in GROUP.checks}
     assert found["unexpected"] == []

@@ -48,11 +48,16 @@ KEYS = [
     "comparison", "because", "power", "tells", "against", "theory", "inputs", "verdict", "how", "seconds",
 ]  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n"
+FAULT = Explanation(verdict=CORRECTED, text="A factor {factor} is missing.")
+CAMERA = Explanation(verdict=REFUTED, text="The camera is another one.")
 
 
 def check(identifier: str = "001.table3.a", printed: float | None = 1.0, tolerance: float = 0.1, **more) -> Check:
-    told = {"separation": 0.5, "alternative": "half"} | more
-    return Check(identifier, "Table 3", f"Statement of {identifier}", "arcsec", printed, tolerance, "a reason", **told)
+    told = {"tells": 0.5, "against": "half", "explanations": (FAULT, CAMERA)} | more
+    return Check(
+        id=identifier, equation="Table 3", statement=f"Statement of {identifier}", unit="arcsec", printed=printed,
+        tolerance=tolerance, because="a reason", **told,
+    )  # fmt: skip
 
 
 def answers(context: Context):
@@ -148,7 +153,7 @@ def test_ids_are_unique_and_belong_to_a_paper():
     with pytest.raises(ValueError, match=r"twice: 001\.table3"):
         select((GOOD, GOOD), None)
     for wrong in ("002.x", "001", "001.", "001..x", "001.a b", "001.a-b"):
-        with pytest.raises(ValueError, match="check id"):
+        with pytest.raises(ValueError, match="not an id of a check"):
             check(wrong)
     with pytest.raises(ValueError, match="another paper"):
         CheckGroup("004.x", "", 1.0, (check("001.x"),), answers)
@@ -200,9 +205,6 @@ def test_help_says_what_a_verdict_means():
 
 # --- verdicts ---------------------------------------------------------------------------------------------------------
 
-FAULT = Explanation(2.0, CORRECTED, "A factor 2 is missing.")
-CAMERA = Explanation(3.0, REFUTED, "The camera is another one.")
-
 
 @pytest.mark.parametrize(
     ("measured", "sigma", "verdict"),
@@ -218,7 +220,7 @@ CAMERA = Explanation(3.0, REFUTED, "The camera is another one.")
     ],
 )
 def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
-    result = check().evaluate(measured, sigma, "Measured.", explanations=[FAULT, CAMERA])
+    result = check().evaluate(measured, sigma, "Measured.", explained=[2.0, 3.0], factor=2)
     assert result.verdict == verdict
     assert (result.measured, result.sigma, result.printed) == (measured, sigma, 1.0)
     assert ("factor 2 is missing" in result.how) == (verdict == CORRECTED)
@@ -244,9 +246,8 @@ def test_a_row_says_which_sides_of_its_claim_it_compares(comparison, said, fake,
 
     def one(context: Context):
         yield context.check("001.eq5").evaluate(1.0, 0.01, "Read.")
-        yield context.check("001.eq8").not_checkable("No number is printed.")
 
-    silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
+    silent = check("001.eq8", printed=None, not_checkable="No number is printed.")
     fake(CheckGroup("001.formulas", "", 1.0, (check("001.eq5", comparison=comparison), silent), one))
     assert json.loads(run("--list", "--json").stdout)["checks"][0]["comparison"] == comparison
     found = run("--out", tmp_path / "run")
@@ -273,13 +274,13 @@ def test_a_number_that_is_not_printed_needs_one_that_is_implied():
 
 
 def test_what_the_text_does_not_print_is_not_checked():
-    result = check(expected=NOT_CHECKABLE).not_checkable("The table is lost.")
+    result = check(not_checkable="The table is lost.").without_comparison()
     assert (result.verdict, result.measured, result.how) == (NOT_CHECKABLE, None, "The table is lost.")
 
 
-@pytest.mark.parametrize("verdict", ["fine", FAILED])
-def test_only_a_verdict_can_be_expected(verdict):
-    with pytest.raises(ValueError, match="no verdict to expect"):
+@pytest.mark.parametrize(("verdict", "words"), [("fine", "Input should be"), (FAILED, "no verdict to expect")])
+def test_only_a_verdict_can_be_expected(verdict, words):
+    with pytest.raises(ValueError, match=words):
         check(expected=verdict)
 
 
@@ -288,7 +289,7 @@ def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path)
 
     def run_both(context: Context):
         yield context.check("001.eq5").evaluate(1.0, None, "Right as printed.")
-        yield context.check("001.eq7").evaluate(2.0, None, "Twice.", explanations=[FAULT])
+        yield context.check("001.eq7").evaluate(2.0, None, "Twice.", explained=[2.0], factor=2)
 
     known = (check("001.eq5", expected=CORRECTED), check("001.eq7", expected=CORRECTED))
     fake(CheckGroup("001.formulas", "Formulas", 1.0, known, run_both))
@@ -325,32 +326,32 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
     assert result.verdict == verdict
     assert result.power == pytest.approx(0.1 + 3 * sigma)
     assert ("half is 0.5 away" in result.how) == (verdict == UNDECIDED)
-    assert check().evaluate(2.0, sigma, "", explanations=[FAULT]).verdict == corrected
+    assert check().evaluate(2.0, sigma, "", explained=[2.0], factor=2).verdict == corrected
     # what does not agree is found, however weak the row
-    assert check().evaluate(3.0, sigma, "", explanations=[CAMERA]).verdict == REFUTED
+    assert check().evaluate(3.0, sigma, "", explained=[None, 3.0]).verdict == REFUTED
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ({"separation": None}, "what the row tells"),
-        ({"separation": 0.0}, "what the row tells"),
-        ({"alternative": ""}, "what the row tells"),
-        ({"separation": 0.09}, "can never tell"),
-        ({"basis": "theory"}, "a theory is named"),
-        ({"theory": "optics"}, "a theory is named"),
-        ({"basis": "theory", "theory": "optics"}, "nothing is printed"),
-        ({"also": ("002.x",)}, "check id"),
+        ({"tells": None}, "what the row tells"),
+        ({"tells": 0.0}, "greater than 0"),
+        ({"against": ""}, "what the row tells"),
+        ({"tells": 0.09}, "can never tell"),
+        ({"basis": "theory"}, "not what the row rests on"),
+        ({"basis": "printed", "theory": "optics"}, "not what the row rests on"),
+        ({"theory": "optics"}, "not what the row rests on"),
+        ({"also": ("002.x",)}, "not an id of a check"),
     ],
 )
 def test_a_row_says_beforehand_what_it_tells(more, words):
     with pytest.raises(ValueError, match=words):
         check(**more)
-    assert check(expected=NOT_CHECKABLE, separation=None, alternative="").separation is None
+    assert check(not_checkable="It is lost.", tells=None, against="").expected == NOT_CHECKABLE
 
 
 def test_the_verdict_of_agreement_is_that_of_the_rows_basis():
-    reproduced, theory = check(basis="chosen"), check(printed=None, basis="theory", theory="optics")
+    reproduced, theory = check(basis="chosen"), check(printed=None, theory="optics")
     light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
     result = reproduced.evaluate(1.0, None, "", inputs=[light])
     assert (check().expected, reproduced.expected, theory.expected) == (CONFIRMED, REPRODUCED, CONSISTENT)
@@ -404,7 +405,7 @@ def test_the_limits_of_an_input_for_a_reader():
 
 def test_a_row_of_two_equations_fails_with_either():
     row = check(also=("001.eq6",), expected=CORRECTED)
-    right, wrong = (row.evaluate(v, None, "", explanations=[FAULT]) for v in (2.0, 1.0))
+    right, wrong = (row.evaluate(v, None, "", explained=[2.0], factor=2) for v in (2.0, 1.0))
     assert row.worse(right, right) is right
     assert row.worse(right, wrong) is row.worse(wrong, right) is wrong
 
@@ -421,7 +422,7 @@ def test_a_row_is_found_by_all_its_ids(fake, tmp_path):
 
 
 def test_what_neither_agrees_nor_is_explained_can_be_told():
-    result = check().evaluate(3.0, None, "", otherwise="Text and table contradict each other.")
+    result = check(otherwise="Text and table contradict each other.").evaluate(3.0, None, "")
     assert (result.verdict, result.how.splitlines()[0]) == (REFUTED, "Text and table contradict each other.")
 
 
@@ -518,12 +519,11 @@ def test_the_report_shows_everything_and_needs_nothing_from_outside(fake, tmp_pa
 
 def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
     def one(context: Context):
-        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explanations=[FAULT])
-        yield context.check("001.eq8").not_checkable("No number is printed.")
+        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explained=[2.0], factor=2)
         light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
         yield context.check("001.eq9").evaluate(1.0, 0.02, "Dim.", 1.0, inputs=[light])
 
-    silent = check("001.eq8", printed=None, expected=NOT_CHECKABLE)
+    silent = check("001.eq8", printed=None, not_checkable="No number is printed.")
     chosen = check("001.eq9", printed=None, basis="chosen")
     fake(GOOD, CheckGroup("001.formulas", "", 1.0, (check("001.eq5", expected=CORRECTED), silent, chosen), one))
     assert run("--out", tmp_path / "run").exit_code == 0
@@ -657,7 +657,7 @@ def sleep(context):
     time.sleep(60)
     yield
 
-check = Check("001.slow", "", "", "1", 1.0, 0.1, "", separation=1.0, alternative="none")
+check = Check(id="001.slow", equation="", statement="", printed=1.0, tolerance=0.1, tells=1.0, against="none")
 registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (check,), sleep),)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)

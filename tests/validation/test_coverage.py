@@ -32,7 +32,7 @@ def test_every_statement_is_a_sentence_with_its_source():
     for check in CHECKS.values():
         assert len(check.statement) > 15, check.id
         assert re.search(r"section|eq|Table|Fig|abstract|text", check.equation), check.id
-        assert len(check.reason) > 10, check.id
+        assert len(check.because) > 10, check.id
 
 
 def test_no_two_checks_are_the_same():

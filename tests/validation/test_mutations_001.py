@@ -347,7 +347,7 @@ def test_every_formula_is_broken():
     rows = {
         match.group()
         for module in (formulas, joint, budget_checks)
-        for check in module.CHECKS
+        for check in module.GROUP.checks
         for name in check.names
         if (match := re.match(r"001\.eq\d+", name))
     }

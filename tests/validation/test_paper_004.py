@@ -102,7 +102,7 @@ def test_what_is_compared():
         assert (check.printed, check.unit, check.comparison) == (pytest.approx(printed), unit, comparison)
         assert check.expected == expected
         assert check.tolerance == pytest.approx(tolerance, rel=1e-3)
-        assert len(check.reason) > 5
+        assert len(check.because) > 5
 
 
 @pytest.mark.parametrize("prefix", ["eq1", "eq2", "eq3", "eq4", "table1", "table2", "turntable", "alignment"])

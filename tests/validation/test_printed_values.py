@@ -1,4 +1,4 @@
-"""What papers print, read from YAML: as printed, and with an error that says where."""
+"""What papers print and the rows that compare it, read from YAML: as printed, and with an error that says where."""
 
 import re
 from pathlib import Path
@@ -7,6 +7,7 @@ import pytest
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import parse_yaml
+from twin.validation.checks.chosen import Supposed
 from twin.validation.checks.printed import FILE, Printed, load_printed
 from twin.validation.registry import GROUPS
 
@@ -57,7 +58,7 @@ def test_a_paper_without_a_file() -> None:
 
 def test_the_papers_files() -> None:
     """Their numbers are those of the checks; Table 2 of paper 004 has its 55 points, twice."""
-    assert {path.name[-3:] for path in FOLDERS if (path / FILE).exists()} == {"000", "001", "004"}
+    assert {path.name[-3:] for path in FOLDERS if (path / FILE).exists()} == {"000", "001", "003", "004"}
     printed = {check.id: check.printed for group in GROUPS for check in group.checks}
     assert printed["001.table4.together"] == load_printed("001").number("table4.spot_arcsec") == 0.145
     assert printed["004.table1.B3"] == load_printed("004").numbers("table1.mtf_nyquist")["B3"] == 0.37
@@ -68,3 +69,73 @@ def test_the_papers_files() -> None:
         columns = load_printed("001").columns(f"table2.{rows}")
         assert list(columns) == ["X", "Y", "Z"]
         assert {len(column) for column in columns.values()} == {11}
+
+
+ROWS = """table1:
+  size_um: 2.3
+groups:
+  001.sizes:
+    title: Sizes
+    seconds: 2.0
+    rows:
+      001.table1.size:
+        equation: Table 1
+        statement: The size is as printed
+        unit: µm
+        printed: table1.size_um
+        tolerance: 0.1
+        because: a twentieth
+        comparison: at most
+        tells: 1.0
+        against: half of it
+        basis: chosen
+        explanations:
+          - verdict: refuted
+            text: It is {what} as large.
+      001.fig1:
+        equation: Fig. 1
+        statement: It is a drawing
+        not_checkable: Nothing is printed.
+"""
+
+
+def test_rows() -> None:
+    """The keys of a row are those of `Check`; the number is where the key says; what follows is left out."""
+    group = Printed(parse_yaml(ROWS, "paper.yaml")).group("001.sizes", lambda context: ())
+    size, figure = group.checks
+    assert (group.title, group.seconds, group.fast_seconds, group.ids) == (
+        "Sizes", 2.0, None, ("001.table1.size", "001.fig1"),
+    )  # fmt: skip
+    assert (size.printed, size.tolerance, size.comparison, size.expected) == (2.3, 0.1, "at most", "reproduced")
+    assert (figure.printed, figure.unit, figure.expected) == (None, "1", "not checkable")
+    assert (
+        "It is twice as large."
+        in size.evaluate(4.6, None, "", explained=[4.6], inputs=[Supposed("on Earth", "")], what="twice").how
+    )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("tolerance: 0.1", "tolerence: 0.1", r"paper\.yaml:13: groups\..*tolerence: unknown key.*'tolerance'"),
+        ("tolerance: 0.1", "tolerance: 10 %", r"paper\.yaml:13: groups\..*tolerance: not a number"),
+        ("tolerance: 0.1", "tolerance: 1.5", r"paper\.yaml:13: groups\..*tolerance: can never tell that"),
+        ("comparison: at most", "comparison: below", r"paper\.yaml:15: groups\..*comparison: not one of the choices"),
+        ("        equation: Table 1\n", "", r"paper\.yaml:8: groups\..*'equation' is missing"),
+        (
+            "printed: table1.size_um",
+            "printed: table1.size_mm",
+            r"paper\.yaml:1: table1: nothing is printed as 'size_mm'",
+        ),
+        ("verdict: refuted", "verdict: confirmed", r"paper\.yaml:20: groups\..*verdict: not one of the choices"),
+        ("001.fig1:", "002.fig1:", r"paper\.yaml:22: groups\..*not an id of a check"),
+        ("seconds: 2.0", "seconds: 0", r"paper\.yaml:6: groups\.001\.sizes\.seconds: outside the limits"),
+        ("groups:", "group:", r"paper\.yaml:1: groups: 'groups' is missing"),
+        ("001.sizes:", "001.size:", r"paper\.yaml: groups: no group '001\.sizes'.*'001\.size'"),
+    ],
+)
+def test_faults_of_rows_are_said_with_file_and_key(old: str, new: str, words: str) -> None:
+    assert old in ROWS
+    with pytest.raises(InputError) as error:
+        Printed(parse_yaml(ROWS.replace(old, new, 1), "paper.yaml")).group("001.sizes", lambda context: ())
+    assert re.search(words, str(error.value)), str(error.value)
