@@ -29,7 +29,7 @@ from twin.laboratory.autocollimator_bench import (
 )
 from twin.laboratory.autocollimator_images import window_pattern
 from twin.validation.paper_001 import table2
-from twin.validation.paper_001.table2_plot import bench_png
+from twin.validation.paper_001.table2 import bench_png
 
 ARCSEC = math.pi / 648000
 SETUP = load_autocollimator_test()

@@ -32,9 +32,11 @@ from twin.validation.checks.check import (
     VERDICTS,
     Check,
     CheckResult,
+    Chosen,
     Explanation,
+    InputRange,
+    Supposed,
 )
-from twin.validation.checks.chosen import Chosen, InputRange, Supposed
 from twin.validation.checks.group import CheckGroup, Context, matches
 from twin.validation.registry import UnknownCheck, select
 from twin.validation.runner import run_checks
@@ -649,7 +651,7 @@ SLOW = """
 import runpy, signal, sys, time
 from twin.validation import registry
 from twin.validation.checks.check import Check
-from twin.validation.checks.chosen import Chosen, InputRange, Supposed
+from twin.validation.checks.check import Chosen, InputRange, Supposed
 from twin.validation.checks.group import CheckGroup
 
 def sleep(context):

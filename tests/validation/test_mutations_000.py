@@ -21,7 +21,7 @@ from tests.validation.undrawn import undrawn
 from twin.orbit.angle import angle_flight as flight_module
 from twin.validation.checks.check import VERDICTS
 from twin.validation.checks.group import Context
-from twin.validation.paper_000 import equations_000, figures, uses
+from twin.validation.paper_000 import equations_000, figures, suppositions
 from twin.validation.paper_000.passes import planes_of
 from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
@@ -43,8 +43,8 @@ def drawn():
     return {
         "equations": replace(made, measured=made.measured[:120]),
         "figures": figures.make_passes(context, count=2),
-        "uses": uses.make_passes(context),
-        "off_axis": uses.off_axis_passes(context),
+        "uses": suppositions.height_passes(context),
+        "off_axis": suppositions.off_axis_passes(context),
     }
 
 
@@ -53,8 +53,8 @@ def quick(drawn, monkeypatch):
     """The groups on these measurements, without pictures."""
     monkeypatch.setattr(equations_000, "make_passes", lambda _: drawn["equations"])
     monkeypatch.setattr(figures, "make_passes", lambda *_, **__: drawn["figures"])
-    monkeypatch.setattr(uses, "make_passes", lambda _: drawn["uses"])
-    monkeypatch.setattr(uses, "off_axis_passes", lambda _: drawn["off_axis"])
+    monkeypatch.setattr(suppositions, "height_passes", lambda _: drawn["uses"])
+    monkeypatch.setattr(suppositions, "off_axis_passes", lambda _: drawn["off_axis"])
     monkeypatch.setattr(figures, "_places", lambda _: {})
     monkeypatch.setattr(figures, "_show", lambda *_: None)
     return monkeypatch
@@ -201,7 +201,7 @@ MUTATIONS = {
         angles(lambda n, a: np.arccos(np.cos(a).astype(np.float32)).astype(float)), ["000.eq6.arccos"],
     ),
     ("000.eq6", "off axis, factor 2"): (
-        angles(lambda n, a: 2 * a, uses, "off_axis_angle"), ["000.outlook.unsigned"],
+        angles(lambda n, a: 2 * a, suppositions, "off_axis_angle"), ["000.outlook.unsigned"],
     ),
     ("000.eq7", "sign"): (angles(lambda n, a: np.array([a[0], np.pi - a[1]])), ["000.eq7"]),
     ("000.eq7", "factor 2"): (angles(lambda n, a: np.array([a[0], 2 * a[1]])), ["000.eq7"]),

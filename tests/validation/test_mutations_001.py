@@ -28,7 +28,7 @@ from twin.laboratory import autocollimator_bench
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.checks.check import REPRODUCED, UNDECIDED
 from twin.validation.checks.group import Context
-from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_images, joint, monitored_errors, table2
+from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_images, joint, table2
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
@@ -286,7 +286,7 @@ MUTATIONS = (
     Mutation("001.table5.d_gamma", "spots taken as one", "budget_checks",
              "001.table5.d_beta.propagated 001.table5.d_alpha.propagated 001.table5.d_gamma.propagated "
              "001.table5.d_f.propagated 001.table5.d_f.by_table1",
-             formula(monitored_errors, "_TABLE_4", lambda sound: sound * np.sqrt(2))),
+             formula(budget_checks, "_TABLE_4", lambda sound: sound * np.sqrt(2))),
     Mutation("001.table2", "sine for cosine about Y", "table2", f"001.table2.y 001.table2.relation.y {LIMITS}",
              relation(lambda axis, unit, b, sound: np.sin(b) if (axis, unit) == ("Y", 2) else sound)),
     Mutation("001.table2", "cosine for sine about Z", "table2",

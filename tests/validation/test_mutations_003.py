@@ -25,7 +25,7 @@ from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.latitude import fitted
 from twin.run.random_streams import stream
 from twin.validation import registry
-from twin.validation.paper_003 import exact, flights, model, rendered, stability
+from twin.validation.paper_003 import exact, fields, flights, model, rendered
 from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_light
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
@@ -183,7 +183,7 @@ def of_differences(change):
         return replace(found, rms=rms, white_sigma=rms / np.sqrt(20.0))
 
     def patch(monkeypatch):
-        monkeypatch.setattr(stability, "third_difference", broken)
+        monkeypatch.setattr(fields, "third_difference", broken)
 
     return patch
 

@@ -25,7 +25,7 @@ from twin.laboratory.focus_alignment import align
 from twin.laboratory.focus_bench import FocusBench
 from twin.validation import registry
 from twin.validation.checks.check import FAILED
-from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, orientation
+from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
@@ -90,7 +90,7 @@ def eq1(change):
         return np.asarray(change(np.asarray(where), f * t, p * t**2))
 
     def patch(monkeypatch):
-        monkeypatch.setattr(orientation, "distortion", broken)
+        monkeypatch.setattr(equations_004, "distortion", broken)
 
     return patch
 
@@ -103,8 +103,7 @@ def eq2(change):
         return change(np.sum(where * t), np.sum(where * t**2), *(np.sum(t**k) for k in (2, 3, 4)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations_004):
-            monkeypatch.setattr(module, "principal_distance_and_point", broken)
+        monkeypatch.setattr(equations_004, "principal_distance_and_point", broken)
 
     return patch
 
@@ -122,8 +121,7 @@ def eq3(change):
         return np.asarray(change(np.sum(where * t, axis=-1), np.sum(t**2, axis=-1)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations_004):
-            monkeypatch.setattr(module, "principal_distance", broken)
+        monkeypatch.setattr(equations_004, "principal_distance", broken)
 
     return patch
 
@@ -136,8 +134,7 @@ def eq4(change):
         return np.asarray(change(f * np.sum(t**3), np.sum(where * t**2), np.sum(t**4)))
 
     def patch(monkeypatch):
-        for module in (orientation, equations_004):
-            monkeypatch.setattr(module, "principal_point", broken)
+        monkeypatch.setattr(equations_004, "principal_point", broken)
 
     return patch
 

@@ -12,7 +12,7 @@ from optics.numerics.backend import load_backend
 from twin.validation import registry
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED, UNDECIDED
 from twin.validation.paper_004 import distortion_checks, focus_checks, turntable_checks
-from twin.validation.paper_004.orientation import Perspective
+from twin.validation.paper_004.equations_004 import Perspective
 from twin.validation.paper_004.turntable_checks import FittedTable
 from twin.validation.registry import select
 from twin.validation.runner import run_checks

@@ -9,17 +9,17 @@ from dataclasses import dataclass
 from scenes.yaml.errors import nearest
 from twin.validation.checks.group import CheckGroup, matches
 from twin.validation.checks.printed import group_of
-from twin.validation.paper_000 import equations_000, figures, suppositions, table1, uses
+from twin.validation.paper_000 import equations_000, figures, suppositions, table1
 from twin.validation.paper_001 import budget_checks, formulas, joint, ranges, table2
 from twin.validation.paper_003 import fields, model
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
 
 GROUPS: tuple[CheckGroup, ...] = (
     equations_000.GROUP,
-    suppositions.GROUP,
+    suppositions.SUPPOSITIONS,
     table1.GROUP,
     figures.GROUP,
-    uses.GROUP,
+    suppositions.USES,
     formulas.GROUP,
     ranges.GROUP,
     joint.GROUP,

@@ -25,7 +25,7 @@ from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.payload_changes import changed_payload
 from twin.orbit.flight.sensor import Platform, Sensor
-from twin.validation.checks.chosen import Chosen
+from twin.validation.checks.check import Chosen
 
 FIELDS, IMAGES, STRIP = "calibrate.yaml", "calibrate_images.yaml", "calibrate_strip.yaml"
 """Files of scenes/orbit: seven fields of drawn points; fields of rendered images; passes with tie points."""

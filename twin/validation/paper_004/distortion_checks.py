@@ -1,4 +1,4 @@
-"""Paper 004, section 3.3: distortion tests from rendered spots, for Table 2 and for equations (1) to (4)."""
+"""Paper 004, section 3.3: distortion tests from rendered spots, Table 2, equations (1) to (4), sources of error."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.units import ARCSEC
+from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.lab_setup import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure, rms
 from twin.run.artefact import Cell, SvgFigure, Table
-from twin.validation.checks.check import Check, CheckResult, mean_of, median_of
+from twin.run.svg import BLUE, GREY, INK, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of, median_of
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import group_of, load_printed
-from twin.validation.paper_004 import orientation, sensitivity_checks
-from twin.validation.paper_004.orientation import POINTS, SpotTest, evaluate_equations
-from twin.validation.paper_004.plots_004 import points_svg, reduction_svg
-from twin.validation.paper_004.turntable_checks import dividing
+from twin.validation.paper_004 import equations_004
+from twin.validation.paper_004.equations_004 import ACCURACY_UM, POINTS, SpotTest, evaluate_equations, rendered
+from twin.validation.paper_004.turntable_checks import FIT_RMS_ARCSEC, dividing
 
 Array = NDArray[np.float64]
 TEST = "distortion"
@@ -39,8 +41,8 @@ def run(context: Context) -> Iterator[CheckResult]:
         return
     runs = measured_tests(context)
     yield from evaluate_equations(context, runs)
-    yield from sensitivity_checks.evaluate_sensitivity(context, runs)
-    yield sensitivity_checks.evaluate_angles(context.check("004.turntable.compensated"), runs)
+    yield from evaluate_sensitivity(context, runs)
+    yield evaluate_angles(context.check("004.turntable.compensated"), runs)
     yield _accuracy(context.check("004.table2.accuracy"), runs)
     yield _compensation(context.check("004.table2.compensation"), runs)
     yield _points(context.check("004.table2.points"), runs)
@@ -197,7 +199,7 @@ def _show(context: Context, runs: Sequence[SimulatedDistortion]) -> None:
             "A point per simulated test. Left: p of (2) follows the error of the zero of W; the line is what the "
             "traced camera makes of it. Right: with a constant beside (2), error bars one stated sigma; the traced "
             "camera's p is zero on this scale, and a pixel is thinner than the line.",
-            points_svg(*orientation.principal_points(tests)),
+            points_svg(*equations_004.principal_points(tests)),
         )
     )
 
@@ -210,6 +212,149 @@ def _statistics(raw: Array, compensated: Array) -> list[Cell]:
         values = np.median(before), np.median(after), np.median(100.0 * (1.0 - after / before))
         out += [f"{values[0]:.3f}", f"{values[1]:.3f}", f"{values[2]:.1f}"]
     return out
+
+
+FEW = 5
+"""Every fifth point, for the effect of their number."""
+
+
+def evaluate_sensitivity(context: Context, runs: Sequence[SimulatedDistortion]) -> Iterator[CheckResult]:
+    """The rows of the sources of error."""
+    if not context.wants("004.sensitivity"):
+        return
+    tests = [SpotTest(run) for run in runs]
+    count = len(tests)
+    half = np.flatnonzero(np.abs(tests[0].run.bench.turn) <= 0.5 * tests[0].run.bench.turn[-1])
+    whole = slice(None)
+    raw = [np.asarray(t.run.raw.fit.angle) for t in tests]
+    all_raw, inner = (np.array([t.errors(w, k) for t, w in zip(tests, raw, strict=True)]) for k in (whole, half))
+    own = np.array([t.errors(t.turn, whole)[1] for t in tests])
+    spots = np.array([t.errors(t.true_turn, whole)[1] for t in tests])
+    share = 100.0 * (1.0 - rms(spots) ** 2 / rms(own) ** 2)
+    how = (
+        f"{rendered(tests)}. With compensated angles D errs by {UM * rms(own):.2f} µm RMS, with the true angles and "
+        f"the same images by {UM * rms(spots):.2f} µm; with angles as read by {UM * rms(all_raw[:, 1]):.2f} µm."
+    )
+    by_spots, by_angles = rms(spots) ** 2, rms(own) ** 2 - rms(spots) ** 2
+    chosen = Chosen(
+        "dividing error of scenes/lab/turntable.yaml, times", 1.0, "1",
+        lambda factor: 100.0 * (1.0 - by_spots / (by_spots + factor**2 * by_angles)),
+    )  # fmt: skip
+    yield context.check("004.sensitivity.angle").evaluate(share, None, how, 50.0, inputs=[chosen])
+    for name, column, over, under in (("field", 1, all_raw, inner), ("distance", 0, inner, all_raw)):
+        top, bottom = rms(over[:, column]), rms(under[:, column])
+        unit, scale = ("µm", UM) if column else ("mm", MM)
+        how = f"{count} tests of {POINTS} points; {len(half)} of them lie in the inner half: {scale * top:.3g} "
+        how += f"against {scale * bottom:.3g} {unit} RMS."
+        yield context.check(f"004.sensitivity.{name}").evaluate(top / bottom, _ratio(over, under, column), how, 1.0)
+    few = np.array([[t.errors(t.turn, slice(k, None, FEW))[0] for k in range(FEW)] for t in tests])
+    every = np.array([t.errors(t.turn, whole)[0] for t in tests])
+    gain = rms(few) / rms(every)
+    how = (
+        f"{count} tests, angles compensated: RMS error of f {MM * rms(every):.3f} mm with {POINTS} points, "
+        f"{MM * rms(few):.3f} mm with {POINTS // FEW}. Independent errors would gain {FEW**0.5:.2f}; what the "
+        "compensation leaves is common to neighbouring points and gains nothing."
+    )
+    yield context.check("004.sensitivity.points").evaluate(gain, None, how, 1.0)
+    yield _requirement(context, tests)
+
+
+def _ratio(over: Array, under: Array, column: int) -> float:
+    """Standard deviation of a ratio of RMS over tests, by leaving one out at a time."""
+    n = len(over)
+    keep = ~np.eye(n, dtype=bool)
+    values = np.array([rms(over[k, column]) / rms(under[k, column]) for k in keep])
+    return float(np.sqrt((n - 1) * np.var(values)))
+
+
+def evaluate_angles(check: Check, runs: Sequence[SimulatedDistortion]) -> CheckResult:
+    """What is left of the dividing error in the angles of the tests."""
+    tests = [SpotTest(run) for run in runs]
+    own, raw = (
+        np.array([np.std(angle(t) - t.true_turn) for t in tests]) / ARCSEC
+        for angle in (lambda t: t.turn, lambda t: t.run.raw.fit.angle)
+    )
+    how = (
+        f"{len(tests)} tests, angles of {POINTS} points against the true ones: median {np.median(own):.3f}″; "
+        f"angles as read {np.median(raw):.3f}″, largest {np.max(raw):.3f}″. What all points share is the zero, see "
+        "004.eq1.constant."
+    )
+    value = float(np.max(own))
+    return check.evaluate(value, None, how, inputs=[dividing(value)])
+
+
+def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
+    rng = np.random.default_rng(np.random.SeedSequence(context.seed, spawn_key=(1,)))
+    wrong = FIT_RMS_ARCSEC * ARCSEC
+    error = [t.errors(t.true_turn + rng.normal(0.0, wrong, len(t.turn)), slice(None))[1] for t in tests]
+    f, points = float(np.mean([t.camera.f for t in tests])), len(tests[0].turn)
+    expected = f * wrong * np.sqrt(1.0 - 3.0 / points)
+    how = (
+        f"The rendered spots of {len(tests)} tests with their true angles and errors of {FIT_RMS_ARCSEC:g}″ drawn from "
+        "point to point; constant, f and p fitted. Errors with long waves would leave less."
+    )
+    needed = FIT_RMS_ARCSEC * ACCURACY_UM / (UM * expected)
+    sigma = UM * expected / np.sqrt(2.0 * points * len(tests))
+    return context.check("004.sensitivity.requirement").evaluate(
+        UM * rms(np.array(error)), sigma, how, None, [UM * expected], asked=FIT_RMS_ARCSEC, needed=needed
+    )
+
+
+def reduction_svg(errors: NDArray[np.float64], paper: tuple[float, float], reduction: float) -> str:
+    """RMS with compensated over RMS with raw angles, micrometres.
+
+    Args:
+        errors: of each test (T, 2), raw and compensated.
+        paper: the same of the paper's Table 2.
+        reduction: that the paper claims.
+    """
+    with look("reduction-004"):
+        figure = new_figure(4.2)
+        axes = figure.subplots()
+        top = 1.08 * max(float(np.max(errors)), *paper)
+        ends = np.array([0.0, top])
+        share = 1.0 - reduction
+        axes.plot(ends, ends, color=GREY, lw=0.8)
+        axes.plot(ends, share * ends, color=GREY, lw=0.8, ls="--")
+        for slope, text in ((1.0, "no change"), (share, f"{100 * reduction:.0f} % lower, as printed")):
+            axes.annotate(text, (top, slope * top), (4, 0), textcoords="offset points", va="center", color=GREY)
+        axes.plot(*errors.T, "o", color=BLUE, ms=6.0, mec="white", mew=0.6, label="simulated test, error")
+        axes.plot([paper[0]], [paper[1]], "s", color=INK, ms=7.0, label="paper 004, Table 2")
+        axes.set_xlim(0.0, top)
+        axes.set_ylim(0.0, top)
+        axes.set_xlabel("RMS, angles as read [µm]")
+        axes.set_ylabel("RMS, compensated angles [µm]")
+        axes.legend(loc="upper left")
+        plain_axes(axes)
+        return to_svg(figure)
+
+
+def points_svg(by_eq2: NDArray[np.float64], free: NDArray[np.float64]) -> str:
+    """Principal points of T tests.
+
+    Args:
+        by_eq2: error of the zero in arcsec, p of (2) and p that the zero explains in mm, (T, 3).
+        free: p with a constant term and its sigma, mm, (T, 2).
+    """
+    with look("principal-point-004"):
+        figure = new_figure(3.6)
+        left, right = figure.subplots(1, 2)
+        zero, found, explained = by_eq2[np.argsort(by_eq2[:, 0])].T
+        left.plot(zero, explained, color=GREY, lw=0.9, label="traced camera, zero wrong by so much")
+        left.plot(zero, found, "o", color=BLUE, ms=5.0, mec="white", mew=0.5, label="p of (2), rendered spots")
+        left.set_xlabel("error of the zero of W [arcsec]")
+        left.set_ylabel("p [mm]")
+        left.set_title("(2) as printed")
+        left.legend(loc="best")
+        number = np.arange(1, len(free) + 1)
+        right.axhline(0.0, color=INK, lw=0.7)
+        right.errorbar(number, free[:, 0], free[:, 1], fmt="o", color=VERMILION, ms=4.0, lw=0.9)
+        right.set_xlabel("test")
+        right.set_ylabel("p [mm]")
+        right.set_title("with a constant term")
+        for axes in (left, right):
+            plain_axes(axes)
+        return to_svg(figure)
 
 
 GROUP = group_of("004.distortion", run)

@@ -24,12 +24,11 @@ from twin.laboratory.focus_alignment import Alignment, State, align, line_turn, 
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import NYQUIST
 from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.svg import AFTER, BEFORE, INK, LIGHT, look, new_figure, plain_axes, to_svg
 from twin.targets.edge_images import TRACK
-from twin.validation.checks.check import Check, CheckResult, mean_of
-from twin.validation.checks.chosen import Chosen
+from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import group_of, load_printed
-from twin.validation.paper_004.plots_004 import alignment_svg
 
 Array = NDArray[np.float64]
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
@@ -390,6 +389,40 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
             alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN),
         )
     )
+
+
+def alignment_svg(far: NDArray[np.float64], turns: NDArray[np.float64], far_bound: float, turn_bound: float) -> str:
+    """Alignments before and after.
+
+    Args:
+        far: largest distance from best focus of each state, mm, (A, S).
+        turns: of the line, arcmin, (A, S).
+        far_bound: what the paper reached, mm.
+        turn_bound: what it reached, arcmin.
+    """
+    with look("alignments-004"):
+        figure = new_figure(3.6)
+        for axes, values, bound, label in zip(
+            figure.subplots(1, 2),
+            (far, turns),
+            (far_bound, turn_bound),
+            ("farthest CCD from best focus [mm]", "turn of the line [arcmin]"),
+            strict=True,
+        ):
+            number = np.arange(1, len(values) + 1)
+            axes.axhspan(1e-4, bound, color=LIGHT, alpha=0.6, lw=0)
+            axes.vlines(number, values[:, -1], values[:, 0], color=LIGHT, lw=1.0)
+            axes.plot(number, values[:, 0], "o", color=BEFORE, ms=6.0, mec=INK, mew=0.4, label="before")
+            axes.plot(number, values[:, -1], "D", color=AFTER, ms=5.0, label="after one round")
+            axes.set_yscale("log")
+            axes.set_ylim(0.4 * float(np.min(values)), 2.5 * float(np.max(values)))
+            axes.set_xlim(0.3, len(values) + 0.7)
+            axes.set_xticks(number)
+            axes.set_xlabel("alignment")
+            axes.set_ylabel(label)
+            plain_axes(axes)
+        figure.axes[0].legend(loc="best")
+        return to_svg(figure)
 
 
 def _second_round(alignment: Alignment) -> float:
