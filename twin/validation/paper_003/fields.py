@@ -18,12 +18,12 @@ from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.validation.checks.check import CheckResult, Chosen, mean_of
+from twin.validation.checks.check import CheckResult, Chosen, mean_of, median_of
 from twin.validation.checks.group import Context
 from twin.validation.checks.printed import group_of
 from twin.validation.paper_003 import flights as flown_fields
 from twin.validation.paper_003.exact import FIELDS, all_errors, changed, setup_of, without_light
-from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of, median
+from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of
 
 _EDGE = 1e-9
 SLOW = 1.5 * ARCSEC, 10.0
@@ -104,7 +104,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
     errors, passes = setup.test.errors, found.orbit.shape[0] * found.orbit.shape[1]
     if "003.table2" in context.selected:
         ratios = np.array([v.max(axis=1) / v.min(axis=1) for v in (found.orbit, found.attitude)])
-        worst, sigma = median(ratios.max(axis=(0, 2)))
+        worst, sigma = median_of(ratios.max(axis=(0, 2)))
         orbit, attitude = (float(np.sqrt(np.mean(v**2))) for v in (found.orbit, found.attitude))
         how = (
             f"{passes} passes of {len(campaigns)} campaigns, measured orbit once a second and attitude eight times; "
@@ -168,7 +168,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
     error = (flights.bias - flights.true_bias) / ARCSEC
     for k, axis in enumerate(BIAS):
         if f"003.table3.{axis}" in context.selected:
-            value, sigma = median(scatter[:, k])
+            value, sigma = median_of(scatter[:, k])
             rms = float(np.sqrt(np.mean(error[:, :, k] ** 2)))
             how = (
                 f"{_campaigns(flights)}. Median of the scatter; that of the true biases is "
@@ -186,7 +186,7 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
             f"{ratio:.1f} times the adjustment's sigmas, for these count neither the orbit's slow error, 0.3 m or "
             "0.12″, nor that readings are shared."
         )
-        value, sigma = median(values)
+        value, sigma = median_of(values)
         yield context.check("003.table3.truth").evaluate(value, sigma, how, inputs=[all_errors(value)])
     if "003.table3.latitude" in context.selected:
         significance = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
@@ -232,7 +232,7 @@ def _interior(context: Context, flights: Flights, number: int, parts: tuple[str,
         f"campaigns. The adjustments claim {each}; the scatter is {ratio:.2f} of that, as it must be for an interior "
         f"that is the same in all fields. Which of Tables 4 and 5 holds the {what} is not in the text."
     )
-    value, sigma = median(rms)
+    value, sigma = median_of(rms)
     return context.check(f"003.table{number}").evaluate(value, sigma, how, inputs=[all_errors(value)])
 
 

@@ -9,19 +9,20 @@ from functools import partial
 import numpy as np
 
 from analysis.orbit.angles import height_error
-from analysis.orbit.three_line_model import BIAS
+from analysis.orbit.three_line_model import BIAS, INTERIOR
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.latitude import LatitudeFit, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
-from twin.validation.checks.check import SIGMAS, CheckResult, Chosen, Supposed
+from twin.validation.checks.check import SIGMAS, CheckResult, Chosen, Supposed, median_of
 from twin.validation.checks.group import Context
 from twin.validation.paper_003.exact import all_errors
 
+INNER = tuple(f"{line} {part}" for line in LINES for part in INTERIOR)
+"""Unknowns of the interior, line by line."""
 MEDIAN = float(np.sqrt(np.pi / 2.0))
 """Standard deviation of a median over that of a mean, for normal noise and many draws."""
 
@@ -150,12 +151,6 @@ def _above(one: FieldPass) -> float:
     return flight - float(np.mean(earth.geodetic(one.check_ground)[2]))
 
 
-def median(values: np.ndarray) -> tuple[float, float]:
-    """Median of (N,) values and its standard deviation."""
-    spread = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
-    return float(np.median(values)), MEDIAN * spread / float(np.sqrt(len(values)))
-
-
 def lines_of(part: str) -> list[int]:
     """Places in INNER of an element, ``f``, ``x`` or ``y``, of all lines."""
     return [INNER.index(f"{line} {part}") for line in LINES]
@@ -183,10 +178,10 @@ def _plan(context: Context, flights: Flights) -> Iterator[CheckResult]:
         if f"003.scheme{k}.plan" not in context.selected:
             continue
         fields = flights.plan[:, k - 1]
-        value, sigma = median(fields.mean(axis=1))
+        value, sigma = median_of(fields.mean(axis=1))
         expected = float(np.median(flights.expected[:, k - 1].mean(axis=1)))
         # the same draws are in both: only their difference counts
-        sigma = median((fields - flights.expected[:, k - 1]).mean(axis=1))[1]
+        sigma = median_of((fields - flights.expected[:, k - 1]).mean(axis=1))[1]
         rows = ", ".join(f"{n} {v:.1f}" for n, v in zip(flights.fields, np.median(fields, axis=0), strict=True))
         how = (
             f"{_campaigns(flights)}. Medians of the fields: {rows} m. Implied: roll and pitch of a field less the "
@@ -202,7 +197,7 @@ def _plan(context: Context, flights: Flights) -> Iterator[CheckResult]:
 def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
     height = flights.height.mean(axis=2)
     if "003.scheme1.height" in context.selected:
-        value, sigma = median(height[:, 0] / flights.height_floor.mean(axis=1))
+        value, sigma = median_of(height[:, 0] / flights.height_floor.mean(axis=1))
         how = (
             f"{_campaigns(flights)}. RMS {float(np.median(height[:, 0])):.2f} m. Below 1, because the thermal turn of "
             "the star trackers from the forward to the aft image, 0.3″ of pitch or 1 m, goes into the calibrated "
@@ -211,7 +206,7 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
         yield context.check("003.scheme1.height").evaluate(value, sigma, how, 1.0)
     for k in (2, 3, 4, 5):
         if f"003.scheme{k}.height" in context.selected:
-            value, sigma = median(height[:, k - 1] / height[:, 0])
+            value, sigma = median_of(height[:, k - 1] / height[:, 0])
             how = (
                 f"{_campaigns(flights)}. RMS {float(np.median(height[:, k - 1])):.2f} m. A bias that is wrong for a "
                 "field moves all three lines alike, in plan; heights follow the angles between the lines, which every "
@@ -272,7 +267,7 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
     ratio = flights.plan.max(axis=2) / flights.plan.min(axis=2)
 
     def row(identifier: str, statistic: Callable[[np.ndarray], np.ndarray], how: str, implied: float) -> CheckResult:
-        value, sigma = median(statistic(flights.plan))
+        value, sigma = median_of(statistic(flights.plan))
         chosen = _varied(value, flights, statistic)
         return context.check(identifier).evaluate(value, sigma, how, implied, inputs=[chosen])
 
@@ -322,7 +317,7 @@ def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Itera
             continue
         table = getattr(flights, what)
         met = np.all(table <= getattr(limits, what), axis=2).mean(axis=0)
-        value, sigma = median(table[:, 3].max(axis=1))
+        value, sigma = median_of(table[:, 3].max(axis=1))
         how = (
             f"{_campaigns(flights)}. The limits are those of scenes/orbit/calibrate.yaml: {source}. Every field is "
             f"within them in {', '.join(f'{100.0 * v:.0f} %' for v in met)} of the campaigns by schemes 1 to 5: with "
@@ -335,7 +330,7 @@ def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Itera
 def _before(context: Context, flights: Flights) -> Iterator[CheckResult]:
     for what in ("plan", "height"):
         if f"003.before.{what}" in context.selected:
-            value, sigma = median(getattr(flights, f"{what}_before").mean(axis=1))
+            value, sigma = median_of(getattr(flights, f"{what}_before").mean(axis=1))
             how = (
                 f"{_campaigns(flights)}, with the laboratory's camera. How much a launch changes is not printed; "
                 "biases of 25 to 40″ and changes of 50 to 95 µm in the interior, which are usual, are assumed. 100 m "

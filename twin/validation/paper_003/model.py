@@ -231,9 +231,9 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
         f"px, rendered by three lines: {3 * len(found) * len(spec.patches)} images"
     )
     if "003.model.points" in context.selected:
-        rms, total = rendered.matching(campaign)
+        rms, matched, wrong = rendered.matching(campaign)
         how = (
-            f"{size}. {total.matched} places pass the matching, {total.wrong_matched} of them wrong by truth; "
+            f"{size}. {matched} places pass the matching, {wrong} of them wrong by truth; "
             "control points are identified less well by eye, and the campaigns take 0.3 px."
         )
         yield context.check("003.model.points").evaluate(rms, None, how, setup_of(FIELDS).test.errors.image)

@@ -15,12 +15,10 @@ from analysis.units import ARCSEC
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.scene import TerrainSpec
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
-from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.image_numbers import ImageTotals
 from twin.orbit.calibration.schemes import tested, tested_before
-from twin.orbit.calibration.screening import screened
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.images.line_optics import optics_of
@@ -185,7 +183,7 @@ def measured(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Adv
     def progress(_: str, done: int, total: int) -> None:
         advance(done / total)
 
-    return screened(fly_fields(setup, seed, progress))
+    return source_of(setup, seed, progress)
 
 
 def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
@@ -193,17 +191,18 @@ def calibrated(campaign: Campaign) -> tuple[FromImages, ...]:
     return tuple(_field(campaign, one) for one in campaign.passes)
 
 
-def matching(campaign: Campaign) -> tuple[float, ImageTotals]:
-    """RMS of right places of control points against the truth over lines and pixels, px, and counts."""
+def matching(campaign: Campaign) -> tuple[float, int, int]:
+    """RMS of right places of control points against the truth over lines and pixels, px; places of all points that
+    pass the matching, and those of them that are wrong by truth.
+    """
     assert campaign.images is not None
-    square, count = 0.0, 0
-    for field in campaign.images:
-        for patch in field.patches:
-            for one in patch.judgements["control"].values():
-                right = one.degrees_of_freedom // 2
-                square += right * float(np.sum(np.nan_to_num(one.rms) ** 2))
-                count += 2 * right
-    return float(np.sqrt(square / max(count, 1))), ImageTotals.of(campaign.images)
+    patches = [patch.judgements for field in campaign.images for patch in field.patches]
+    every = [one for sorts in patches for lines in sorts.values() for one in lines.values()]
+    control = [one for sorts in patches for one in sorts["control"].values()]
+    right = np.array([one.degrees_of_freedom // 2 for one in control])
+    square = float(sum(n * np.sum(np.nan_to_num(one.rms) ** 2) for n, one in zip(right, control, strict=True)))
+    rms = float(np.sqrt(square / max(2 * int(right.sum()), 1)))
+    return rms, sum(one.matched for one in every), sum(one.wrong_matched for one in every)
 
 
 def _field(campaign: Campaign, one: FieldPass) -> FromImages:
