@@ -124,8 +124,7 @@ def run(context: Context) -> Iterator[CheckResult]:
     same, own = differences(data.same, data.same), differences(data.light, data.own)
     yield from _same(context, data, same)
     yield from _own(context, data, own)
-    if "000.table1.pair" in context.selected:
-        yield _pair(context, data, own)
+    yield _pair(context, data, own)
     yield from _accuracy(context, data)
     context.progress(0.9, "draw")
     context.add(
@@ -143,8 +142,6 @@ def _same(context: Context, data: Data, same: Differences) -> Iterator[CheckResu
     count = len(same.values)
     for k, (name, printed) in enumerate(PRINTED_ARCSEC.items()):
         identifier = f"000.table1.{name}"
-        if identifier not in context.selected:
-            continue
         sigma = float(same.spread[k])
         variance = same.planes_sigma[k] ** 2 - same.resection_sigma[k] ** 2
         how = (
@@ -161,8 +158,6 @@ def _own(context: Context, data: Data, own: Differences) -> Iterator[CheckResult
     count = len(own.values)
     for k, name in enumerate(PRINTED_ARCSEC):
         identifier = f"000.table1.{name}_own"
-        if identifier not in context.selected:
-            continue
         bias, spread = float(np.mean(own.values[:, k])), float(own.spread[k])
         noise = spread * np.sqrt(1.0 / count + SIGMAS**2 / (2.0 * (count - 1)))
         how = (
@@ -230,8 +225,6 @@ def _accuracy(context: Context, data: Data) -> Iterator[CheckResult]:
         ("000.accuracy", data.own, "taken out of the points"),
         ("000.accuracy.light", data.light, "left in"),
     ):
-        if identifier not in context.selected:
-            continue
         found = np.array([intersection_angles(*planes_of(m, "tls")).values for m in passes.measured])
         off = (found - values_of(passes.flight.dihedral)) / ARCSEC
         rms = np.sqrt(np.mean(off**2, axis=0))

@@ -79,18 +79,15 @@ def measured(context: Context) -> Measured:
 def run(context: Context) -> Iterator[CheckResult]:
     """Render the benches and set them beside the printed table and its text."""
     for axis in _CLAIMED:
-        if f"001.table2.claimed.{axis}" in context.selected:
-            yield _claimed(context, axis)
+        yield _claimed(context, axis)
     if not any(".claimed." not in identifier for identifier in context.selected):
         return
     found = measured(context)
     differences = mean_differences(found.setup.spec, found.ideal, found.real)
     for axis, one in differences.items():
         identifier = f"001.table2.{axis.lower()}"
-        if identifier in context.selected:
-            yield context.check(identifier).evaluate(one.value, one.sigma, one.how, inputs=[_errors(one.value)])
-    if "001.table2.z_columns" in context.selected:
-        yield _z_columns(context, found)
+        yield context.check(identifier).evaluate(one.value, one.sigma, one.how, inputs=[_errors(one.value)])
+    yield _z_columns(context, found)
     yield from _relations(context, found)
     yield from _limits(context, differences, len(found.real))
     _show(context, found)
@@ -187,27 +184,25 @@ def _relations(context: Context, found: Measured) -> Iterator[CheckResult]:
         between = 2.0 * series.half_angle
         factor = autocollimator.relation_factor(axis, 2, between)
         identifier = f"001.table2.relation.{axis.lower()}"
-        if identifier in context.selected:
-            how = (
-                f"Noise-free images of the ideal bench at {series.angles[-1] / ARCSEC:.0f} arcsec, mirrors "
-                f"{math.degrees(between):.0f}° apart: mirror 2 reads {read:.6f} of the turn, about its own {own}."
-            )
-            if axis == "Z":
-                how += (
-                    " The text has it about its own Z; that turn is Δγ cos b, and no autocollimator on its normal can "
-                    "see it."
-                )
-            yield context.check(identifier).evaluate(read / factor, None, how)
-    identifier = "001.table2.relation.mirror_1_z"
-    if identifier in context.selected:
-        result = found.ideal["Z"]
-        read = float(result.readings[0, -1, 1] / result.series.angles[-1])
         how = (
-            f"Noise-free images of the ideal bench at {result.series.angles[-1] / ARCSEC:.0f} arcsec. The printed "
-            "column of mirror 1 grows by 0.866 of the turn, sin 60°, which is mirror 2's."
+            f"Noise-free images of the ideal bench at {series.angles[-1] / ARCSEC:.0f} arcsec, mirrors "
+            f"{math.degrees(between):.0f}° apart: mirror 2 reads {read:.6f} of the turn, about its own {own}."
         )
-        expected = [autocollimator.relation_factor("Z", 1, 0.0)]
-        yield context.check(identifier).evaluate(read, None, how, None, expected)
+        if axis == "Z":
+            how += (
+                " The text has it about its own Z; that turn is Δγ cos b, and no autocollimator on its normal can "
+                "see it."
+            )
+        yield context.check(identifier).evaluate(read / factor, None, how)
+    identifier = "001.table2.relation.mirror_1_z"
+    result = found.ideal["Z"]
+    read = float(result.readings[0, -1, 1] / result.series.angles[-1])
+    how = (
+        f"Noise-free images of the ideal bench at {result.series.angles[-1] / ARCSEC:.0f} arcsec. The printed "
+        "column of mirror 1 grows by 0.866 of the turn, sin 60°, which is mirror 2's."
+    )
+    expected = [autocollimator.relation_factor("Z", 1, 0.0)]
+    yield context.check(identifier).evaluate(read, None, how, None, expected)
 
 
 def _limits(context: Context, axes: Mapping[str, MeanDifference], count: int) -> Iterator[CheckResult]:
@@ -215,14 +210,13 @@ def _limits(context: Context, axes: Mapping[str, MeanDifference], count: int) ->
     text = ", ".join(f"about {axis} {one.value:.3f}" for axis, one in axes.items())
     printed = ", ".join(f"{axis} {printed_mean_difference(axis):.3f}" for axis in axes)
     for identifier in ("001.table2.mean_error", "001.table2.below_1"):
-        if identifier in context.selected:
-            how = (
-                f"Mean differences of {count} rendered benches with the declared errors: {text} arcsec. The printed "
-                f"rows give {printed}."
-            )
-            sigma = axes[worst].sigma / math.sqrt(count)
-            value = axes[worst].value
-            yield context.check(identifier).evaluate(value, sigma, how, inputs=[_errors(value)])
+        how = (
+            f"Mean differences of {count} rendered benches with the declared errors: {text} arcsec. The printed "
+            f"rows give {printed}."
+        )
+        sigma = axes[worst].sigma / math.sqrt(count)
+        value = axes[worst].value
+        yield context.check(identifier).evaluate(value, sigma, how, inputs=[_errors(value)])
 
 
 def _claimed(context: Context, name: str) -> CheckResult:

@@ -92,39 +92,34 @@ def _stability(
     if context.wants("003.table3"):
         yield from _biases(context, flights)
     for number, k in ((4, 0), (5, 1), (6, 2)):
-        if f"003.fig{number}" in context.selected:
-            yield _slope(context, flights, number, k)
+        yield _slope(context, flights, number, k)
     for number, parts, what in ((4, ("x", "y"), "principal points"), (5, ("f",), "principal distances")):
-        if f"003.table{number}" in context.selected:
-            yield _interior(context, flights, number, parts, what)
+        yield _interior(context, flights, number, parts, what)
 
 
 def _quality(context: Context, campaigns: Sequence[Campaign], setup: CalibrationSetup) -> Iterator[CheckResult]:
     found = quality_of(setup, campaigns)
     errors, passes = setup.test.errors, found.orbit.shape[0] * found.orbit.shape[1]
-    if "003.table2" in context.selected:
-        ratios = np.array([v.max(axis=1) / v.min(axis=1) for v in (found.orbit, found.attitude)])
-        worst, sigma = median_of(ratios.max(axis=(0, 2)))
-        orbit, attitude = (float(np.sqrt(np.mean(v**2))) for v in (found.orbit, found.attitude))
-        how = (
-            f"{passes} passes of {len(campaigns)} campaigns, measured orbit once a second and attitude eight times; "
-            f"third differences of {orbit:.3f} m and {attitude / ARCSEC:.2f}″, RMS. The numbers of Table 2 are lost. "
-            "All fields are given the same noise here, so that this is what chance does to seven equal fields."
-        )
-        noise = Chosen.power("noise of the worst field over that of the best, times", 1.0, "1", worst)
-        yield context.check("003.table2").evaluate(worst, sigma, how, 10.0, inputs=[noise])
-    if "003.table2.white" in context.selected:
-        ratio = found.attitude_sigma / found.attitude_jump
-        how = (
-            f"{passes} passes, three axes. True error of a reading, without its mean over the pass and what it shares "
-            f"with the next: {float(np.sqrt(np.mean(found.attitude_jump**2))) / ARCSEC:.3f}″. White noise has third "
-            "differences of √20 of its sigma."
-        )
-        yield context.check("003.table2.white").evaluate(
-            float(np.mean(ratio)), float(np.std(ratio) / np.sqrt(ratio.size)), how, 1.0
-        )
-    if "003.table2.orbit" in context.selected:
-        yield _orbit(context, found.orbit_sigma, found.orbit_error, setup)
+    ratios = np.array([v.max(axis=1) / v.min(axis=1) for v in (found.orbit, found.attitude)])
+    worst, sigma = median_of(ratios.max(axis=(0, 2)))
+    orbit, attitude = (float(np.sqrt(np.mean(v**2))) for v in (found.orbit, found.attitude))
+    how = (
+        f"{passes} passes of {len(campaigns)} campaigns, measured orbit once a second and attitude eight times; "
+        f"third differences of {orbit:.3f} m and {attitude / ARCSEC:.2f}″, RMS. The numbers of Table 2 are lost. "
+        "All fields are given the same noise here, so that this is what chance does to seven equal fields."
+    )
+    noise = Chosen.power("noise of the worst field over that of the best, times", 1.0, "1", worst)
+    yield context.check("003.table2").evaluate(worst, sigma, how, 10.0, inputs=[noise])
+    ratio = found.attitude_sigma / found.attitude_jump
+    how = (
+        f"{passes} passes, three axes. True error of a reading, without its mean over the pass and what it shares "
+        f"with the next: {float(np.sqrt(np.mean(found.attitude_jump**2))) / ARCSEC:.3f}″. White noise has third "
+        "differences of √20 of its sigma."
+    )
+    yield context.check("003.table2.white").evaluate(
+        float(np.mean(ratio)), float(np.std(ratio) / np.sqrt(ratio.size)), how, 1.0
+    )
+    yield _orbit(context, found.orbit_sigma, found.orbit_error, setup)
     if "003.table2.equal" in context.selected:
         sigma_of, interval = SLOW
         slow = errors.star_tracker.slow.model_copy(update={"noise": (sigma_of,) * 3, "interval": interval})
@@ -167,39 +162,36 @@ def _biases(context: Context, flights: Flights) -> Iterator[CheckResult]:
     claimed = np.sqrt(np.mean(flights.bias_sigma**2, axis=(0, 1))) / ARCSEC
     error = (flights.bias - flights.true_bias) / ARCSEC
     for k, axis in enumerate(BIAS):
-        if f"003.table3.{axis}" in context.selected:
-            value, sigma = median_of(scatter[:, k])
-            rms = float(np.sqrt(np.mean(error[:, :, k] ** 2)))
-            how = (
-                f"{_campaigns(flights)}. Median of the scatter; that of the true biases is "
-                f"{float(np.median(true[:, k])):.2f}″, each field is known to {claimed[k]:.2f}″, and the error is "
-                f"{rms:.2f}″, RMS. Seasons of 1″ and thermal amplitudes of 3 to 4″ are assumed."
-            )
-            if axis == "yaw":
-                how += " The scatter is mostly that of the estimate: yaw goes with y of the outer lines."
-            yield context.check(f"003.table3.{axis}").evaluate(value, sigma, how, inputs=[all_errors(value)])
-    if "003.table3.truth" in context.selected:
-        values = np.sqrt(np.mean(error[:, :, :2] ** 2, axis=(1, 2)))
-        ratio = float(np.sqrt(np.mean((error[:, :, :2] * ARCSEC / flights.bias_sigma[:, :, :2]) ** 2)))
+        value, sigma = median_of(scatter[:, k])
+        rms = float(np.sqrt(np.mean(error[:, :, k] ** 2)))
         how = (
-            f"{_campaigns(flights)}. Truth: the turn between measured and true attitude at the middle of each pass. "
-            f"{ratio:.1f} times the adjustment's sigmas, for these count neither the orbit's slow error, 0.3 m or "
-            "0.12″, nor that readings are shared."
+            f"{_campaigns(flights)}. Median of the scatter; that of the true biases is "
+            f"{float(np.median(true[:, k])):.2f}″, each field is known to {claimed[k]:.2f}″, and the error is "
+            f"{rms:.2f}″, RMS. Seasons of 1″ and thermal amplitudes of 3 to 4″ are assumed."
         )
-        value, sigma = median_of(values)
-        yield context.check("003.table3.truth").evaluate(value, sigma, how, inputs=[all_errors(value)])
-    if "003.table3.latitude" in context.selected:
-        significance = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
-        share = float(np.mean(significance >= _SIGNIFICANT))
-        expected = float(np.median(flights.true_significance[:, :2]))
-        how = (
-            f"{_campaigns(flights)}. Median over campaigns, roll and pitch; a thermal amplitude of 4″ over the sine of "
-            f"latitude is there, beside seasons of 1″. {100.0 * share:.0f} % of the slopes reach three sigmas."
-        )
-        # quartiles, for few fields make long tails; roll and pitch are drawn apart
-        low, value, high = np.percentile(significance, [25.0, 50.0, 75.0])
-        sigma = MEDIAN * (high - low) / (2.0 * _QUARTILE) / float(np.sqrt(significance.size))
-        yield context.check("003.table3.latitude").evaluate(float(value), float(sigma), how, _SIGNIFICANT, [expected])
+        if axis == "yaw":
+            how += " The scatter is mostly that of the estimate: yaw goes with y of the outer lines."
+        yield context.check(f"003.table3.{axis}").evaluate(value, sigma, how, inputs=[all_errors(value)])
+    values = np.sqrt(np.mean(error[:, :, :2] ** 2, axis=(1, 2)))
+    ratio = float(np.sqrt(np.mean((error[:, :, :2] * ARCSEC / flights.bias_sigma[:, :, :2]) ** 2)))
+    how = (
+        f"{_campaigns(flights)}. Truth: the turn between measured and true attitude at the middle of each pass. "
+        f"{ratio:.1f} times the adjustment's sigmas, for these count neither the orbit's slow error, 0.3 m or "
+        "0.12″, nor that readings are shared."
+    )
+    value, sigma = median_of(values)
+    yield context.check("003.table3.truth").evaluate(value, sigma, how, inputs=[all_errors(value)])
+    significance = np.array([[abs(f.amplitude) / f.amplitude_sigma for f in row[:2]] for row in flights.fits])
+    share = float(np.mean(significance >= _SIGNIFICANT))
+    expected = float(np.median(flights.true_significance[:, :2]))
+    how = (
+        f"{_campaigns(flights)}. Median over campaigns, roll and pitch; a thermal amplitude of 4″ over the sine of "
+        f"latitude is there, beside seasons of 1″. {100.0 * share:.0f} % of the slopes reach three sigmas."
+    )
+    # quartiles, for few fields make long tails; roll and pitch are drawn apart
+    low, value, high = np.percentile(significance, [25.0, 50.0, 75.0])
+    sigma = MEDIAN * (high - low) / (2.0 * _QUARTILE) / float(np.sqrt(significance.size))
+    yield context.check("003.table3.latitude").evaluate(float(value), float(sigma), how, _SIGNIFICANT, [expected])
 
 
 def _slope(context: Context, flights: Flights, number: int, k: int) -> CheckResult:

@@ -175,8 +175,6 @@ def results(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
 
 def _plan(context: Context, flights: Flights) -> Iterator[CheckResult]:
     for k in NAMES:
-        if f"003.scheme{k}.plan" not in context.selected:
-            continue
         fields = flights.plan[:, k - 1]
         value, sigma = median_of(fields.mean(axis=1))
         expected = float(np.median(flights.expected[:, k - 1].mean(axis=1)))
@@ -196,27 +194,25 @@ def _plan(context: Context, flights: Flights) -> Iterator[CheckResult]:
 
 def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
     height = flights.height.mean(axis=2)
-    if "003.scheme1.height" in context.selected:
-        value, sigma = median_of(height[:, 0] / flights.height_floor.mean(axis=1))
-        how = (
-            f"{_campaigns(flights)}. RMS {float(np.median(height[:, 0])):.2f} m. Below 1, because the thermal turn of "
-            "the star trackers from the forward to the aft image, 0.3″ of pitch or 1 m, goes into the calibrated "
-            "interior; with the true one it stays in the heights. The numbers of Table 7 are lost."
-        )
-        yield context.check("003.scheme1.height").evaluate(value, sigma, how, 1.0)
+    value, sigma = median_of(height[:, 0] / flights.height_floor.mean(axis=1))
+    how = (
+        f"{_campaigns(flights)}. RMS {float(np.median(height[:, 0])):.2f} m. Below 1, because the thermal turn of "
+        "the star trackers from the forward to the aft image, 0.3″ of pitch or 1 m, goes into the calibrated "
+        "interior; with the true one it stays in the heights. The numbers of Table 7 are lost."
+    )
+    yield context.check("003.scheme1.height").evaluate(value, sigma, how, 1.0)
     for k in (2, 3, 4, 5):
-        if f"003.scheme{k}.height" in context.selected:
-            value, sigma = median_of(height[:, k - 1] / height[:, 0])
-            how = (
-                f"{_campaigns(flights)}. RMS {float(np.median(height[:, k - 1])):.2f} m. A bias that is wrong for a "
-                "field moves all three lines alike, in plan; heights follow the angles between the lines, which every "
-                "field gives alike."
-            )
-            check = context.check(f"003.scheme{k}.height")
-            # what an interior of its own in every field would add to the heights in square
-            more = np.sqrt((1.0 + check.tolerance + SIGMAS * sigma) ** 2 - 1.0) * float(np.median(height[:, 0]))
-            limit_text = f"holds while x of the forward line wanders by up to {1e6 * more / _per_shift(setup):.2g} µm"
-            yield check.evaluate(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", limit_text)])
+        value, sigma = median_of(height[:, k - 1] / height[:, 0])
+        how = (
+            f"{_campaigns(flights)}. RMS {float(np.median(height[:, k - 1])):.2f} m. A bias that is wrong for a "
+            "field moves all three lines alike, in plan; heights follow the angles between the lines, which every "
+            "field gives alike."
+        )
+        check = context.check(f"003.scheme{k}.height")
+        # what an interior of its own in every field would add to the heights in square
+        more = np.sqrt((1.0 + check.tolerance + SIGMAS * sigma) ** 2 - 1.0) * float(np.median(height[:, 0]))
+        limit_text = f"holds while x of the forward line wanders by up to {1e6 * more / _per_shift(setup):.2g} µm"
+        yield check.evaluate(value, sigma, how, 1.0, inputs=[Supposed("one interior for all fields", limit_text)])
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
@@ -272,38 +268,34 @@ def _finding(context: Context, flights: Flights) -> Iterator[CheckResult]:
         return context.check(identifier).evaluate(value, sigma, how, implied, inputs=[chosen])
 
     for k in (1, 2):
-        if f"003.scheme{k}.uneven" in context.selected:
-            values = _uneven(flights.plan, k)
-            how = (
-                f"{_campaigns(flights)}. Medians: {float(np.median(spread[:, k - 1])):.2f} m against "
-                f"{float(np.median(spread[:, 3])):.2f} m. True in {_share(values > 1.0)} campaigns."
-            )
-            yield row(f"003.scheme{k}.uneven", partial(_uneven, k=k), how, 1.0)
-    if "003.scheme4.even" in context.selected:
-        values = _even(flights.plan)
+        values = _uneven(flights.plan, k)
         how = (
-            f"{_campaigns(flights)}. Largest over smallest: {float(np.median(ratio[:, 0])):.1f} by scheme 1, "
-            f"{float(np.median(ratio[:, 3])):.1f} by scheme 4, {float(np.median(ratio[:, 4])):.1f} by scheme 5; more "
-            f"even than scheme 1 in {_share(values < 1.0)} campaigns. No mean evens out a field's own season."
+            f"{_campaigns(flights)}. Medians: {float(np.median(spread[:, k - 1])):.2f} m against "
+            f"{float(np.median(spread[:, 3])):.2f} m. True in {_share(values > 1.0)} campaigns."
         )
-        yield row("003.scheme4.even", _even, how, 1.0)
-    if "003.scheme4.improves" in context.selected:
-        values = _improved(flights.plan)
-        steps = ", ".join(f"{float(np.median(v)):.2f}" for v in mean.T)
-        how = (
-            f"{_campaigns(flights)}. Medians of schemes 1 to 5: {steps} m. Better than scheme 1 in "
-            f"{_share(values < 1.0)} campaigns. One campaign, as the paper has it, may show anything from "
-            f"{float(np.min(values)):.2f} to {float(np.max(values)):.2f}."
-        )
-        yield row("003.scheme4.improves", _improved, how, 0.9)
-    if "003.scheme4.unseen" in context.selected:
-        values = _unseen(flights.plan)
-        how = (
-            f"{_campaigns(flights)}. Medians {float(np.median(flights.plan[:, 0, -1])):.1f} m by scheme 1 and "
-            f"{float(np.median(flights.plan[:, 3, -1])):.1f} m by scheme 4; better in {_share(values < 1.0)} "
-            "campaigns. The six other fields are in the mean that they test."
-        )
-        yield row("003.scheme4.unseen", _unseen, how, 1.0)
+        yield row(f"003.scheme{k}.uneven", partial(_uneven, k=k), how, 1.0)
+    values = _even(flights.plan)
+    how = (
+        f"{_campaigns(flights)}. Largest over smallest: {float(np.median(ratio[:, 0])):.1f} by scheme 1, "
+        f"{float(np.median(ratio[:, 3])):.1f} by scheme 4, {float(np.median(ratio[:, 4])):.1f} by scheme 5; more "
+        f"even than scheme 1 in {_share(values < 1.0)} campaigns. No mean evens out a field's own season."
+    )
+    yield row("003.scheme4.even", _even, how, 1.0)
+    values = _improved(flights.plan)
+    steps = ", ".join(f"{float(np.median(v)):.2f}" for v in mean.T)
+    how = (
+        f"{_campaigns(flights)}. Medians of schemes 1 to 5: {steps} m. Better than scheme 1 in "
+        f"{_share(values < 1.0)} campaigns. One campaign, as the paper has it, may show anything from "
+        f"{float(np.min(values)):.2f} to {float(np.max(values)):.2f}."
+    )
+    yield row("003.scheme4.improves", _improved, how, 0.9)
+    values = _unseen(flights.plan)
+    how = (
+        f"{_campaigns(flights)}. Medians {float(np.median(flights.plan[:, 0, -1])):.1f} m by scheme 1 and "
+        f"{float(np.median(flights.plan[:, 3, -1])):.1f} m by scheme 4; better in {_share(values < 1.0)} "
+        "campaigns. The six other fields are in the mean that they test."
+    )
+    yield row("003.scheme4.unseen", _unseen, how, 1.0)
 
 
 def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Iterator[CheckResult]:
@@ -313,8 +305,6 @@ def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Itera
         "height": f"{limits.height:g} m is commonly asked for contours of 20 m",
     }
     for what, source in sources.items():
-        if f"003.scale50000.{what}" not in context.selected:
-            continue
         table = getattr(flights, what)
         met = np.all(table <= getattr(limits, what), axis=2).mean(axis=0)
         value, sigma = median_of(table[:, 3].max(axis=1))
@@ -329,15 +319,14 @@ def _scale(context: Context, flights: Flights, setup: CalibrationSetup) -> Itera
 
 def _before(context: Context, flights: Flights) -> Iterator[CheckResult]:
     for what in ("plan", "height"):
-        if f"003.before.{what}" in context.selected:
-            value, sigma = median_of(getattr(flights, f"{what}_before").mean(axis=1))
-            how = (
-                f"{_campaigns(flights)}, with the laboratory's camera. How much a launch changes is not printed; "
-                "biases of 25 to 40″ and changes of 50 to 95 µm in the interior, which are usual, are assumed. 100 m "
-                "in plan are 41″ of the look; in height they are 110 µm between x of the forward and the aft line."
-            )
-            chosen = Chosen.power("what the launch changes, times", 1.0, "1", value)
-            yield context.check(f"003.before.{what}").evaluate(value, sigma, how, inputs=[chosen])
+        value, sigma = median_of(getattr(flights, f"{what}_before").mean(axis=1))
+        how = (
+            f"{_campaigns(flights)}, with the laboratory's camera. How much a launch changes is not printed; "
+            "biases of 25 to 40″ and changes of 50 to 95 µm in the interior, which are usual, are assumed. 100 m "
+            "in plan are 41″ of the look; in height they are 110 µm between x of the forward and the aft line."
+        )
+        chosen = Chosen.power("what the launch changes, times", 1.0, "1", value)
+        yield context.check(f"003.before.{what}").evaluate(value, sigma, how, inputs=[chosen])
 
 
 def _share(true: np.ndarray) -> str:

@@ -77,10 +77,8 @@ def _singles(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     local = bench.experiment.instrument.cameras[bench.cameras[0]].line_focal_length
     show.causes_shown(context, own, geometry, local, data)
     for equation, name in _BY_EQUATION.items():
-        if f"001.{equation}.range" in context.selected:
-            yield _range(context, f"001.{equation}.range", own[name], geometry)
-    if "001.small_angles.range" in context.selected:
-        yield _small(context, own)
+        yield _range(context, f"001.{equation}.range", own[name], geometry)
+    yield _small(context, own)
 
 
 def _range(context: Context, identifier: str, both: list[Range], geometry: MonitorGeometry) -> CheckResult:
@@ -170,8 +168,6 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
     )
     explained = _box_limits(geometry)
     for k, name in enumerate(NAMES):
-        if f"001.table1.range.{name}" not in context.selected:
-            continue
         share, whence = corners.limit(turns.key(JOINT, name))
         diagonal = [found.mean(form, name, name) for form in (JOINT, FORM)]
         how = (
@@ -203,8 +199,6 @@ def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
 def _crosstalk(context: Context, found: turns.Separation, setup: str) -> Iterator[CheckResult]:
     for pair, scale in (("d_alpha.by_d_f", 1e3), ("d_beta.by_d_gamma", 1.0)):
         identifier = f"001.table1.range.{pair}"
-        if identifier not in context.selected:
-            continue
         read, _, changed = pair.partition(".by_")
         value, sigma = found.mean(FORM, read, changed)
         f_by_alpha, gamma_by_beta = found.mean(FORM, "d_f", "d_alpha")[0], found.mean(FORM, "d_gamma", "d_beta")[0]
@@ -236,8 +230,6 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     across = pupil.gradient[NAMES.index("d_beta"), 1] * ARCSEC * f**2
     for equation, name in _BY_EQUATION.items():
         identifier = f"001.{equation}.defocus"
-        if identifier not in context.selected:
-            continue
         k = NAMES.index(name)
         unit = _plain(turns.UNITS[name])
         edge = curves.crossing(f"{name} claimed")
@@ -269,8 +261,6 @@ def _returns(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     show.returns_shown(context, list(found.values()), data)
     for kind, identifier in (("plane", "001.returns.plane"), ("roof", "001.returns.roof"),
                              ("roof along", "001.returns.roof_along"), ("corner", "001.returns.corner")):  # fmt: skip
-        if identifier not in context.selected:
-            continue
         r = found[kind]
         across, along = float(r.across.mean()), float(r.along.mean())
         value = {
