@@ -58,6 +58,13 @@ RUNS = {
 }
 """What computes where no procedure is made of it, and writes what was computed."""
 COMMANDS = {"analysis.mtf.__main__"}
+INSIDE = re.compile(
+    r"twin\.(camera|compare|design|export|live|main_job|recover|study|uncertainty|verify)(\..*)?"
+    r"|twin\..*_(report|numbers|plots?|sections?|tables|content|export|command)"
+    r"|twin\.run\.(cli|command|console|page|report|run_folder)"
+    r"|twin\.orbit\.calibration\.(field_images|observations|flown_campaign|influences|screening)"
+)
+"""What the validation does not import: commands, what shows and writes results, and the steps of `source_of`."""
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
@@ -259,6 +266,42 @@ def test_source_knows_rooms_that_stand_above_its_own() -> None:
         if here != there and ROOMS.index(there) > ROOMS.index(here):
             wrong.append(f"{importer} ({here}) imports {module} ({there})")
     assert wrong == []
+
+
+def inside(importer: str, source: str) -> list[str]:
+    """What a module of the validation takes from the inside of the twin: names with an underscore, what shows or writes
+    results, and what other modules do for every caller (`INSIDE`).
+    """
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ImportFrom) and not (node.module or "").startswith("twin.validation"):
+            names = [alias.name for alias in node.names]
+            found += [f"{node.module}.{name}" for name in names if name.startswith("_")]
+            found += [m for m in (node.module, *(f"{node.module}.{n}" for n in names)) if m and INSIDE.fullmatch(m)]
+        elif isinstance(node, ast.Attribute) and re.match("_[a-z]", node.attr):
+            if ast.unparse(node.value) not in ("self", "cls"):
+                found.append(ast.unparse(node))
+    return [f"{importer}: {name}" for name in dict.fromkeys(found)]
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "twin/validation").rglob("*.py")), ids=lambda path: path.stem)
+def test_the_validation_is_a_user(path: Path) -> None:
+    """It takes what a user may call; its report alone writes a run folder, as a command does."""
+    if path.stem != "validation_report":
+        assert inside(path.stem, path.read_text("utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from twin.laboratory.distortion_run import _locate",
+        "from twin.laboratory import focus_report",
+        "from twin.orbit.calibration.flown_campaign import fly_fields",
+        "def f(bench): return bench._cache",
+    ],
+)
+def test_what_the_validation_takes_from_the_inside_is_found(line: str) -> None:
+    assert len(inside("module", line)) == 1
 
 
 def test_every_folder_of_the_source_is_in_a_room() -> None:

@@ -18,9 +18,9 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
-from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.payload_changes import changed_payload
@@ -195,7 +195,7 @@ def _moved(setup: CalibrationSetup, one: FieldPass, line: str, interior: np.ndar
 
 def exact_campaign(setup: CalibrationSetup, seed: np.random.SeedSequence) -> Campaign:
     """Image points of the rigorous sensor without noise."""
-    return fly_fields(setup, seed).independent
+    return source_of(setup, seed).independent
 
 
 def recovered(campaign: Campaign, pitch: float) -> tuple[float, str]:

@@ -13,8 +13,8 @@ from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
@@ -126,7 +126,7 @@ def _quality(context: Context, campaigns: Sequence[Campaign], setup: Calibration
         tracker = errors.star_tracker.model_copy(update={"slow": slow})
         worse = changed(setup, errors=errors.model_copy(update={"star_tracker": tracker}))
         seed = np.random.SeedSequence(context.seed, spawn_key=(3, 4))
-        again = quality_of(worse, [fly_fields(worse, seed)])
+        again = quality_of(worse, [source_of(worse, seed)])
         truth = float(np.sqrt(np.mean(again.attitude_error**2) / np.mean(found.attitude_error**2)))
         shown = again.attitude_sigma / np.sqrt(np.mean(found.attitude_sigma**2))
         how = (

@@ -12,9 +12,9 @@ from analysis.orbit.angles import height_error
 from analysis.orbit.three_line_model import BIAS, INTERIOR
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.latitude import LatitudeFit, fitted
 from twin.orbit.calibration.schemes import schemes_tested, tested, tested_before, values_of
 from twin.validation.checks.check import SIGMAS, CheckResult, Chosen, Supposed, median_of
@@ -76,7 +76,7 @@ def flown(
     out = []
     for k, seed in enumerate(seeds):
         step(k)
-        out.append(fly_fields(setup, seed).independent)
+        out.append(source_of(setup, seed).independent)
     return out
 
 

@@ -12,9 +12,9 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from scenes.specs.orbit.calibration import CalibrationImagesSpec
 from scenes.specs.orbit.setup import CalibrationSetup
+from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.run.artefact import SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
@@ -152,7 +152,7 @@ def exact_misses(setup: CalibrationSetup, campaign: Campaign, seed: np.random.Se
 
 def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
     setup = without_light(setup_of(FIELDS, (FIELD,)))
-    campaign = fly_fields(setup, seed).independent
+    campaign = source_of(setup, seed).independent
     if "003.model.rank" in context.selected:
         found = exact.rank_of(setup, campaign)
         text = "; ".join(str(o) for o in found.open)
@@ -201,7 +201,7 @@ def _yaw(context: Context, seed: np.random.SeedSequence) -> CheckResult:
     ratios, sigmas = [], []
     for k in range(count):
         context.progress(0.1 + 0.05 * k / count, f"fly campaign {k + 1} of {count}")
-        campaign = fly_fields(setup, stream(seed, k)).independent
+        campaign = source_of(setup, stream(seed, k)).independent
         for one in campaign.passes:
             found = calibrated_alone(campaign, one)
             sigmas.append(found.sigma[f"{one.name} yaw"])

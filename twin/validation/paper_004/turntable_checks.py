@@ -20,7 +20,6 @@ from scenes.specs.lab_setup import resolve_turntable
 from scenes.specs.turntable_test import TurntableTestSpec
 from twin.laboratory.distortion_run import rms
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_report import FIT_NAMES
 from twin.laboratory.turntable_run import run_turntable
 from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import Check, CheckResult, Chosen, median_of
@@ -41,6 +40,7 @@ FITTED, FAST_FITTED = 60, 12
 """Turntables whose calibration is fitted."""
 NETWORK = "network"
 _REPEATED = tuple(f"004.turntable.{name}" for name in ("repeat", "criterion", "chauvenet", "chauvenet_mean"))
+FIT_NAMES = {name: name.replace("_", " ") for name in FITS} | {"fourier": "Fourier series"}
 CLOSED_FORMS = tuple(name for name in FITS if name != NETWORK)
 
 
