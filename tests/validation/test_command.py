@@ -222,7 +222,7 @@ def test_help_says_what_a_verdict_means():
     ],
 )
 def test_a_verdict_follows_from_the_numbers(measured, sigma, verdict):
-    result = check().evaluate(measured, sigma, "Measured.", explained=[2.0, 3.0], factor=2)
+    result = check().evaluate(measured, sigma, "Measured.", explained=[2.0, 3.0], facts={"factor": 2})
     assert result.verdict == verdict
     assert (result.measured, result.sigma, result.printed) == (measured, sigma, 1.0)
     assert ("factor 2 is missing" in result.how) == (verdict == CORRECTED)
@@ -291,7 +291,7 @@ def test_another_verdict_than_the_expected_one_fails_the_command(fake, tmp_path)
 
     def run_both(context: Context):
         yield context.check("001.eq5").evaluate(1.0, None, "Right as printed.")
-        yield context.check("001.eq7").evaluate(2.0, None, "Twice.", explained=[2.0], factor=2)
+        yield context.check("001.eq7").evaluate(2.0, None, "Twice.", explained=[2.0], facts={"factor": 2})
 
     known = (check("001.eq5", expected=CORRECTED), check("001.eq7", expected=CORRECTED))
     fake(CheckGroup("001.formulas", "Formulas", 1.0, known, run_both))
@@ -328,7 +328,7 @@ def test_nothing_is_confirmed_that_could_not_have_failed(sigma, verdict, correct
     assert result.verdict == verdict
     assert result.power == pytest.approx(0.1 + 3 * sigma)
     assert ("half is 0.5 away" in result.how) == (verdict == UNDECIDED)
-    assert check().evaluate(2.0, sigma, "", explained=[2.0], factor=2).verdict == corrected
+    assert check().evaluate(2.0, sigma, "", explained=[2.0], facts={"factor": 2}).verdict == corrected
     # what does not agree is found, however weak the row
     assert check().evaluate(3.0, sigma, "", explained=[None, 3.0]).verdict == REFUTED
 
@@ -407,7 +407,7 @@ def test_the_limits_of_an_input_for_a_reader():
 
 def test_a_row_of_two_equations_fails_with_either():
     row = check(also=("001.eq6",), expected=CORRECTED)
-    right, wrong = (row.evaluate(v, None, "", explained=[2.0], factor=2) for v in (2.0, 1.0))
+    right, wrong = (row.evaluate(v, None, "", explained=[2.0], facts={"factor": 2}) for v in (2.0, 1.0))
     assert row.worse(right, right) is right
     assert row.worse(right, wrong) is row.worse(wrong, right) is wrong
 
@@ -521,7 +521,7 @@ def test_the_report_shows_everything_and_needs_nothing_from_outside(fake, tmp_pa
 
 def test_the_summary_names_every_check_and_every_correction(fake, tmp_path):
     def one(context: Context):
-        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explained=[2.0], factor=2)
+        yield context.check("001.eq5").evaluate(2.0, 0.001, "Twice | as much.", explained=[2.0], facts={"factor": 2})
         light = Chosen.power("light", 8.0, "mW", 1.0, -1.0)
         yield context.check("001.eq9").evaluate(1.0, 0.02, "Dim.", 1.0, inputs=[light])
 

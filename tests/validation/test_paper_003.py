@@ -19,6 +19,7 @@ from twin.validation.checks.check import (
     NOT_CHECKABLE,
     REFUTED,
     UNDECIDED,
+    median_of,
 )
 from twin.validation.paper_003 import fields, flights, model
 from twin.validation.registry import Selection, select

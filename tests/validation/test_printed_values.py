@@ -110,7 +110,7 @@ def test_rows() -> None:
     assert (figure.printed, figure.unit, figure.expected) == (None, "1", "not checkable")
     assert (
         "It is twice as large."
-        in size.evaluate(4.6, None, "", explained=[4.6], inputs=[Supposed("on Earth", "")], what="twice").how
+        in size.evaluate(4.6, None, "", explained=[4.6], inputs=[Supposed("on Earth", "")], facts={"what": "twice"}).how
     )
 
 

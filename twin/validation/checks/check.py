@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.spec import Number, Spec, Text
 from twin.run.artefact import plain, significant
@@ -388,7 +389,7 @@ class Check(Spec):
         implied: float | None = None,
         explained: Sequence[float | None] = (),
         inputs: Sequence[Chosen | Supposed] = (),
-        **facts: object,
+        facts: Mapping[str, object] = FrozenMap(),
     ) -> CheckResult:
         """The result, with the verdict that the numbers give.
 
@@ -417,7 +418,7 @@ class Check(Spec):
         if self.tells is None or (self.basis == "chosen") != bool(inputs):
             raise ValueError(f"{self.id}: it must say what it tells, and its inputs just where they are chosen")
         goal, allowed = float(goal), self.tolerance + noise
-        verdict, reason = self._verdict(measured, goal, allowed, explained, facts | {"measured": measured})
+        verdict, reason = self._verdict(measured, goal, allowed, explained, {**facts, "measured": measured})
         agrees = verdict == self.agreed
         ranges = tuple(i.range(lambda value: self.outside(value, goal) <= allowed, agrees) for i in inputs)
         chosen = f"Chosen here: {'; '.join(r.text for r in ranges)}." if ranges else ""

@@ -286,7 +286,7 @@ def _row(
     inputs = [place] if sentence.row.basis == "chosen" else []
     return sentence.row.evaluate(
         value, sigma, how, sentence.implied, _explained(sentence, passes, other), inputs,
-        north=lat, east=lon, alike=ALIKE,
+        facts={"north": lat, "east": lon, "alike": ALIKE},
     )  # fmt: skip
 
 

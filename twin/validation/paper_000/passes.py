@@ -27,9 +27,6 @@ TRACED = "angle_gf7"
 PAIRS = (("forward", "nadir"), ("nadir", "aft"))
 """Of alpha and beta."""
 
-TENTH = "a tenth of the smaller difference that Table 1 prints, 0.44 arcsec"
-"""Why a tolerance is 0.05 arcsec."""
-
 
 @dataclass(frozen=True, eq=False)
 class Passes:

@@ -75,7 +75,9 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
     }
     for identifier, (what, which, value) in cases.items():
         measured = float(rows[what].bias[which] / ARCSEC)
-        yield context.check(identifier).evaluate(measured, None, statement(what), 0.0, [value], tilt=speed / ARCSEC)
+        yield context.check(identifier).evaluate(
+            measured, None, statement(what), 0.0, [value], facts={"tilt": speed / ARCSEC}
+        )
 
 
 def _refraction(passes: Passes, angle: str, line: str) -> float:

@@ -28,8 +28,6 @@ FRAMES = 9
 BUDGET = "monitor_pair"
 TABLE_3 = load_printed("001").numbers("table3.spot_arcsec")
 TABLE_4 = load_printed("001").number("table4.spot_arcsec")
-INPUTS = "20 %: the paper prints two digits and no inputs; ours, in scenes/library/budgets, are chosen for its Table 3"
-"""Why a tolerance is a fifth."""
 FOCAL_PLANE, LONG_PRISM = "coordinate_thermal", "prism_180_thermal"
 """Causes whose inputs are also applied by themselves."""
 FEW_DRAWS = (FOCAL_PLANE, "central_prism_thermal")

@@ -110,7 +110,7 @@ class _Finding:
 def _row(check: Check, finding: _Finding) -> CheckResult:
     ratio = finding.ratio
     how = f"{finding.how} By camera: {ratio.text}."
-    return check.evaluate(ratio.value, ratio.sigma, how, finding.implied, finding.explained, **finding.facts)
+    return check.evaluate(ratio.value, ratio.sigma, how, finding.implied, finding.explained, facts=finding.facts)
 
 
 def without_cos2(geometry: MonitorGeometry, local: float) -> float:

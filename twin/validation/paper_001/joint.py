@@ -244,7 +244,7 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
                     f"{-matrix[k, k]:.4f}, and (7) y11 − y01; for X, (3) and (5) agree."
                 )
             value, noise = matrix[k, k], sigma[k, k]
-            yield context.check(identifier).evaluate(value, noise, text, None, [explained[parameter]], **facts)
+            yield context.check(identifier).evaluate(value, noise, text, None, [explained[parameter]], facts=facts)
     yield from _couplings(context, images, how, matrix, sigma, right)
     rows: list[list[Cell]] = [
         [

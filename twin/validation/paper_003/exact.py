@@ -27,13 +27,10 @@ from twin.orbit.flight.payload_changes import changed_payload
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.validation.checks.check import Chosen
 
-FIELDS, IMAGES, STRIP = "calibrate.yaml", "calibrate_images.yaml", "calibrate_strip.yaml"
-"""Files of scenes/orbit: seven fields of drawn points; fields of rendered images; passes with tie points."""
+FIELDS, IMAGES = "calibrate.yaml", "calibrate_images.yaml"
+"""Files of scenes/orbit: seven fields of drawn points; fields of rendered images."""
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 
-CLASS = "a value of a class lies below √10 times its number"
-"""Why a tolerance is ROOT_TEN - 1 of a number."""
-ROOT_TEN = 10**0.5
 TOLERANCE = 1e-3
 """Of the conditional sigmas; the last step of a round of the stepwise solution."""
 _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}

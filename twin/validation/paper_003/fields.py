@@ -152,7 +152,7 @@ def _orbit(context: Context, significance: np.ndarray, error: np.ndarray, setup:
     )
     expected = noise / float(np.hypot(noise, drift))
     return context.check("003.table2.orbit").evaluate(
-        implied / true, sigma, how, 1.0, [expected], noise=noise, drift=drift
+        implied / true, sigma, how, 1.0, [expected], facts={"noise": noise, "drift": drift}
     )
 
 

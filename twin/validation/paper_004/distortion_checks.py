@@ -296,7 +296,7 @@ def _requirement(context: Context, tests: Sequence[SpotTest]) -> CheckResult:
     needed = FIT_RMS_ARCSEC * ACCURACY_UM / (UM * expected)
     sigma = UM * expected / np.sqrt(2.0 * points * len(tests))
     return context.check("004.sensitivity.requirement").evaluate(
-        UM * rms(np.array(error)), sigma, how, None, [UM * expected], asked=FIT_RMS_ARCSEC, needed=needed
+        UM * rms(np.array(error)), sigma, how, None, [UM * expected], facts={"asked": FIT_RMS_ARCSEC, "needed": needed}
     )
 
 

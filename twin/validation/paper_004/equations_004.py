@@ -41,8 +41,6 @@ UNEVEN = slice(0, 44)
 """Points from one end of the line to six tenths of the other half: there f and p of (2) hang on each other, and the
 camera's radial distortion makes a p of 54 mm, which no noise hides.
 """
-PIXEL_MM = 0.007
-"""Pitch of the panchromatic line of gf7."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +285,7 @@ def _point(check: Check, tests: Sequence[SpotTest]) -> CheckResult:
         f"{MM * pitch * stated:.2f} mm. Correlation of p with the constant {with_constant:.2f}, with f {with_f:.3f} "
         "(medians of their sizes; of equal independent errors it would be 0.75 and 0)."
     )
-    return check.evaluate(error, error / np.sqrt(2 * len(tests)), how, None, [stated], edge=edge)
+    return check.evaluate(error, error / np.sqrt(2 * len(tests)), how, None, [stated], facts={"edge": edge})
 
 
 def principal_points(tests: Sequence[SpotTest]) -> tuple[Array, Array]:

@@ -30,7 +30,6 @@ Array = NDArray[np.float64]
 TEST = "turntable"
 REPEATS = load_printed("004").whole("turntable.repeats")
 REPEAT_RMS_ARCSEC = load_printed("004").number("turntable.repeat_rms_arcsec")
-CHAUVENET_RMS_ARCSEC = load_printed("004").number("turntable.chauvenet_rms_arcsec")
 FIT_RMS_ARCSEC = load_printed("004").number("turntable.fit_rms_arcsec")
 TABLES, FAST_TABLES = 1000, 200
 """Turntables that are calibrated; quick."""

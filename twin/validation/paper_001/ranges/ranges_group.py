@@ -106,7 +106,7 @@ def _range(context: Context, identifier: str, both: list[Range], geometry: Monit
         f"Corrected: 1 % {best['1 %']}, {show.fine_text(name)} {best['fine']}."
     )
     return context.check(identifier).evaluate(
-        limit * per, None, how.replace(" ″", "″"), window * per, explained, f=f, f_x=f_x, error=error
+        limit * per, None, how.replace(" ″", "″"), window * per, explained, facts={"f": f, "f_x": f_x, "error": error}
     )
 
 
