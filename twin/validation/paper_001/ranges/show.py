@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.monitor.monitoring import MonitorGeometry
 from analysis.units import ARCSEC
+from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, JOINT, PRINTED, Curves
-from twin.validation.paper_001.ranges.defocus import FieldPoint, PupilStudy
-from twin.validation.paper_001.ranges.turns import CLAIMED, EQUATIONS, FINE, NAMES, Corners, Range, key
+from twin.validation.checks.group import Context
+from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, FORMS, JOINT, PRINTED, Curves
+from twin.validation.paper_001.ranges.defocus import CONFOCAL, SMALL, FieldPoint, PupilStudy, Response
+from twin.validation.paper_001.ranges.turns import (
+    CLAIMED,
+    CUT,
+    EQUATIONS,
+    FINE,
+    KINDS,
+    NAMES,
+    UNITS,
+    Corners,
+    Range,
+    Separation,
+    criterion,
+    key,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-import math
-
-from analysis.monitor.monitoring import MonitorGeometry
-from twin.run.artefact import Cell, SvgFigure, Table
-from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges.curves import FORMS
-from twin.validation.paper_001.ranges.defocus import CONFOCAL, SMALL, Response
-from twin.validation.paper_001.ranges.turns import CUT, KINDS, UNITS, Separation, criterion
 
 _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREEN}
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}
