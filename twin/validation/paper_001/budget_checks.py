@@ -16,15 +16,6 @@ from twin.validation.checks.printed import group_of
 from twin.validation.paper_001 import budget
 from twin.validation.paper_001.budget import FEW_DRAWS, TABLE_3, BudgetImages
 
-_LINES = {
-    "centroid": "Energy centre of one image",
-    "coordinate_thermal": "Thermal distortion of the coordinate system (recorder's board)",
-    "prism_180_thermal": "Temperature gradient across the 180° prism",
-    "prism_0_thermal": "Temperature gradient across the 0° prism",
-    "prism_180_rotation": "Rotation of the 180° prism with residual angle errors",
-    "prism_0_rotation": "Rotation of the 0° prism with residual angle errors",
-    "central_prism_thermal": "Temperature of the central prism",
-}
 _LARGEST = ("prism_180_thermal", "prism_0_rotation")
 """The two lines that make most of (12)."""
 _INPUT_OF = {
@@ -170,9 +161,10 @@ def _totals(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
 
 
 def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
+    texts = {n: context.check(f"001.table3.{n}").statement.removesuffix(", error of one spot") for n in lines}
     rows: list[list[Cell]] = []
     for name, line in lines.items():
-        rows.append([_LINES[name], f"{TABLE_3[name]:g}", f"{line.three_sigma / ARCSEC:.4f}",
+        rows.append([texts[name], f"{TABLE_3[name]:g}", f"{line.three_sigma / ARCSEC:.4f}",
                      f"{line.sigma / ARCSEC:.4f}", f"{line.value:.4g} {line.unit}",
                      f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
     context.add(
@@ -187,7 +179,7 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     data = {n: {"three_sigma_arcsec": l.three_sigma / ARCSEC, "sigma_arcsec": l.sigma / ARCSEC, "input": l.value,
                 "unit": l.unit, "input_for_0.1_arcsec": l.allowed} for n, l in lines.items()}  # fmt: skip  # noqa: E741
     context.add(Data("budget", "The budget as data", "Inputs and results of every line.", data))
-    shown = {_LINES[n]: (TABLE_3[n], line.three_sigma / ARCSEC, line.sigma / ARCSEC) for n, line in lines.items()}
+    shown = {texts[n]: (TABLE_3[n], line.three_sigma / ARCSEC, line.sigma / ARCSEC) for n, line in lines.items()}
     caption = (
         "Printed and simulated error of one spot, 3σ, on a logarithmic scale; bars: three sigma of the simulation."
     )

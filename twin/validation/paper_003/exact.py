@@ -118,39 +118,24 @@ def rays_at(sensor: Sensor, attitude: Platform, pitch: float, line: np.ndarray, 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives:
-    """Coefficients of the error equations against image points of the rigorous sensor.
-
-    Attributes:
-        error: line -> unknown -> largest difference over the largest coefficient.
-    """
-
-    error: Mapping[str, Mapping[str, float]]
-
-    @property
-    def worst(self) -> tuple[str, str, float]:
-        """Line, unknown and difference."""
-        every = [(line, name, value) for line, row in self.error.items() for name, value in row.items()]
-        return max(every, key=lambda e: e[2])
-
-
-def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> Derivatives:
-    """Change each unknown of the sensor a little; what the unchanged model then misses is minus its coefficient.
+def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> tuple[str, str, float]:
+    """Coefficients of the error equations against image points of the rigorous sensor: each unknown of the sensor is
+    changed a little; what the unchanged model then misses is minus its coefficient.
 
     Args:
         setup: cameras.
         one: a pass; its check points are taken.
         bias: (3,) from the measured to the true attitude, radians.
+
+    Returns:
+        Line and unknown that are farthest off, and their largest difference over the largest coefficient.
     """
     payload = changed_payload(setup.test, setup.camera)
     ground, still = one.check_ground, np.zeros(3)
-    found = {}
+    found = []
     for line in LINES:
         model, pitch = line_model(payload, line), setup.camera.pitch_of(line)
         base = true_sensors(setup, one, trajectory=Turned(one.trajectory, bias))[line]
-        row = {}
-
         seen = places_seen(setup, one, line, np.zeros(3), bias)
         by = partials(model, rays_at(base, one.trajectory, pitch, *seen), ground, bias, still)
         for k, name in enumerate((*INTERIOR, *BIAS)):
@@ -163,9 +148,8 @@ def derivatives(setup: CalibrationSetup, one: FieldPass, bias: np.ndarray) -> De
                 sides.append(misclosure(model, rays_at(base, one.trajectory, pitch, *seen), ground, bias, still))
             coefficient = -(sides[0] - sides[1]) / (2.0 * step)
             expected = by.interior[:, :, k] if k < 3 else by.bias[:, :, k - 3]
-            row[name] = float(np.abs(coefficient - expected).max() / np.abs(coefficient).max())
-        found[line] = FrozenMap(row)
-    return Derivatives(FrozenMap(found))
+            found.append((line, name, float(np.abs(coefficient - expected).max() / np.abs(coefficient).max())))
+    return max(found, key=lambda entry: entry[2])
 
 
 def places_seen(
@@ -267,14 +251,13 @@ class Walk:
     """The stepwise solution of a field against the simultaneous one.
 
     Attributes:
-        found: stepwise. together: simultaneous. distance: largest difference, sigmas. which: of which unknown.
+        found: stepwise. together: simultaneous. distance: largest difference, sigmas.
         after: rounds -> largest difference after so many, sigmas.
     """
 
     found: Stepwise
     together: Adjustment
     distance: float
-    which: str
     after: Mapping[int, float]
 
 
@@ -290,6 +273,4 @@ def walked(campaign: Campaign, one: FieldPass, rounds: tuple[int, ...] = (1, 10,
 
     found = stepwise(*given, held=GAUGE.held, tolerance=TOLERANCE)
     after = {n: float(distance(stepwise(*given, held=GAUGE.held, rounds=n)).max()) for n in rounds}
-    away = distance(found)
-    which = np.array(together.names)[free][int(away.argmax())]
-    return Walk(found, together, float(away.max()), str(which), FrozenMap(after))
+    return Walk(found, together, float(distance(found).max()), FrozenMap(after))

@@ -32,7 +32,7 @@ class Flights:
     """N campaigns over K fields, S schemes; the last scheme lets each field use its own parameters.
 
     Attributes:
-        fields: names. latitude: (K,) radians. scheme_fields: of the averaged schemes.
+        fields: names. latitude: (K,) radians.
         bias, bias_sigma, true_bias: (N, K, 3) of each field calibrated by itself, radians; roll, pitch, yaw.
         interior, interior_sigma: (N, K, 9) in the order of INNER, metres; sigma 0 where held.
         plan, height: (N, S, K) RMS at check points without ground control, metres.
@@ -46,7 +46,6 @@ class Flights:
 
     fields: tuple[str, ...]
     latitude: np.ndarray
-    scheme_fields: tuple[tuple[str, ...], ...]
     bias: np.ndarray
     bias_sigma: np.ndarray
     true_bias: np.ndarray
@@ -115,7 +114,6 @@ def flights_of(campaigns: Sequence[Campaign]) -> Flights:
     return Flights(
         fields=names,
         latitude=latitude,
-        scheme_fields=first.spec.schemes,
         fits=tuple(fits),
         **{key: np.array(value) for key, value in rows.items()},
     )

@@ -127,8 +127,7 @@ def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResu
         )
         yield context.check("003.model").evaluate(worst, None, how, 0.0)
     if "003.equations" in context.selected:
-        found = exact.derivatives(setup, one, one.bias)
-        line, name, worst = found.worst
+        line, name, worst = exact.derivatives(setup, one, one.bias)
         how = (
             f"The equations are lost; rebuilt as derivatives of the model. {len(one.check_ground)} ground points: each "
             "unknown of the rigorous sensor is changed to either side, and what the unchanged model misses at the new "

@@ -91,11 +91,6 @@ class Bench:
             raise BeamMissedError("a clear aperture cuts a monitor beam")
         return np.moveaxis(known.place, 0, 1)
 
-    def shifts(self, start: np.ndarray, end: np.ndarray) -> dict[str, np.ndarray]:
-        """Camera -> (S, 4) px [left row, left column, right row, right column], after minus before."""
-        moved = end - start
-        return {name: moved[:, 2 * k : 2 * k + 2].reshape(-1, 4) for k, name in enumerate(self.cameras)}
-
     def readings(self, start: np.ndarray, end: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
         """Camera -> form -> (S, 4) in the units of ``monitoring.PARAMETERS``, from positions (S, C, 2)."""
         start = np.broadcast_to(start, end.shape)

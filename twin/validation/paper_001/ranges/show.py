@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.units import ARCSEC
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.group import Context
 from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, FORMS, JOINT, PRINTED, Curves
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 _COLOURS = {PRINTED: VERMILION, JOINT: ORANGE, CORRECTED: BLUE, CALIBRATED: GREEN}
 _MARKS = {PRINTED: "o", JOINT: "D", CORRECTED: "s", CALIBRATED: "^"}
-SYMBOLS = {"d_alpha": "Δα", "d_beta": "Δβ", "d_gamma": "Δγ", "d_f": "Δf"}
 _OF_PARAMETER = {"d_alpha": VERMILION, "d_beta": BLUE, "d_gamma": GREEN, "d_f": PURPLE}
 _ORDER = ("d_beta", "d_alpha", "d_gamma", "d_f")
 
