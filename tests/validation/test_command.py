@@ -659,7 +659,8 @@ def sleep(context):
     time.sleep(60)
     yield
 
-check = Check(id="001.slow", equation="", statement="", printed=1.0, tolerance=0.1, tells=1.0, against="none")
+check = Check(id="001.slow", equation="", statement="",
+              printed=1.0, tolerance=0.1, because="", tells=1.0, against="none")
 registry.GROUPS = (CheckGroup("001.slow", "", 1.0, (check,), sleep),)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)

@@ -120,6 +120,7 @@ def test_rows() -> None:
         ("tolerance: 0.1", "tolerence: 0.1", r"paper\.yaml:13: groups\..*tolerence: unknown key.*'tolerance'"),
         ("tolerance: 0.1", "tolerance: 10 %", r"paper\.yaml:13: groups\..*tolerance: not a number"),
         ("tolerance: 0.1", "tolerance: 1.5", r"paper\.yaml:13: groups\..*tolerance: can never tell that"),
+        ("        because: a twentieth\n", "", r"paper\.yaml:8: groups\..*'because' is missing"),
         ("comparison: at most", "comparison: below", r"paper\.yaml:15: groups\..*comparison: not one of the choices"),
         ("        equation: Table 1\n", "", r"paper\.yaml:8: groups\..*'equation' is missing"),
         (

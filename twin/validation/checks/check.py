@@ -353,10 +353,10 @@ class Check(Spec):
             raise Problem("no verdict to expect", shown(self.expected), allowed, within=("expected",))
         if self.not_checkable:
             return self
+        if missing := {"tolerance", "because"} - self.model_fields_set:
+            raise Problem(f"{sorted(missing)[0]!r} is missing", None, "tolerance: a number, and because: its reason")
         if self.tells is None or not self.against:
-            raise Problem(
-                "what the row tells from what is missing", None, "tells: a number above 0, and against: a phrase"
-            )
+            raise Problem("what the row tells from what is missing", None, "tells: above 0, and against: a phrase")
         if self.tolerance > self.tells:
             raise Problem(
                 "can never tell that", f"{self.tolerance:g}", f"at most {self.tells:g}", within=("tolerance",)

@@ -112,7 +112,7 @@ class Printed:
         if not isinstance(row, dict):
             return row
         printed = {"printed": self.number(row["printed"])} if isinstance(row.get("printed"), str) else {}
-        return {"id": name, **row, **printed}
+        return {**row, **printed, "id": name}
 
     def _at(self, key: str) -> Any:
         value, path = self.content.data, _path(key)
