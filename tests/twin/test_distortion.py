@@ -24,7 +24,7 @@ from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import BenchError
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import load_printed
 
 UM, NM = 1e-6, 1e-9
 FALSE_ALARM = 1e-4

@@ -19,7 +19,7 @@ from scenes.specs.load import LAB, SCENES
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import load_printed
 
 ARCMIN = np.pi / 180 / 60
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from scenes.yaml.errors import nearest
-from twin.validation.checks.group import CheckGroup, matches
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import CheckGroup, group_of, matches
 from twin.validation.paper_000 import equations_000, figures, suppositions, table1
 from twin.validation.paper_001 import budget_checks, formulas, joint, ranges, table2
 from twin.validation.paper_003 import fields, model

@@ -1,14 +1,29 @@
-"""A group of checks that share work, and what it is given to work with."""
+"""Groups of rows that share work, what they are given to work with, and the YAML files in which the rows stand beside
+what the papers print.
+
+Keys of numbers end in the unit in which the paper prints them, so that they are read as printed and converted where
+they are used. Below ``groups`` stand the rows by group and id, with the keys of `Check`; a row's ``printed`` is a
+number, or the dotted key of one in the same file.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import ConfigDict, Field
 
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
+from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
+from scenes.yaml.spec import Number, Spec, Text
+from scenes.yaml.translate import validate
+from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact
 from twin.validation.checks.check import Check, CheckResult
@@ -122,3 +137,156 @@ class CheckGroup:
     def ids(self) -> tuple[str, ...]:
         """Ids of its checks."""
         return tuple(check.id for check in self.checks)
+
+
+FILE = "printed.yaml"
+"""Name of the file in each paper's folder."""
+_FOLDER = Path(__file__).parents[1]
+_Seconds = Annotated[Number, Field(gt=0.0)]
+
+
+class GroupRows(Spec):
+    """Rows that share work; the attributes are those of `CheckGroup`."""
+
+    title: Text
+    seconds: _Seconds
+    fast_seconds: _Seconds | None = None
+    rows: dict[str, Check]
+
+
+class PaperRows(Spec):
+    """The rows of a file, whose other keys are what the paper prints."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    groups: dict[str, GroupRows]
+
+
+@dataclass(frozen=True, eq=False)
+class Printed:
+    """What a paper prints. Keys are dotted, as in ``table1.mtf_nyquist``.
+
+    Every reader raises InputError, with file, line and key, where there is nothing of that name or of that kind.
+    """
+
+    content: YamlFile
+
+    def number(self, key: str) -> float:
+        """One number."""
+        return self._number(_path(key), self._at(key))
+
+    def whole(self, key: str) -> int:
+        """A count."""
+        value = self._at(key)
+        if not isinstance(value, int) or isinstance(value, bool):
+            raise self._error(_path(key), "no whole number", value)
+        return value
+
+    def column(self, key: str) -> tuple[float, ...]:
+        """A list of numbers."""
+        return self._column(_path(key), self._at(key))
+
+    def numbers(self, key: str) -> Mapping[str, float]:
+        """A mapping of numbers, in the order of the file."""
+        return FrozenMap({k: self._number((*_path(key), k), v) for k, v in self._mapping(key).items()})
+
+    def columns(self, key: str) -> Mapping[str, tuple[float, ...]]:
+        """A mapping of lists, in the order of the file."""
+        return FrozenMap({k: self._column((*_path(key), k), v) for k, v in self._mapping(key).items()})
+
+    @cached_property
+    def groups(self) -> Mapping[str, GroupRows]:
+        """Prefix -> rows, in the order of the file, checked."""
+        return FrozenMap(validate(PaperRows, replace(self.content, data=self._named(self.content.data))).groups)
+
+    def group(self, prefix: str, run: Run) -> CheckGroup:
+        """The group of that prefix, whose rows a function computes.
+
+        Raises:
+            InputError: there is no such group.
+        """
+        if prefix not in self.groups:
+            known = nearest(prefix, self.groups)
+            raise InputError(Issue(f"no group {prefix!r}", self.content.file, key=("groups",), suggestion=known))
+        found = self.groups[prefix]
+        return CheckGroup(prefix, found.title, found.seconds, tuple(found.rows.values()), run, found.fast_seconds)
+
+    def _named(self, data: Any) -> Any:
+        """The data with each row's id in it, and the number in place of the key that stands for what is printed."""
+        groups = data.get("groups") if isinstance(data, dict) else None
+        if not isinstance(groups, dict):
+            return data
+        named: dict[str, Any] = {}
+        for prefix, group in groups.items():
+            rows = group.get("rows") if isinstance(group, dict) else None
+            if isinstance(rows, dict):
+                group = {**group, "rows": {name: self._row(name, row) for name, row in rows.items()}}
+            named[prefix] = group
+        return {**data, "groups": named}
+
+    def _row(self, name: str, row: Any) -> Any:
+        if not isinstance(row, dict):
+            return row
+        printed = {"printed": self.number(row["printed"])} if isinstance(row.get("printed"), str) else {}
+        return {**row, **printed, "id": name}
+
+    def _at(self, key: str) -> Any:
+        value, path = self.content.data, _path(key)
+        for depth, part in enumerate(path):
+            if not isinstance(value, dict) or part not in value:
+                known = value if isinstance(value, dict) else {}
+                place = path[:depth]
+                raise InputError(
+                    Issue(
+                        f"nothing is printed as {part!r}",
+                        self.content.file,
+                        self.content.lines.get(place),
+                        place,
+                        suggestion=nearest(str(part), known),
+                    )
+                )
+            value = value[part]
+        return value
+
+    def _mapping(self, key: str) -> dict[str, Any]:
+        value = self._at(key)
+        if not isinstance(value, dict):
+            raise self._error(_path(key), "no mapping", value)
+        return value
+
+    def _column(self, path: KeyPath, value: Any) -> tuple[float, ...]:
+        if not isinstance(value, list):
+            raise self._error(path, "no list", value)
+        return tuple(self._number((*path, k), item) for k, item in enumerate(value))
+
+    def _number(self, path: KeyPath, value: Any) -> float:
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            raise self._error(path, "no number", value)
+        return float(value)
+
+    def _error(self, path: KeyPath, problem: str, found: Any) -> InputError:
+        return InputError(Issue(problem, self.content.file, self.content.lines.get(path), path, found=repr(found)))
+
+
+@cache
+def load_printed(paper: str) -> Printed:
+    """What a paper prints.
+
+    Args:
+        paper: its number, for instance "001".
+
+    Raises:
+        InputError: there is no file of that paper, or it cannot be read.
+    """
+    return Printed(read_yaml(_FOLDER / f"paper_{paper}" / FILE))
+
+
+def group_of(prefix: str, run: Run = lambda context: ()) -> CheckGroup:
+    """A group by its prefix, with the rows that its paper's file holds, and what computes those that can be checked;
+    errors as of `load_printed`.
+    """
+    return load_printed(prefix.partition(".")[0]).group(prefix, run)
+
+
+def _path(key: str) -> KeyPath:
+    return tuple(key.split("."))

@@ -16,8 +16,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_run import values_of
 from twin.validation.checks.check import CheckResult, mean_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of, worst
 
 Array = NDArray[np.float64]

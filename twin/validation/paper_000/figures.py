@@ -22,8 +22,7 @@ from twin.orbit.angle.angle_flight import AnglePass, Measurement
 from twin.run.artefact import SvgFigure, Table
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import Check, CheckResult, Chosen, Supposed, mean_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 from twin.validation.paper_000.passes import TEST, Passes, planes_of, repeated, setup_of
 
 Kind = Literal["signs", "largest", "far", "alike", "little", "grows", "opposite"]

@@ -20,8 +20,7 @@ from twin.orbit.angle.angle_run import centred, effect_rows, sighted
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, standard_refractivity
 from twin.orbit.flight.line_camera import dihedral_angle
 from twin.validation.checks.check import CheckResult, mean_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_000.passes import OFF_AXIS, TEST, TRACED, Passes, planes_of, repeated, setup_of
 
 SCALE_HEIGHT = 8435.0

@@ -19,8 +19,7 @@ from twin.orbit.angle.angle_run import effect_rows, values_of
 from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import SIGMAS, CheckResult, Chosen
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 from twin.validation.paper_000.passes import PAIRS, TEST, Passes, planes_of, repeated, setup_of
 
 Array = NDArray[np.float64]

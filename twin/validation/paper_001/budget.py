@@ -20,8 +20,7 @@ from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together
 from twin.monitor.truth import line_points
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import Context, load_printed
 
 FRAMES = 9
 """Averaged in one measurement, (12)."""

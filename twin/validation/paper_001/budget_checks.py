@@ -11,8 +11,7 @@ from twin.monitor.simulated_budget import BudgetLine, Together
 from twin.run.artefact import Cell, Data, SvgFigure, Table
 from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import SIGMAS, CheckResult, Chosen, Supposed
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001 import budget
 from twin.validation.paper_001.budget import FEW_DRAWS, TABLE_3, BudgetImages
 

@@ -20,8 +20,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.check import Check, CheckResult
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001.formulas_images import (
     FACE,
     FRAMES,

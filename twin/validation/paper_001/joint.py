@@ -15,8 +15,7 @@ from scenes.specs.channel import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.validation.checks.check import CheckResult
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001 import formulas_images
 from twin.validation.paper_001.formulas import INSTRUMENT, without_cos2
 from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, MonitorImages, Ratio, quotient, ratios_svg

@@ -36,8 +36,7 @@ from twin.laboratory.autocollimator_images import AutocollimatorPath
 from twin.run.artefact import Cell, PngFigure, Table
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.validation.checks.check import CheckResult, Chosen
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

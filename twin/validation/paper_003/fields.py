@@ -19,8 +19,7 @@ from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import CheckResult, Chosen, mean_of, median_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_003 import flights as flown_fields
 from twin.validation.paper_003.exact import FIELDS, all_errors, changed, setup_of, without_light
 from twin.validation.paper_003.flights import MEDIAN, Flights, lines_of

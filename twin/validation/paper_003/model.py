@@ -19,8 +19,7 @@ from twin.run.artefact import SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import CheckResult
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_003 import exact, rendered
 from twin.validation.paper_003 import rendered as marks
 from twin.validation.paper_003.exact import (

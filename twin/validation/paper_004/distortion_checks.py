@@ -17,8 +17,7 @@ from twin.laboratory.distortion_run import SimulatedDistortion, measure, rms
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.svg import BLUE, GREY, INK, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of, median_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 from twin.validation.paper_004 import equations_004
 from twin.validation.paper_004.equations_004 import ACCURACY_UM, POINTS, SpotTest, evaluate_equations, rendered
 from twin.validation.paper_004.turntable_checks import FIT_RMS_ARCSEC, dividing

@@ -31,8 +31,7 @@ from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
 from twin.laboratory.distortion_run import SimulatedDistortion, rms
 from twin.targets.target_path import TargetPath
 from twin.validation.checks.check import Check, CheckResult
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 from twin.validation.paper_004.turntable_checks import dividing
 
 ACCURACY_UM = load_printed("004").number("distortion.accuracy_um")

@@ -27,8 +27,7 @@ from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.svg import AFTER, BEFORE, INK, LIGHT, look, new_figure, plain_axes, to_svg
 from twin.targets.edge_images import TRACK
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 
 Array = NDArray[np.float64]
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")

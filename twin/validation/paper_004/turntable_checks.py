@@ -23,8 +23,7 @@ from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_run import run_turntable
 from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import Check, CheckResult, Chosen, median_of
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of, load_printed
+from twin.validation.checks.group import Context, group_of, load_printed
 
 Array = NDArray[np.float64]
 TEST = "turntable"

@@ -20,7 +20,7 @@ from scenes.specs.channel import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import load_printed
 from twin.validation.paper_001.ranges.curves import CORRECTED, FORMS, Bench, Curves, sampled
 from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_of
 

@@ -13,8 +13,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.run.artefact import Data
 from twin.validation.checks.check import CheckResult
-from twin.validation.checks.group import Context
-from twin.validation.checks.printed import group_of
+from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001.ranges import defocus, show, turns
 from twin.validation.paper_001.ranges import defocus as returns
 from twin.validation.paper_001.ranges.curves import CALIBRATED, JOINT, PRINTED, Bench

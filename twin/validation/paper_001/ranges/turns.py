@@ -17,7 +17,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.specs.channel import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family
-from twin.validation.checks.printed import load_printed
+from twin.validation.checks.group import load_printed
 from twin.validation.paper_001.ranges.curves import FORMS, Bench, Curves, Domain, sampled
 
 NAMES = ("d_alpha", "d_beta", "d_gamma", "d_f")
