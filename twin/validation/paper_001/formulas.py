@@ -18,7 +18,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import Check, CheckResult
 from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001.formulas_images import (
@@ -30,7 +30,7 @@ from twin.validation.paper_001.formulas_images import (
     TURN,
     Ratio,
     SingleMotions,
-    ratios_svg,
+    show_ratios,
 )
 
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
@@ -208,16 +208,8 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
 
 def _show(context: Context, ratios: Mapping[str, Ratio]) -> None:
     """Figure, table and data of what was found."""
-    exact = {i: (context.check(i).equation, r.value) for i, r in ratios.items() if context.check(i).printed == 1.0}
-    if exact:
-        context.add(
-            SvgFigure(
-                "ratios",
-                "Readings of paper 001's formulas over what they should be",
-                "Measured from images, mean of both cameras; the noise is below the size of the marks.",
-                ratios_svg(exact),
-            )
-        )
+    title = "Readings of paper 001's formulas over what they should be"
+    show_ratios(context, "ratios", title, {identifier: ratio.value for identifier, ratio in ratios.items()})
     cameras = list(next(iter(ratios.values())).cameras)
     rows: list[list[Cell]] = [
         [i, *(number for name in cameras for number in ratio.cameras[name])] for i, ratio in ratios.items()

@@ -20,7 +20,9 @@ from optics.geometry.tree import Motion, State
 from scenes.specs.channel import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
+from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
+from twin.validation.checks.group import Context
 
 Value = TypeVar("Value", float, np.ndarray)
 FRAMES = 9
@@ -294,7 +296,7 @@ class SingleMotions(MonitorImages):
         return worst
 
 
-def ratios_svg(ratios: Mapping[str, tuple[str, float]]) -> str:
+def _ratios_svg(ratios: Mapping[str, tuple[str, float]]) -> str:
     """A row per check: id -> (equation, measured over right)."""
     with look("formulas-001"):
         figure = new_figure(0.8 + 0.27 * len(ratios))
@@ -312,3 +314,11 @@ def ratios_svg(ratios: Mapping[str, tuple[str, float]]) -> str:
         axes.tick_params(axis="y", length=0)
         plain_axes(axes)
         return to_svg(figure)
+
+
+def show_ratios(context: Context, name: str, title: str, found: Mapping[str, float]) -> None:
+    """Draw what was measured of rows, id -> value, that are 1 where a formula is right."""
+    exact = {i: (context.check(i).equation, v) for i, v in found.items() if context.check(i).printed == 1.0}
+    if exact:
+        caption = "Measured from images, mean of both cameras; the noise is below the size of the marks."
+        context.add(SvgFigure(name, title, caption, _ratios_svg(exact)))

@@ -13,12 +13,12 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.channel import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import CheckResult
 from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001 import formulas_images
 from twin.validation.paper_001.formulas import INSTRUMENT, without_cos2
-from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, MonitorImages, Ratio, quotient, ratios_svg
+from twin.validation.paper_001.formulas_images import FRAMES, PARAMETERS, MonitorImages, Ratio, quotient, show_ratios
 
 AMOUNTS = {"d_alpha": 50e-6, "d_beta": 50e-6, "d_gamma": 20 * ARCSEC, "d_f": 20e-6}
 """Motion behind each parameter: line CCD along X, along Y (m) and about Z (rad), growth of the camera."""
@@ -173,11 +173,7 @@ def run(context: Context) -> Iterator[CheckResult]:
         result = _angle(context, images)
         shown[result.id] = float(result.measured or 0.0)
         yield result
-    exact = {i: (context.check(i).equation, v) for i, v in shown.items() if context.check(i).printed == 1.0}
-    if exact:
-        caption = "Measured from images, mean of both cameras; the noise is below the size of the marks."
-        title = "The joint form: what was found over what should be"
-        context.add(SvgFigure("joint-ratios", title, caption, ratios_svg(exact)))
+    show_ratios(context, "joint-ratios", "The joint form: what was found over what should be", shown)
 
 
 def measured(context: Context) -> JointMotions:
