@@ -21,8 +21,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
-from scenes.yaml.spec import Number, Spec, Text
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Number, Spec, Text, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact

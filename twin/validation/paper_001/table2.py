@@ -22,7 +22,7 @@ from analysis.monitor.autocollimator import column_component, mean_difference, r
 from analysis.units import ARCSEC
 from optics.numerics.quadrature import PupilNodes
 from scenes.models.autocollimator_model import UNITS, mirror_body
-from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
     Reader,
