@@ -119,11 +119,9 @@ def _spots(run: RenderRun, camera: str) -> str:
 
 
 def _residuals(run: RenderRun) -> str:
-    from twin.main_job.report_content import residual_panels, results
     from twin.main_job.spot_plots import residuals_svg
 
-    titles = {name: estimator.title for name, estimator in run.estimators.items()}
-    return residuals_svg(residual_panels(results(run)), titles)
+    return residuals_svg(run)
 
 
 def _side(instrument: Instrument, paths: LightPaths) -> str:

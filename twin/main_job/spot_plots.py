@@ -14,7 +14,9 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
-from twin.run.artefact import FAR, tick_text
+from twin.main_job.result_sections import part_title
+from twin.main_job.verdict import state_readings
+from twin.run.artefact import FAR, residual, tick_text
 from twin.run.svg import (
     AFTER,
     BEFORE,
@@ -168,13 +170,13 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {name: every[name] for name in names}
 
 
-def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: dict[str, str]) -> str:
-    """Residuals in sigma.
-
-    Args:
-        panels: panel title -> row label -> estimator -> residual in sigma (None without noise).
-        names: estimator -> its name for readers.
-    """
+def residuals_svg(run: RenderRun) -> str:
+    """Residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
+    names = {name: estimator.title for name, estimator in run.estimators.items()}
+    panels: dict[str, dict[str, dict[str, float | None]]] = {}
+    for same in zip(*(state_readings(run, name) for name in names), strict=True):
+        panel = panels.setdefault(part_title(run, same[0]), {})
+        panel[same[0].parameter.symbol] = {one.estimator: residual(one.error, one.sigma) for one in same}
     with look("residuals"):
         rows = [len(panel) for panel in panels.values()]
         figure = new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))

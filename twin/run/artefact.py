@@ -6,10 +6,13 @@ import base64
 import json
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+from markupsafe import Markup
+
+from optics.numerics.frozen_map import FrozenMap
 from twin.run.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"
@@ -104,19 +107,51 @@ class OwnDecimals(float):
     decimals: int
 
 
+class Marked(str):
+    """A text of a table's cell that says more than itself.
+
+    Attributes:
+        below: a second, smaller line.
+        look: how it is set off, a class of the style sheet: ``truth``, ``near``, ``far``, ``wrong``, a verdict.
+        key: name by which programs find the cell in a page.
+        hint: shown to who points at the cell.
+    """
+
+    def __new__(cls, text: str, below: str = "", look: str = "", key: str = "", hint: str = "") -> Marked:
+        """The text ``text`` with what else the cell says."""
+        made = super().__new__(cls, text)
+        made.below, made.look, made.key, made.hint = below, look, key, hint
+        return made
+
+    below: str
+    look: str
+    key: str
+    hint: str
+
+
+def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
+    """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR."""
+    far = ratio is not None and abs(ratio) > FAR
+    return Marked(text, f"{'▲' if far else '●'} {residual_text(ratio)} σ", "far" if far else "near", key, hint)
+
+
 @dataclass(frozen=True, eq=False)
 class Artefact:
     """Something to show beside the checks.
 
     Attributes:
         name: of its file, without ending: small letters, digits, - and _; unique in its group.
-        title: heading in the report.
-        caption: what it shows, in sentences.
+        title: heading in the report; empty for none.
+        caption: what it shows, in sentences; words between backticks are shown as code.
+        within: file of the run folder that holds it; None for a file of its own, empty if only the page shows it.
+        full: table with all digits that a reader can take away from the page.
     """
 
     name: str
     title: str
     caption: str
+    within: str | None = field(default=None, kw_only=True)
+    full: Table | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse names that are no file names."""
@@ -128,6 +163,11 @@ class Artefact:
     def kind(self) -> str:
         """``svg``, ``png``, ``csv`` or ``json``; also the ending of the file."""
         raise NotImplementedError
+
+    @property
+    def file(self) -> str:
+        """Path of its file in the run folder, empty if it has none."""
+        return f"artefacts/{self.name}.{self.kind}" if self.within is None else self.within
 
     def content(self) -> bytes:
         """What the file holds."""
@@ -182,13 +222,23 @@ class Table(Artefact):
     """A table for the report, and as CSV; heads carry the units.
 
     ``decimals`` are those that the report shows of a column's numbers, None for so many significant ``digits``; the CSV
-    holds all digits.
+    holds all digits. ``over``: heads above the heads, each with the number of columns that it spans. ``bands``: row ->
+    title of the rows from there on, of a table in parts.
     """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     decimals: Sequence[int | None] = ()
     digits: int = 6
+    over: Sequence[tuple[str, int]] = ()
+    bands: Mapping[int, str] = field(default_factory=FrozenMap)
+
+    @property
+    def handed(self) -> Table | None:
+        """What a page hands out with all digits: ``full``, itself if its cells are plain numbers and texts, or None."""
+        if self.full is not None or any(isinstance(cell, Marked) for row in self.rows for cell in row):
+            return self.full
+        return self
 
     def shown(self) -> list[list[Cell]]:
         """The rows as the report shows them."""
@@ -238,6 +288,38 @@ class Data(Artefact):
     def content(self) -> bytes:
         """The data; NaN and infinities are refused."""
         return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Text(Artefact):
+    """Words of a report beside its figures and tables: ``caption`` is a paragraph, ``points`` are a list below it."""
+
+    points: Sequence[str] = ()
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "txt"
+
+    def content(self) -> bytes:
+        """The words."""
+        return "\n".join([self.caption, *self.points, ""]).encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Piece(Artefact):
+    """A part of a page that this program wrote, with all texts of users escaped in it."""
+
+    markup: Markup
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "html"
+
+    def content(self) -> bytes:
+        """The part."""
+        return self.markup.encode()
 
 
 @dataclass(frozen=True, eq=False)
