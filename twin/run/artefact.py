@@ -169,6 +169,16 @@ class Artefact:
         """Path of its file in the run folder, empty if it has none."""
         return f"artefacts/{self.name}.{self.kind}" if self.within is None else self.within
 
+    @property
+    def handed(self) -> Table | None:
+        """What a reader can take away from the page with all digits."""
+        return self.full
+
+    @property
+    def said(self) -> str:
+        """The caption, or what stands in its place."""
+        return self.caption
+
     def content(self) -> bytes:
         """What the file holds."""
         raise NotImplementedError
@@ -184,6 +194,11 @@ class SvgFigure(Artefact):
     def kind(self) -> str:
         """Ending of the file."""
         return "svg"
+
+    @property
+    def drawing(self) -> Markup:
+        """The drawing for a page: made by this program, not by a user."""
+        return Markup(self.svg)
 
     def content(self) -> bytes:
         """The drawing as a file of its own."""
@@ -235,7 +250,7 @@ class Table(Artefact):
 
     @property
     def handed(self) -> Table | None:
-        """What a page hands out with all digits: ``full``, itself if its cells are plain numbers and texts, or None."""
+        """``full``, or itself if its cells are plain numbers and texts."""
         if self.full is not None or any(isinstance(cell, Marked) for row in self.rows for cell in row):
             return self.full
         return self
@@ -250,6 +265,17 @@ class Table(Artefact):
             ]
             for row in self.rows
         ]
+
+    @property
+    def cells(self) -> list[list[Marked]]:
+        """The rows for a page."""
+        return [[cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in self.shown()]
+
+    @property
+    def words(self) -> list[bool]:
+        """Whether a column holds words, which begin at its left, or numbers."""
+        columns = [[row[k] for row in self.rows] for k in range(len(self.heads))]
+        return [all(isinstance(cell, str) and _is_word(cell) for cell in column) for column in columns]
 
     def _text(self, value: float, place: int | None) -> str:
         if isinstance(value, OwnDecimals):
@@ -272,6 +298,19 @@ class Table(Artefact):
     def address(self) -> str:
         """The table as a data address: a page can hand it out without a file beside it."""
         return "data:text/csv;charset=utf-8;base64," + base64.b64encode(self.content()).decode("ascii")
+
+
+def cell_text(value: Cell) -> str:
+    """A cell of a table, with at most six digits."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
+
+
+def _is_word(cell: str) -> bool:
+    return not isinstance(cell, Marked) or not cell.look or cell.look.startswith(("text", "verdict"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,6 +384,11 @@ class Undrawn(Artefact):
     def note(self) -> str:
         """What is missing, and why."""
         return f"the figure {self.title!r} could not be drawn: {self.why}"
+
+    @property
+    def said(self) -> str:
+        """The note as a sentence."""
+        return f"{self.note[0].upper()}{self.note[1:]}."
 
 
 @dataclass(frozen=True, eq=False)

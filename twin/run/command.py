@@ -284,7 +284,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
 
 def print_report(report: Report, console: Console) -> None:
     """The verdict, the main table of a report, and what else was found."""
-    from twin.run.page import cell_text
+    from twin.run.artefact import cell_text
 
     print_verdict(console, report.verdict)
     summary = report.summary

@@ -14,20 +14,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
-from twin.run.artefact import (
-    Artefact,
-    Cell,
-    Data,
-    Marked,
-    Piece,
-    PngFigure,
-    SvgFigure,
-    Table,
-    Text,
-    Undrawn,
-    plain,
-    significant,
-)
+from twin.run.artefact import Artefact
 from twin.run.data_files import FrameFacts, frame_files
 from twin.run.further_sections import further_sections
 from twin.run.page_policy import page_policy
@@ -57,53 +44,6 @@ def _template() -> Template:
 def reproduce(words: Sequence[str]) -> str:
     """The command line of a program, its subcommand and options that makes a run again, as one types it."""
     return f"python -m {shlex.join(words)} --out again"
-
-
-def artefact_content(artefact: Artefact) -> dict[str, Any]:
-    """An artefact for the macro ``show``."""
-    handed = artefact.handed if isinstance(artefact, Table) else artefact.full
-    out: dict[str, Any] = {"title": artefact.title, "caption": artefact.caption, "file": artefact.file}
-    out |= dict.fromkeys(("svg", "image", "table", "piece"))
-    out |= {"csv": handed and {"name": handed.name, "address": handed.address}, "points": ()}
-    if isinstance(artefact, SvgFigure):
-        # drawn by this program, not by a user
-        out["svg"] = Markup(artefact.svg)
-    elif isinstance(artefact, PngFigure):
-        out["image"] = artefact.address
-    elif isinstance(artefact, Table):
-        columns = [[row[k] for row in artefact.rows] for k in range(len(artefact.heads))]
-        words = [all(isinstance(cell, str) and _is_text(cell) for cell in cells) for cells in columns]
-        rows = [
-            [cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in artefact.shown()
-        ]
-        out["table"] = {"heads": artefact.heads, "over": artefact.over, "bands": artefact.bands}
-        out["table"] |= {"rows": rows, "texts": words, "dense": len(artefact.heads) > DENSE}
-    elif isinstance(artefact, Undrawn):
-        out["caption"] = f"{artefact.note[0].upper()}{artefact.note[1:]}."
-    elif isinstance(artefact, Text):
-        out["points"] = artefact.points
-    elif isinstance(artefact, Piece):
-        out["piece"] = artefact.markup
-    elif not isinstance(artefact, Data):
-        raise TypeError(f"the report cannot show {type(artefact).__name__}")
-    return out
-
-
-def _is_text(cell: str) -> bool:
-    return not isinstance(cell, Marked) or cell.look in ("", "text")
-
-
-def cell_text(value: Cell) -> str:
-    """A cell of a table, with at most six digits."""
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        return value
-    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
-
-
-DENSE = 16
-"""Columns from which on a table is set in small type."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +131,6 @@ def report_page(
     """
     return _template().render(
         report=report,
-        summary=artefact_content(report.summary),
-        sections=[(section, [artefact_content(a) for a in section.artefacts]) for section in report.sections],
         command=reproduce(words),
         rows=rows,
         versions=", ".join(f"{name} {version}" for name, version in versions().items()),
