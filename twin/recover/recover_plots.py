@@ -12,10 +12,24 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.main_job.series_plots import time_unit
-from twin.main_job.spot_plots import DIVERGING, GRAY, cross, stretch
+from twin.main_job.spot_plots import cross, stretch
 from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
-from twin.run.svg import AFTER, BEFORE, BLUE, INK, LIGHT, ORANGE, SKY, look, new_figure, plain_axes, to_svg
+from twin.run.svg import (
+    AFTER,
+    BEFORE,
+    BLUE,
+    DIVERGING,
+    GRAY,
+    INK,
+    LIGHT,
+    ORANGE,
+    SKY,
+    look,
+    new_figure,
+    plain_axes,
+    to_svg,
+)
 
 LIMIT = 5.0
 """Of the colour scale of residuals, sigmas."""

@@ -131,7 +131,8 @@ def shared_legend(
 ) -> None:
     """A legend beside all panels, of what one of them shows; in one row unless ``columns`` are given."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc=f"outside {place}", ncols=columns or max(len(labels), 1), **how)
+    outside: Any = f"outside {place}"
+    figure.legend(handles, labels, loc=outside, ncols=columns or max(len(labels), 1), **how)
 
 
 def signed_map(axes: Axes, values: np.ndarray, most: float | None = None, **how: Any) -> AxesImage:
