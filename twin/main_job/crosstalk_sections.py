@@ -43,7 +43,8 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
         "are logarithmic over three decades, red is positive. 0 stands for less than 10⁻⁶. The CSV also has what is "
         "true and what each estimator reads. Four coordinates for each camera cannot tell these motions apart; the "
-        "first four are the family that the papers' estimators assume."
+        "first four are the family that the papers' estimators assume. `crosstalk.json` says of every motion in words "
+        "what the spots make of it."
     )
     parts: list[Artefact] = [figure(drawn, "motions", caption, full=_motions(run))]
     for k, (name, table) in enumerate(run.crosstalk.items()):

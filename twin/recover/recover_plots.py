@@ -25,9 +25,10 @@ from twin.run.svg import (
     LIGHT,
     ORANGE,
     SKY,
+    gridded,
     look,
     new_figure,
-    plain_axes,
+    shared_legend,
     to_svg,
 )
 
@@ -164,8 +165,7 @@ def changes_svg(lines: Sequence[Line]) -> str:
             axes.set_ylabel(line.name)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(f"time [{unit}]")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
         return to_svg(figure)
 
@@ -183,6 +183,4 @@ def _change(axes: Axes, line: Line, size: float) -> None:
     axes.errorbar(
         time / size, value, sigma, fmt="o", color=INK, ms=3.0, elinewidth=0.8, capsize=2, label="each time by itself"
     )
-    plain_axes(axes)
-    axes.grid(axis="y", color=LIGHT, lw=0.5)
-    axes.set_axisbelow(True)
+    gridded(axes, "y")
