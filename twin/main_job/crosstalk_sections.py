@@ -10,7 +10,7 @@ from itertools import groupby
 import numpy as np
 from markupsafe import Markup
 
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.result_sections import IN_PAGE, figure
