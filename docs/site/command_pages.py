@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 from functools import cache
 from itertools import groupby
@@ -11,9 +10,8 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
-import typer
-
 from docs.site.markdown import anchor, code, prose, sentence, table
+from twin.run.console import parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("twin", "analysis", "scenes", "optics")
@@ -41,25 +39,6 @@ def _runs(path: Path) -> bool:
     text = path.read_text("utf-8")
     last = ast.parse(text).body[-1:] if '__name__ == "__main__"' in text else []
     return any(isinstance(node, ast.If) and ast.unparse(node.test) == "__name__ == '__main__'" for node in last)
-
-
-@cache
-def parser(program: str) -> Any:
-    """The command of a program, with its parser; of a program with subcommands the group.
-
-    Raises:
-        LookupError: neither a Typer application ``app`` nor a function ``main``.
-    """
-    module = importlib.import_module(program)
-    if hasattr(module, "__path__"):
-        module = importlib.import_module(f"{program}.__main__")
-    app = getattr(module, "app", None)
-    if app is None:
-        if not hasattr(module, "main"):
-            raise LookupError(f"{program}: neither app nor main")
-        app = typer.Typer(add_completion=False)
-        app.command()(module.main)
-    return typer.main.get_command(app)
 
 
 def commands(program: str) -> dict[str, Any]:
