@@ -22,13 +22,10 @@ from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.versions import versions
 
-SHARED = "twin.run"
-"""Package of the style sheet and of the macros."""
-
 
 def environment(package: str) -> Environment:
     """Environment that finds the templates of ``package`` and the shared ones."""
-    loader = FileSystemLoader([str(files(package)), str(files(SHARED))])
+    loader = FileSystemLoader([str(files(package)), str(files(__package__))])
     out = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     out.globals["page_policy"] = page_policy
     return out

@@ -18,7 +18,7 @@ import xarray as xr
 from scenes.yaml.errors import InputError
 from twin.run.provenance import Provenance
 from twin.run.run_folder import read_manifest
-from twin.run.versions import ROOT, source_digest, versions
+from twin.run.versions import BEFORE, ROOT, source_digest, versions
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore
 from twin.study.runs.plan import Plan
@@ -114,9 +114,9 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is gone: {started_in}")
     # modules are those of this program, whatever lies in the folder where it starts
-    command = [sys.executable, "-P", "-m", *words, "--out", str(place.absolute())]
+    command = [sys.executable, "-P", "-m", f"{BEFORE}{words[0]}", *words[1:], "--out", str(place.absolute())]
     command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    paths = os.pathsep.join(filter(None, (str(ROOT.parent if BEFORE else ROOT), os.environ.get("PYTHONPATH"))))
     with subprocess.Popen(
         command,
         cwd=started_in,
