@@ -45,7 +45,7 @@ from twin.laboratory.measured_readings import COMPARISON_COLUMNS, SPOT_COLUMNS
 from twin.orbit.measured.measurement_tables import COLUMNS
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")), *sorted((ROOT / "docs").rglob("*.md"))]
 _FENCE = re.compile(r"^```(\S*)[^\n]*\n(.*?)^```", re.M | re.S)
 
 
