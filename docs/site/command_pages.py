@@ -53,8 +53,9 @@ def command_page() -> str:
     parts = [
         """# Commands
 
-Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), and has a `--help` that says the
-same as this page. All that make a run folder share `--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
+Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), or `camtwin` with the last part of
+the name, `camtwin render`, and has a `--help` that says the same as this page. All that make a run folder share
+`--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
 what is in the folders says [the next page](run_folders/index.md). Exit codes: 0 success, 2 bad input (one line for
 each fault with file, line and key; nothing is written), 1 anything else, 130 interrupted.
 """
