@@ -74,6 +74,11 @@ def test_what_is_rewritten(text: str, made: str) -> None:
     assert backend.rewritten(text) == made
 
 
+def test_the_citation_and_the_changelog_have_the_version() -> None:
+    assert f"\nversion: {version()}\n" in (ROOT / "CITATION.cff").read_text("utf-8")
+    assert re.search(rf"^## {re.escape(version())}\b", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)
+
+
 def test_a_name_that_an_import_binds_is_refused() -> None:
     with pytest.raises(ValueError, match="line 1: import optics"):
         backend.rewritten("import optics.waves\noptics.waves.f()\n")
@@ -159,6 +164,9 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     manifest = json.loads((tmp_path / "a/manifest.json").read_text("utf-8"))
     assert (manifest["program"], manifest["versions"]["space-camera-twin"]) == ("twin.render", version())
     assert manifest["provenance"]["source"] == program_digest()
+    # nothing of the folder where a module is started, as in a source tree
+    (tmp_path / "typer.py").write_text("raise ImportError('found here')\n", "utf-8")
+    assert run(installed, tmp_path, "python", "-m", f"{backend.PREFIX}.scenes.lens", "--help").returncode == 0
     told = run(installed, tmp_path, "camtwin", "--version").stdout
     assert told == f"camtwin {version()} from {own}\n"
 
