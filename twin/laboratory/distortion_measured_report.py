@@ -15,8 +15,7 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_report import ESTIMATES, dress, joint_section, typeset
 from twin.laboratory.distortion_run import MeasuredDistortion
-from twin.laboratory.turntable_measured_report import DOUBTFUL
-from twin.laboratory.turntable_report import FIT_NAMES
+from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREY, ORANGE, look, new_figure, to_svg

@@ -351,12 +351,13 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> MeasuredDistortion
     compensation, series = None, None
     tables: tuple[Comparisons, ...] = ()
     if files.turntable is not None:
-        cal, held = read_turntable(files.turntable)
-        series, tables = cal.series, (cal,) if held is None else (cal, held)
+        tables = read_turntable(files.turntable)
+        cal, *held = tables
+        series = cal.series
         _check_region(files, found, series)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
         choice = choose(series, seed, names, files.turntable.folds)
-        compensation = compensate(series, choice, None if held is None else held.series)
+        compensation = compensate(series, choice, held[0].series if held else None)
     _check_angles(files, found)
     try:
         means, common, raw, compensated = reduce(

@@ -18,7 +18,7 @@ from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_plots import FIELD_COLOURS
 from twin.laboratory.measured_focus import MeasuredAlignment
-from twin.laboratory.turntable_measured_report import DOUBTFUL
+from twin.laboratory.turntable_report import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import GREY, INK, look, new_figure, plain_axes, to_svg

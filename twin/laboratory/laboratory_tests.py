@@ -30,15 +30,10 @@ def _distortion() -> Test[Any]:
 
 
 def _turntable() -> Test[Any]:
-    from twin.laboratory.turntable_measured_report import measured_turntable_report
     from twin.laboratory.turntable_numbers import TURNTABLE
     from twin.laboratory.turntable_report import turntable_report
-    from twin.laboratory.turntable_run import MeasuredTurntable
 
-    return (
-        TURNTABLE,
-        lambda run: measured_turntable_report(run) if isinstance(run, MeasuredTurntable) else turntable_report(run),
-    )
+    return TURNTABLE, turntable_report
 
 
 LABORATORY_TESTS: dict[str, Callable[[], Test[Any]]] = {
