@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from scenes.specs.procedures import studied
 from scenes.specs.study_factor import MOST_RUNS, FactorSpec, Key
 from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Seed, Spec, Text, Whole
@@ -146,16 +147,6 @@ UNITS = {
 }
 """Ending of a result's key -> unit."""
 
-BaseCommand = Literal[
-    "render",
-    "lab focus",
-    "lab distortion",
-    "lab turntable",
-    "orbit angle",
-    "orbit calibrate",
-    "orbit monitor",
-]
-
 
 class BaseSpec(Spec):
     """The job that every run of the study changes.
@@ -166,7 +157,7 @@ class BaseSpec(Spec):
             name in the library.
     """
 
-    command: BaseCommand
+    command: Annotated[str, OneOf(lambda: ("render", *studied()))]
     file: Reference
 
 

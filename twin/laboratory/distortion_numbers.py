@@ -12,19 +12,15 @@ from numpy.typing import NDArray
 from analysis.orientation.line_orientation import LINE_TERMS, LineOrientation
 from analysis.turntable.chauvenet import expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import DistortionSetup, resolve_distortion_test
-from scenes.specs.resolved import ExperimentSetup
 from twin.laboratory.distortion_run import (
     DistortionRun,
     FoundEstimate,
     MeasuredDistortion,
     SimulatedDistortion,
     rms,
-    run_distortion,
 )
 from twin.laboratory.turntable_numbers import FileNumbers, RejectedNumbers
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 Array = NDArray[np.float64]
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
@@ -387,8 +383,3 @@ def distortion_numbers(run: DistortionRun) -> dict[str, Any]:
     assert isinstance(run, SimulatedDistortion)
     found = _found(run, run.setup.test.name)
     return dict(plain_data(SimulatedDistortionNumbers(**found, truth=TruthNumbers.of(run))))
-
-
-DISTORTION = Procedure[ExperimentSetup[Any], DistortionRun](
-    "distortion", DistortionSetup, resolve_distortion_test, run_distortion, distortion_numbers
-)

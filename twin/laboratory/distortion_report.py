@@ -13,7 +13,7 @@ from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
-from twin.laboratory.distortion_run import SimulatedDistortion, rms
+from twin.laboratory.distortion_run import DistortionRun, MeasuredDistortion, SimulatedDistortion, rms
 from twin.laboratory.turntable_report import FIT_NAMES
 from twin.run.artefact import FAR, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts
@@ -118,8 +118,13 @@ SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 
 
-def distortion_report(run: SimulatedDistortion) -> Report:
+def distortion_report(run: DistortionRun) -> Report:
     """Report of a distortion test."""
+    if isinstance(run, MeasuredDistortion):
+        from twin.laboratory.distortion_measured_report import measured_distortion_report
+
+        return measured_distortion_report(run)
+    assert isinstance(run, SimulatedDistortion)
     data = distortion_numbers(run)
     truth, test = data["truth"], run.setup.test
     fit = run.compensated.fit

@@ -13,13 +13,10 @@ from analysis.turntable.angle_fits import AngleFit
 from analysis.turntable.chauvenet import expected_rejections
 from analysis.turntable.dividing_error import CalibrationSeries
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import TurntableSetup, resolve_turntable_test
-from scenes.specs.resolved import ExperimentSetup
 from twin.laboratory.measured_readings import Comparisons
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import TurntableRun, rms, run_turntable_test
+from twin.laboratory.turntable_run import TurntableRun, rms
 from twin.run.plain_data import WHERE_KNOWN, plain_data
-from twin.run.procedure import Procedure
 
 Array = NDArray[np.float64]
 
@@ -226,8 +223,3 @@ class TurntableNumbers:
 def turntable_numbers(run: TurntableRun) -> dict[str, Any]:
     """Contents of turntable.json without its frames."""
     return dict(plain_data(TurntableNumbers.of(run)))
-
-
-TURNTABLE = Procedure[ExperimentSetup[Any], TurntableRun](
-    "turntable", TurntableSetup, resolve_turntable_test, run_turntable_test, turntable_numbers
-)

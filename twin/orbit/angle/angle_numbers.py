@@ -12,11 +12,10 @@ from scipy.stats import chi2
 from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
 from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
 from twin.orbit.angle.measured_angle import MeasuredAngleRun, MeasuredAngles, run_measured_angle
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Advance, Procedure, silent
+from twin.run.procedure import Advance, silent
 
 ByAngle = Mapping[str, float | None]
 """A number for each angle of the test's file; what could not be computed is None."""
@@ -237,6 +236,3 @@ def angle_numbers(run: AngleRun | MeasuredAngleRun) -> dict[str, Any]:
     if isinstance(run, MeasuredAngleRun):
         return {"measured": plain_data({one.name: MeasuredPassNumbers.of(one) for one in run.passes})}
     return dict(plain_data(AngleNumbers.of(run)))
-
-
-ANGLE = Procedure("angle", AngleSetup, resolve_angle, run_any_angle, angle_numbers)
