@@ -21,7 +21,7 @@ from scenes.specs.orbit.load import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
-from twin.laboratory.distortion_run import MeasuredDistortion, measure_files
+from twin.laboratory.distortion_run import DistortionRun, measure_files
 from twin.laboratory.export import export_turntable
 from twin.laboratory.measured_focus import MeasuredAlignment, align_measured
 from twin.laboratory.measured_readings import read_turntable
@@ -53,7 +53,7 @@ def write(path: Path, rows: Sequence[Sequence[object]]) -> None:
         csv.writer(stream).writerows(rows)
 
 
-def distortion_of(folder: Path) -> MeasuredDistortion:
+def distortion_of(folder: Path) -> DistortionRun:
     return measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
 
 
