@@ -130,7 +130,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.lab_setup:resolve_focus_test",
         run="twin.laboratory.measured_focus:run_focus_test",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
-        report="twin.laboratory.focus_report:focus_report",
+        report="twin.laboratory.focus_measured_report:any_focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
             FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test"),
@@ -204,7 +204,7 @@ PROCEDURES: dict[str, Procedure] = {
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
         run="twin.orbit.angle.angle_numbers:run_any_angle",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
-        report="twin.orbit.angle.angle_report:angle_report",
+        report="twin.orbit.angle.measured_angle_report:any_angle_report",
         export="twin.orbit.angle.angle_export:angle_exported",
         files=(
             FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),

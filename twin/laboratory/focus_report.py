@@ -12,18 +12,13 @@ from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_plots import defocus_svg, edges_svg, mtf_svg, through_focus_svg
-from twin.laboratory.measured_focus import MeasuredAlignment
 from twin.run.artefact import SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 
-def focus_report(alignment: Alignment | MeasuredAlignment) -> Report:
+def focus_report(alignment: Alignment) -> Report:
     """Report of an alignment."""
-    if isinstance(alignment, MeasuredAlignment):
-        from twin.laboratory.focus_measured_report import measured_focus_report
-
-        return measured_focus_report(alignment)
     first, last = alignment.states[0], alignment.states[-1]
     bench = alignment.bench
     data = focus_numbers(alignment)

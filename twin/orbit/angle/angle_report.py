@@ -13,7 +13,6 @@ from scenes.yaml.units import LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections
-from twin.orbit.angle.measured_angle import MeasuredAngleRun
 from twin.run.artefact import FAR, Cell, Table, fixed
 from twin.run.report import Report, one_sentence
 
@@ -28,12 +27,8 @@ METHOD_NAMES = {
 }
 
 
-def angle_report(run: AngleRun | MeasuredAngleRun) -> Report:
+def angle_report(run: AngleRun) -> Report:
     """Report of an intersection angle test."""
-    if isinstance(run, MeasuredAngleRun):
-        from twin.orbit.angle.measured_angle_report import measured_angle_report
-
-        return measured_angle_report(run)
     verdict, lead = _found(run)
     return Report(
         "Intersection angles from ground points",

@@ -8,7 +8,8 @@ from scipy.stats import chi2
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
-from twin.orbit.angle.angle_report import METHOD_NAMES, SIGHTED
+from twin.orbit.angle.angle_report import METHOD_NAMES, SIGHTED, angle_report
+from twin.orbit.angle.angle_run import AngleRun
 from twin.orbit.angle.angle_sections import listed
 from twin.orbit.angle.measured_angle import MeasuredAngleRun, MeasuredAngles
 from twin.run.artefact import Cell, Table, fixed
@@ -16,6 +17,11 @@ from twin.run.report import Report, Section, one_sentence
 
 _FALSE_ALARM = 1e-4
 """Of a point that is named for its distance from its plane, over all points of a line."""
+
+
+def any_angle_report(run: AngleRun | MeasuredAngleRun) -> Report:
+    """Report of a simulated test or of one on measurements."""
+    return measured_angle_report(run) if isinstance(run, MeasuredAngleRun) else angle_report(run)
 
 
 def measured_angle_report(run: MeasuredAngleRun) -> Report:
