@@ -202,9 +202,9 @@ PROCEDURES: dict[str, Procedure] = {
         "angle",
         setup="scenes.specs.orbit.setup:AngleSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
-        run="twin.orbit.angle.angle_numbers:run_any_angle",
+        run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
-        report="twin.orbit.angle.measured_angle_report:any_angle_report",
+        report="twin.orbit.angle.angle_report:angle_report",
         export="twin.orbit.angle.angle_export:angle_exported",
         files=(
             FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),
