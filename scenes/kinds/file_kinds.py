@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scenes.specs.autocollimator_test import AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec

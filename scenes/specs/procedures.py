@@ -126,8 +126,8 @@ def studied() -> tuple[str, ...]:
 PROCEDURES: dict[str, Procedure] = {
     "lab focus": Procedure(
         "focus",
-        setup="scenes.specs.lab_setup:FocusSetup",
-        resolve="scenes.specs.lab_setup:resolve_focus_test",
+        setup="scenes.specs.resolved:FocusSetup",
+        resolve="scenes.specs.resolved:resolve_focus_test",
         run="twin.laboratory.measured_focus:run_focus_test",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
         report="twin.laboratory.focus_measured_report:any_focus_report",
@@ -149,8 +149,8 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "lab distortion": Procedure(
         "distortion",
-        setup="scenes.specs.lab_setup:DistortionSetup",
-        resolve="scenes.specs.lab_setup:resolve_distortion_test",
+        setup="scenes.specs.resolved:DistortionSetup",
+        resolve="scenes.specs.resolved:resolve_distortion_test",
         run="twin.laboratory.distortion_run:run_distortion",
         numbers="twin.laboratory.distortion_numbers:distortion_numbers",
         report="twin.laboratory.distortion_report:distortion_report",
@@ -177,17 +177,17 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "lab turntable": Procedure(
         "turntable",
-        setup="scenes.specs.lab_setup:TurntableSetup",
-        resolve="scenes.specs.lab_setup:resolve_turntable_test",
+        setup="scenes.specs.resolved:TurntableSetup",
+        resolve="scenes.specs.resolved:resolve_turntable_test",
         run="twin.laboratory.turntable_run:run_turntable_test",
         numbers="twin.laboratory.turntable_numbers:turntable_numbers",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(
-            FileKind("turntable_test", "scenes.specs.turntable_test:TurntableTestSpec", "a turntable test"),
+            FileKind("turntable_test", "scenes.specs.turntable:TurntableTestSpec", "a turntable test"),
             FileKind(
                 "measured_turntable",
-                "scenes.specs.turntable_test:MeasuredTurntableSpec",
+                "scenes.specs.turntable:MeasuredTurntableSpec",
                 "a turntable test on measurements",
             ),
         ),
@@ -263,8 +263,8 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit check": Procedure(
         "check",
-        setup="scenes.specs.measured.pass_files_setup:CheckSetup",
-        resolve="scenes.specs.measured.pass_files_setup:resolve_check",
+        setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
         numbers="twin.orbit.conventions.check_numbers:check_numbers",
         report="twin.orbit.conventions.check_report:check_report",
@@ -272,7 +272,7 @@ PROCEDURES: dict[str, Procedure] = {
         files=(
             FileKind(
                 "orbit_check",
-                "scenes.specs.measured.orbit_check:OrbitCheckSpec",
+                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
                 "a check of the conventions of a pass",
             ),
         ),
@@ -293,8 +293,8 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "orbit match": Procedure(
         "match",
-        setup="scenes.specs.measured.pass_files_setup:MatchSetup",
-        resolve="scenes.specs.measured.pass_files_setup:resolve_match",
+        setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
         run="twin.orbit.matching.match_run:run_match",
         numbers="twin.orbit.matching.match_numbers:match_numbers",
         report="twin.orbit.matching.match_report:match_report",
@@ -302,7 +302,7 @@ PROCEDURES: dict[str, Procedure] = {
         files=(
             FileKind(
                 "orbit_match",
-                "scenes.specs.measured.orbit_match:OrbitMatchSpec",
+                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
                 "points to be measured in line images",
             ),
         ),
@@ -372,9 +372,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.design.design_run:run_design",
         numbers="twin.design.design_run:design_numbers",
         report="twin.design.design_report:design_report",
-        files=(
-            FileKind("camera_design", "scenes.specs.camera_design:CameraDesignSpec", "an optimisation of a camera"),
-        ),
+        files=(FileKind("camera_design", "scenes.specs.camera:CameraDesignSpec", "an optimisation of a camera"),),
         judged=False,
     ),
     "design monitor": Procedure(

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.orientation.line_orientation import LINE_TERMS, LineOrientation
-from analysis.turntable.chauvenet import expected_rejections
+from analysis.orientation.interior import LINE_TERMS, LineOrientation
+from analysis.turntable.dividing_error import expected_rejections
 from analysis.units import ARCSEC
 from twin.laboratory.distortion_run import DistortionRun, FoundEstimate, SimulatedDistortion, rms
 from twin.laboratory.measured_readings import SpotReadings

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.turntable.angle_fits import AngleFit
-from analysis.turntable.chauvenet import expected_rejections
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections
 from analysis.units import ARCSEC
 from twin.laboratory.measured_readings import Comparisons
 from twin.laboratory.turntable_bench import TurntableModel

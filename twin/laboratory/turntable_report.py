@@ -12,7 +12,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.units import ARCSEC
-from scenes.specs.turntable_test import MeasuredTurntableSpec
+from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_numbers import turntable_numbers

@@ -15,8 +15,7 @@ from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.spec import Source
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Source, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.page import RunFacts, cell_text, write_test
 from twin.run.procedure import performed
