@@ -22,7 +22,8 @@ from scenes.models.monitor_layout import resolve_monitor_design
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
-from twin.run.command import Test, run_test
+from twin.run.command import run_test
+from twin.run.procedure import Test
 
 PROGRAM = "twin.design"
 

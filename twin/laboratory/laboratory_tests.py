@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from twin.run.command import Test
+from twin.run.procedure import Test
 
 
 def _focus() -> Test[Any]:

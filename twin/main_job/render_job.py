@@ -20,7 +20,7 @@ from scenes.specs.channel import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
-from twin.main_job.deformation_results import deformation_warnings
+from twin.main_job.job_tables import deformation_warnings
 from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality

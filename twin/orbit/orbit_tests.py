@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from twin.run.command import Test
+from twin.run.procedure import Test
 
 if TYPE_CHECKING:
     from twin.run.report import Report

@@ -7,14 +7,14 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
@@ -38,40 +38,13 @@ from twin.run.cli import (
     result_table,
 )
 from twin.run.ending_signals import exit_on_terminate
-from twin.run.procedure import Advance, Procedure, Run
+from twin.run.procedure import Advance, Run, Session, Test
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 from twin.run.versions import program_digest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
-
-WRITE = "write the run folder"
-"""Name of the work in the progress display."""
-
-
-@dataclass(frozen=True)
-class Session:
-    """A command at work.
-
-    Attributes:
-        folder: its run folder, open.
-        backend: where to trace.
-        advance: shows the user how far it is.
-        started: seconds since the epoch.
-        clock: reading of the monotonic clock then.
-    """
-
-    folder: RunFolder
-    backend: Backend
-    advance: Advance
-    started: float
-    clock: float
-
-    @property
-    def seconds(self) -> float:
-        """Since the start."""
-        return time.monotonic() - self.clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +65,6 @@ class Result:
 
 
 Given = TypeVar("Given")
-
-Test: TypeAlias = "tuple[Procedure[Any, Run], Callable[[Run], Report]]"
-"""A test, and what makes the report of its run. A command imports them when it has read the file: its help and what is
-wrong with a file wait for neither.
-"""
 
 
 def run_command(

@@ -19,8 +19,8 @@ from scenes.yaml.translate import validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.laboratory.laboratory_tests import LABORATORY_TESTS
 from twin.orbit.orbit_tests import ORBIT_TESTS
-from twin.run.command import Test
 from twin.run.page import RunFacts, cell_text, write_test
+from twin.run.procedure import Test
 from twin.run.report import Report, with_warnings
 from twin.run.run_folder import RunFolder
 
