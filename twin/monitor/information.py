@@ -139,7 +139,7 @@ def information_of(
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
-    noise, brightest = _noise_of_spots(path, detector, alike, single)
+    noise, brightest = spot_noise(path, detector, alike, single)
     rows = quantity_rows(instrument, ground)
     return [
         Information(
@@ -181,25 +181,22 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
     return ground_geometry(instrument, {name: model.line_focal_length for name, model in instrument.cameras.items()})
 
 
-def spot_noise(path: MonitorPath, detector: EmvaDetector, alike: bool = False) -> np.ndarray:
+def spot_noise(
+    path: MonitorPath, detector: EmvaDetector, alike: bool = False, single: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of all shifts by the noise of images before and after, (D, D) px^2: of each spot twice the bound that
-    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames.
+    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames. And the
+    share of what a pixel can hold that every spot's brightest one gets, (C,).
 
     Args:
         path: the monitor's light.
         detector: of the area CCDs.
         alike: spots of one camera and one beam width are taken to have one shape; their light is their own.
+        single: pictures of the spots in single precision.
 
     Raises:
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
-    return _noise_of_spots(path, detector, alike, single=True)[0]
-
-
-def _noise_of_spots(
-    path: MonitorPath, detector: EmvaDetector, alike: bool, single: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """What ``spot_noise`` gives, and the share of what a pixel can hold that every spot's brightest one gets, (C,)."""
     channels, spec = path.channels, path.instrument.spec
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
     shown = tuple(c for c in channels if c in groups.values())

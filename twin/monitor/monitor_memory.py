@@ -7,7 +7,7 @@ of the pupil grow with the square of the CCD's diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from optics.numerics.threads import cores
@@ -33,6 +33,18 @@ def largest_piece(each: int) -> int:
         each: pixels of all frames of one.
     """
     return max(1, min(CHUNK, LARGEST_FRAMES // each))
+
+
+def pieces(count: int, each: int) -> Iterator[slice]:
+    """States of a series whose frames are worked on at once.
+
+    Args:
+        count: states.
+        each: pixels of all frames of one.
+    """
+    size = largest_piece(each)
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
 
 
 STARTED = 220e6

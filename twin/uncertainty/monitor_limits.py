@@ -10,7 +10,6 @@ import numpy as np
 
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import LeastSeen, Quantity, Split
 from analysis.monitor.recovery import joint, judged_spots
 from analysis.monitor.stated_numbers import Elasticity, HeavyTail, elasticities, heavy_tails
@@ -22,6 +21,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models.disturbances import state_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.yaml.errors import InputError
+from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import half_fields
@@ -193,12 +193,8 @@ def find_limits(
     if not found:
         return None
     rows = np.stack([quantity.row for quantity in found])
-    still = np.zeros((1, len(experiment.path.channels), 2))
-    shifts = Shifts(still, still, noise[None], cameras, stated)
-    splits = {
-        name: limits.split(rows, stated, noise, estimator.gain(shifts)[0])
-        for name, estimator in applicable(cameras, stated).items()
-    }
+    gains = estimator_gains(cameras, stated, noise)
+    splits = {name: limits.split(rows, stated, noise, gain) for name, gain in gains.items()}
     remedies = [
         Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
         Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),

@@ -20,7 +20,7 @@ from twin.run.provenance import Provenance
 from twin.run.run_folder import read_manifest
 from twin.run.versions import ROOT, source_digest, versions
 from twin.study.runs.block_result import BlockResult
-from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore
+from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.task import Task, evaluate
@@ -169,7 +169,7 @@ def repeat_chunk(state: FolderState) -> Repetition:
     try:
         plan = Plan.of(resolve_study(folder / CONFIG))
         store = ChunkStore(folder, plan)
-        store.look()
+        store.entries.update({entry.first: entry for entry in examined(folder).whole})
         whole = store.result() if not store.missing else None
     except (ChunkError, InputError) as error:
         raise CannotRepeat(str(error)) from error
