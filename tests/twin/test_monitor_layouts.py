@@ -143,6 +143,17 @@ def with_light(path: MonitorPath, times: float, frames: int) -> MonitorPath:
     return MonitorPath(replace(start, spec=spec, channels=channels), path.backend)
 
 
+def fisher(found: Information) -> np.ndarray:
+    """(M, M) information of the spots on the motions, per standard deviation squared."""
+    spots = found.disturbances.spots
+    return np.asarray(spots.T @ np.linalg.solve(found.noise, spots))
+
+
+def posterior(found: Information) -> np.ndarray:
+    """(4 K, 4 K) covariance of the parameters that is left, rad and m."""
+    return np.asarray(found.disturbances.misfit(found.gain) + found.gain @ found.noise @ found.gain.T)
+
+
 def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
     even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     # rounding falls with the number of frames where read noise spreads over its steps
@@ -162,11 +173,15 @@ def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBe
         noise=np.kron(np.eye(2), once),
     )
     brighter = replace(one, noise=once / 2.0)
-    assert twice.fisher == pytest.approx(brighter.fisher, rel=1e-9, abs=1e-9 * float(np.abs(one.fisher).max()))
-    assert twice.posterior == pytest.approx(brighter.posterior, rel=1e-6, abs=1e-9 * float(np.trace(one.posterior)))
+    known = fisher(one)
+    assert fisher(twice) == pytest.approx(fisher(brighter), rel=1e-9, abs=1e-9 * float(np.abs(known).max()))
+    left = posterior(one)
+    assert posterior(twice) == pytest.approx(posterior(brighter), rel=1e-6, abs=1e-9 * float(np.trace(left)))
+    for name, rows in one.quantities.items():
+        assert one.sigma(name) ** 2 == pytest.approx(np.trace(rows @ left @ rows.T) / len(rows), rel=1e-9)
     # the two forms of the posterior are one
-    root = own.parameters @ np.linalg.solve(np.eye(len(shared)) + one.fisher, own.parameters.T)
-    assert one.posterior == pytest.approx(root, rel=1e-5, abs=1e-9 * float(np.trace(root)))
+    root = own.parameters @ np.linalg.solve(np.eye(len(shared)) + known, own.parameters.T)
+    assert left == pytest.approx(root, rel=1e-5, abs=1e-9 * float(np.trace(root)))
 
 
 def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, path: MonitorPath) -> None:
