@@ -25,7 +25,7 @@ def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> 
     told: dict[int, str] = {}
     states = random_states(3, 1)
     record = one_detector(pair, FRAMES, SEED)
-    how = Observing(lambda photons, numbers: each(pair, photons, numbers), leave=told.__setitem__, stated=False)
+    how = Observing(record, leave=told.__setitem__, stated=False)
     (found,) = observe(pair, [states[0], BEYOND, *states[1:]], how, [10, 11, 12, 13])
     assert list(told) == [11]
     assert "forward/" in told[11]
@@ -42,13 +42,6 @@ def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> 
     assert list(told) == [11, 3]
 
 
-def each(pair: MonitorExperiment, photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frames with the stream of each state's own number, wherever it stands."""
-    pairs = zip(photons, numbers.tolist(), strict=True)
-    after = [pair.frames_after(one[None], FRAMES, SEED, number) for one, number in pairs]
-    return pair.frames_before(FRAMES, SEED), np.concatenate(after)
-
-
 def test_pieces_are_the_whole(pair: MonitorExperiment) -> None:
     states = random_states(5, 2)
     whole, parts = (
@@ -62,9 +55,11 @@ def test_pieces_are_the_whole(pair: MonitorExperiment) -> None:
 def test_a_spot_that_cannot_be_measured_leaves_its_state_out(pair: MonitorExperiment) -> None:
     """Whatever is recorded: here one detector has seen no light."""
     told: dict[int, str] = {}
+    exposed = one_detector(pair, FRAMES, SEED)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        before, after = each(pair, photons, numbers)
+        before, after = exposed(photons, numbers)
+        assert isinstance(before, np.ndarray)
         after[numbers == 1, 2] = 0
         return before, after
 

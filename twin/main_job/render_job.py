@@ -135,7 +135,7 @@ def render_job(
     before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
 
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        after = experiment.frames_after(photons, count, number, int(numbers[0]))
+        after = experiment.frames_after(photons, count, number, numbers)
         stage.begin(6)
         return before, after
 

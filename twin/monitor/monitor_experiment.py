@@ -310,7 +310,7 @@ class MonitorExperiment:
         photons = self.nominal_photons + stray
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
 
-    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:
+    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int | np.ndarray = 0) -> np.ndarray:
         """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
 
         Args:
@@ -318,13 +318,14 @@ class MonitorExperiment:
             frames: per state.
             seed: as for ``frames_before``; state number first + s draws from a stream of its own, so that the frames of
                 a state do not depend on how a series is cut into pieces.
-            first: number of the first state.
+            first: number of the first state, or of each, (S,).
         """
         pattern = self.pattern(seed)
         out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
+        numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
 
         def expose(s: int) -> None:
-            own = stream(seed, 2, first + s)
+            own = stream(seed, 2, int(numbers[s]))
             out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, own, threads=1)
 
         if len(photons) == 1:

@@ -237,4 +237,4 @@ def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: n
         stray: photons beside those of the nominal spots.
     """
     before = experiment.frames_before(frames, seed, stray)
-    return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, int(numbers[0])))
+    return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))

@@ -63,7 +63,7 @@ class StateReader:
         def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
             if not noise:
                 return self._clean_before, experiment.expected_frames(photons)
-            return self._before, experiment.frames_after(photons, self.frames, self.seed, number)
+            return self._before, experiment.frames_after(photons, self.frames, self.seed, numbers)
 
         how = Observing(record, self.centroid, single=single, frames=None if noise else self.frames)
-        return next(observe(experiment, [state], how))
+        return next(observe(experiment, [state], how, [number]))
