@@ -12,9 +12,9 @@ from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.measured_finishes import measured_finishes
 from scenes.models.obstruction import find_obstructions
-from scenes.specs.channel import PRISM_180, prism_of
+from scenes.models.scenery import measured_finishes
+from scenes.specs.instrument import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError

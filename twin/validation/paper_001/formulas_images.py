@@ -17,7 +17,7 @@ from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
