@@ -35,8 +35,10 @@ def largest_piece(each: int) -> int:
     return max(1, min(CHUNK, LARGEST_FRAMES // each))
 
 
-STARTED = 220e6
-"""Of a job of any size until its spots are measured, beside the imported program: kernels and their compiler; bytes."""
+STARTED = 290e6
+"""Memory of a job of any size until its spots are measured, beside the imported program: kernels, their compiler, and
+what the heap keeps of arrays that are freed; bytes.
+"""
 DRAWN = 410e6
 """The same when it is drawn and written, the most of a small one; bytes."""
 PIXEL = 380.0
