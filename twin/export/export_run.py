@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import xarray as xr
 from analysis.images.image_file import ImageFile
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, why_unreadable
 from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_fits, read_frames, run_cards
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
@@ -159,7 +160,7 @@ def _told(place: Path) -> Iterator[None]:
         raise
     # readers of spoilt files fail in ways that cannot be foreseen
     except Exception as error:
-        problem = f"cannot be read as a file of a run: {error}"
+        problem = f"cannot be read as a file of a run: {why_unreadable(error)}"
         raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
 
 
@@ -192,7 +193,10 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
         if name in manifest.sha256:
             with (
                 _told(source / name),
-                xr.open_dataset(source / name, engine="h5netcdf", decode_timedelta=False) as data,
+                # of a damaged file the library leaves the file open
+                xr.open_dataset(
+                    io.BytesIO((source / name).read_bytes()), engine="h5netcdf", decode_timedelta=False
+                ) as data,
             ):
                 content = expected_fits(data.load(), [*about, *cards])
                 items = int(np.prod(data["photons"].shape[:-2]))

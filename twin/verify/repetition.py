@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -16,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from scenes.yaml.errors import InputError
+from scenes.yaml.input_file import why_unreadable
 from twin.run.provenance import Provenance
 from twin.run.run_folder import read_manifest
 from twin.run.versions import ROOT, source_digest, versions
@@ -204,11 +206,11 @@ def _data_difference(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[F
     """study.nc and study.json against what the chunks hold."""
     name = "study.nc"
     try:
-        with xr.open_dataset(folder / name, engine="h5netcdf") as data:
+        with xr.open_dataset(io.BytesIO((folder / name).read_bytes()), engine="h5netcdf") as data:
             kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
         told = json.loads((folder / "study.json").read_bytes())
     except (OSError, ValueError) as error:
-        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {error}"),)
+        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {why_unreadable(error)}"),)
     made = make_dataset(plan, whole)
     found = [
         array_difference(str(key), kept.get(str(key), np.array([])), np.asarray(made[key].values))
