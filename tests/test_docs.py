@@ -31,14 +31,14 @@ from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, check_nodes
 from scenes.specs.load import load_camera
-from scenes.specs.measured.monitor_frames_setup import read_frame_table
+from scenes.specs.measured.monitor_frames import read_frame_table
 from scenes.specs.resolved import resolve
-from scenes.yaml.coating_file import COLUMNS as COATING_COLUMNS
 from scenes.yaml.csv_table import read_table
 from scenes.yaml.errors import InputError
+from scenes.yaml.finish_files import COLUMNS as COATING_COLUMNS
 from scenes.yaml.node_table import COLUMNS as NODE_COLUMNS
 from scenes.yaml.node_table import HEAT_COLUMNS
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.laboratory.measured_focus import IMAGE_COLUMNS, MTF_COLUMNS
 from twin.laboratory.measured_readings import COMPARISON_COLUMNS, SPOT_COLUMNS

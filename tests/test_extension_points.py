@@ -46,21 +46,21 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.targets.target_shapes import Target
 from optics.thermal.heat import Temperature
-from optics.waves.pupil_function import circular_pupil
+from optics.waves.pupil_stack import circular_pupil
 from scenes.models.camera_model import surface_of
 from scenes.models.obstruction import find_obstructions
 from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from scenes.schema import json_schema
 from scenes.specs.camera import MirrorSpec
-from scenes.specs.channel import PRISMS
+from scenes.specs.instrument import PRISMS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.resolved import resolve
 from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure

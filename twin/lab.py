@@ -11,7 +11,7 @@ if __name__ == "__main__":
 
 import typer
 
-from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
 from twin.laboratory.laboratory_tests import LABORATORY_TESTS, export_distortion, export_focus, export_turntable
 from twin.run.command import add_test
 

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.images import fits_image, tiff_image
-from analysis.images.image_header import ImageError, ImageHeader
-from analysis.images.picture_header import JPEG_MAGIC, PNG_MAGIC, jpeg_header, png_header
+from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
 
 __all__ = ["GAMMAS", "ImageError", "ImageFile", "Region", "tone_curve"]
 

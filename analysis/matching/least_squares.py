@@ -20,8 +20,8 @@ redundancy) and with a correlation of neighbours up to three pixels that all poi
 the points, freed of what a fit of so many unknowns takes out of white noise. With influence matrix B (place by pixel),
 by the curvature that is left when the slopes of the template's noise are taken off
 (`analysis.matching.template_noise`), the covariance is B C B', and more where smoothing leaves few residuals to tell it
-by. To it comes what residuals tell of displacements that differ within the window (`analysis.matching.window_relief`)
-and the error of interpolation; steps of them are tested for (`analysis.matching.window_halves`). Not in the covariance:
+by. To it comes what residuals tell of displacements that differ within the window (`analysis.matching.window_checks`)
+and the error of interpolation; steps of them are tested for (`analysis.matching.window_checks`). Not in the covariance:
 what pulls all points alike (an error of the reference's georeference) and aliasing of the image.
 """
 
@@ -36,8 +36,14 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.template_noise import TemplateNoise, noise_energy, template_noise
-from analysis.matching.window_halves import WindowHalves, window_halves
-from analysis.matching.window_relief import ResidualCorrelation, WindowRelief, residual_correlation, window_relief
+from analysis.matching.window_checks import (
+    ResidualCorrelation,
+    WindowHalves,
+    WindowRelief,
+    residual_correlation,
+    window_halves,
+    window_relief,
+)
 
 __all__ = ["Fits", "least_squares"]
 

@@ -12,7 +12,7 @@ from analysis.matching.correlation import search
 from analysis.matching.least_squares import least_squares
 from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates
 from analysis.matching.spline import resampled
-from analysis.matching.window_halves import FALSE_ALARM, risk
+from analysis.matching.window_checks import FALSE_ALARM, risk
 
 __all__ = ["MatchOptions", "Matches", "Reason", "match", "resampled"]
 

@@ -156,7 +156,7 @@ class MatchOptions:
         largest_sigma: of the place along its worst direction, px; above it UNCERTAIN, or RELIEF where only
             displacements within the window bring it there.
         largest_risk: chance of a step of displacement within a window that passes the test for one; above it UNTESTED.
-            The share of windows that fail the test and its power give it (`analysis.matching.window_halves`).
+            The share of windows that fail the test and its power give it (`analysis.matching.window_checks`).
         least_contrast: standard deviation of the image under the template over that of one pixel's noise; a point that
             fails otherwise is called FLAT below it.
         saturation: DN from which a pixel counts as saturated; None: the largest value of an integer type.

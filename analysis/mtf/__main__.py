@@ -33,11 +33,10 @@ from rich.console import Console
 from rich.table import Table
 
 from analysis.images.image_file import ImageError, ImageFile, Region, tone_curve
-from analysis.mtf.bar_contrast import BarError, BarMtf
-from analysis.mtf.bar_pages import measure_bar_pages, page_warnings
-from analysis.mtf.edge_mtf import EdgeMtf
+from analysis.mtf.bar_mtf import BarError, BarMtf, measure_bar_pages, page_warnings
+from analysis.mtf.edge_location import EdgeError
 from analysis.mtf.edge_pages import grey_step, measure_pages
-from analysis.mtf.slanted_edge import EdgeError
+from analysis.mtf.slanted_edge import EdgeMtf
 
 Array = NDArray[np.float64]
 BAD_INPUT, NOT_PRINTED = 2, 1

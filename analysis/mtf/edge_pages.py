@@ -21,11 +21,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
-from analysis.mtf.edge_mtf import EdgeMtf, PagePlaces
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
 from analysis.mtf.slanted_edge import (
     CORE_WIDTHS,
+    EdgeMtf,
     FittedEdge,
+    PagePlaces,
     check_phases,
     checked_frequency,
     core_width,

@@ -31,7 +31,7 @@ from scipy.stats import chi2
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise, Parameters
 from analysis.orbit.forward_intersection import intersect
 from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.residual_weights import Robust, robust_weights, standardised
+from analysis.orbit.residual_tests import Robust, robust_weights, standardised
 from analysis.orbit.shared_noise import Series, SharedNoise
 from analysis.orbit.three_line_model import BIAS, LineModel, Rays, bias_rotation
 

@@ -1,5 +1,14 @@
-"""What is the same in all frames of a spot and is not the spot: bad pixels, columns and rows, an uneven background,
-reflections.
+"""What is the same in all frames of a spot and is not the spot, and images in which it is repaired.
+
+The repaired image is c = u d + (1 - u) m(q) - e(q), with the image d, the mask u of the pixels that are used, the
+fitted model m and what of it is not the spot and its level, e. The parameters q are fitted to d themselves, so that a
+change n of the image moves a centroid of influence g to first order by
+
+    g u n + g ((1 - u) dm/dq - de/dq) Q n,     Q = (D' W D)^-1 D' W
+
+with the design D and the weights W of the fit: the covariance holds what the repair costs.
+
+Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 
 Everything is looked for in the residuals of the fitted shape. A pixel is bad when it differs from what the pixels about
 it predict: light comes through the optics and has no detail of one pixel. Whether an uneven background or a reflection
@@ -10,6 +19,7 @@ where something was found, pixels are then left out from `CLOSER` sigmas on.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,13 +30,58 @@ from scipy.stats import chi2, norm
 from analysis.spots import spot_image
 from analysis.spots.frame_screening import FALSE_ALARM, Finding, ScreenedFrames
 from analysis.spots.noise import NoiseModel
-from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
-from analysis.spots.spot_positions import SpotError
+from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened, model_parts
+from analysis.spots.spot_positions import SpotError, SpotPositions
 from analysis.spots.spot_template import SpotTemplate
 
-__all__ = ["Examined", "examine", "lone_pixels", "refit"]
-
 Array = NDArray[np.float64]
+
+
+def repaired_centroid(
+    screened: ScreenedFrames,
+    fit: ScreenedFit,
+    noise: NoiseModel,
+    template: SpotTemplate,
+    measure: Callable[[Array, NoiseModel], SpotPositions],
+) -> tuple[SpotPositions, float]:
+    """Measure the centre of a spot in the repaired image, and what the repair costs: sigma over what it would be if
+    nothing had been repaired and all frames were used, minus 1. Less than 0 where what was put in has less noise than
+    what was taken out, as at the edge of a window.
+
+    Args:
+        screened: frames of one state.
+        fit: of the spot in these.
+        noise: of the detector.
+        template: the spot's one shape.
+        measure: a centroid with its maps, of images (1, H, W) and their noise.
+
+    Raises:
+        SpotError: of ``measure``.
+    """
+    shape = screened.mean.shape
+    design, extra, beside = model_parts(fit, template)
+    level, used, counts = fit.level.ravel(), fit.used.ravel(), screened.counts.ravel()
+    image = np.where(used, screened.mean.ravel(), level) - extra
+    # what is saturated has been put in
+    found = measure(image.reshape(1, *shape), replace(noise, saturation_dn=1e300))
+    assert found.gain_maps is not None
+    own = found.gain_maps.reshape(2, -1)
+    temporal, fixed = noise.temporal_variance_dn2(level, 1), noise.fixed_variance_dn2(level)
+    weighted = design * (used / (temporal / counts + fixed))
+    influence = own * used + own @ (~used * design - beside).T @ fit.inverse @ weighted
+    new = (influence * (temporal / counts)) @ influence.T + screened.jitter / float(np.median(counts))
+    old = (influence * fixed) @ influence.T
+    ideal = (own * (temporal / screened.recorded + fixed)) @ own.T
+    positions = replace(
+        found,
+        temporal_covariance=new[None],
+        fixed_covariance=old[None],
+        gain_maps=influence.reshape(1, 2, *shape),
+        light_dn=noise.light_signal_dn(level).reshape(1, *shape),
+    )
+    return positions, float(np.sqrt(np.trace(new + old) / np.trace(ideal)) - 1.0)
+
+
 Mask = NDArray[np.bool_]
 CLOSER = 4.5
 """Sigmas of a pixel from which it is left out of an image that is known to hold defects."""

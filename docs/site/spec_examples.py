@@ -14,8 +14,7 @@ from docs.site.spec_keys import NAMED, NODE, Key, Section, every_key, flow, keys
 from scenes.schema import MODELS
 from scenes.specs.load import SCENES
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 LONGEST = 70

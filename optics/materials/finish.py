@@ -1,4 +1,4 @@
-"""What a surface does with light in the path tracer: Fresnel's laws and finishes."""
+"""What a surface does with light in the path tracer: Fresnel's laws, finishes and measured coatings."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from optics.materials import scatter_table
-from optics.materials.coating_table import CoatingTable
-from optics.materials.scatter import ABg, Scatter
-from optics.materials.scatter_table import ScatterTable
+from optics.materials import scatter
+from optics.materials.scatter import ABg, Scatter, ScatterTable
 from optics.numerics.array_math import select, sqrt
 
 GRAZING = 1e-12
@@ -93,8 +91,8 @@ class Finish:
             return
         if self.scatter is not None or self.transmission > 0.0:
             raise ValueError("a table of scattering stands in place of a lobe, on what light does not go through")
-        for k in range(scatter_table.STEPS if not self.scattered_only else 0):
-            angle = 0.5 * np.pi * k / scatter_table.STEPS
+        for k in range(scatter.STEPS if not self.scattered_only else 0):
+            angle = 0.5 * np.pi * k / scatter.STEPS
             reflected = self.reflectance if self.coating is None else self.coating.at(angle, False)[0]
             if self.table.drawn.share[k] > reflected:
                 raise ValueError(
@@ -143,3 +141,59 @@ SILICON = Finish(reflectance=0.3, records=True)
 
 ABSORBER = Finish()
 """Perfectly black."""
+
+STEPS = 360
+"""Intervals of the angle of incidence, from 0 to 90 degrees, in which a path looks a coating up."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoatingTable:
+    """A coating at one wavelength, for unpolarised light.
+
+    Attributes:
+        angles: of incidence on the side of air, ascending from 0, radians, (K,).
+        reflectance: 0 to 1, (K,).
+        transmittance: 0 to 1, (K,); None where it is not told.
+
+    Linear between the angles; constant beyond the last one.
+
+    Raises:
+        ValueError: angles that do not ascend, shares that are impossible.
+    """
+
+    angles: np.ndarray
+    reflectance: np.ndarray
+    transmittance: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        """Copy, freeze and check."""
+        names = ("angles", "reflectance", *(("transmittance",) if self.transmittance is not None else ()))
+        for name in names:
+            array = np.array(getattr(self, name), np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if not np.all(np.diff(self.angles) > 0.0) or self.angles[0] < 0.0 or self.angles[-1] > 0.5 * np.pi:
+            raise ValueError("angles of incidence must ascend between 0 and 90 degrees")
+        through = np.zeros_like(self.reflectance) if self.transmittance is None else self.transmittance
+        if not self.reflectance.shape == through.shape == self.angles.shape:
+            raise ValueError("one reflectance, and one transmittance, for each angle")
+        if min(np.min(self.reflectance), np.min(through)) < 0.0 or np.max(self.reflectance + through) > 1.0 + 1e-9:
+            raise ValueError("reflectance and transmittance lie between 0 and 1, also together")
+
+    def at(self, angle: float, through: bool) -> tuple[float, float]:
+        """Reflectance and transmittance at an angle of incidence in radians.
+
+        Args:
+            angle: radians.
+            through: whether light goes through, where no transmittance is told all that is not reflected.
+        """
+        reflected = float(np.interp(angle, self.angles, self.reflectance))
+        if not through:
+            return reflected, 0.0
+        if self.transmittance is None:
+            return reflected, 1.0 - reflected
+        return reflected, float(np.interp(angle, self.angles, self.transmittance))
+
+    def drawn(self, through: bool) -> np.ndarray:
+        """Reflectance and transmittance from 0 to 90 degrees, (STEPS + 1, 2); ``through`` as for ``at``."""
+        return np.array([self.at(float(angle), through) for angle in np.linspace(0.0, 0.5 * np.pi, STEPS + 1)])

@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 
-from optics.materials.material import TemperatureRange
-from optics.materials.names import unknown_name
+from optics.materials.material import TemperatureRange, unknown_name
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import UnphysicalError
 

@@ -1,4 +1,4 @@
-"""Light scattered by surfaces: ABg and Harvey-Shack lobes and Lambertian diffusion.
+"""Light scattered by surfaces: ABg and Harvey-Shack lobes, Lambertian diffusion, and measured tables.
 
 Both lobes depend only on d = |beta - beta0|, the distance of the scattered from the specular direction in the plane of
 direction cosines (components of the unit vectors along the surface; Harvey 1976; Pfisterer, "Approximated scatter
@@ -14,11 +14,28 @@ l = B^(1/g) and f = A/B / (1 + x^g) = A/B h(x) rho(x), where rho = (1 + x^2)^(g/
 2^(g/2 - 1). So d is drawn with the share of the upper bound, and a draw is kept with the probability rho / max(rho).
 What is not kept, and what falls outside the unit circle (no such direction exists), stays in the specular beam:
 energy is conserved for every angle of incidence without any table.
+
+A table gives f (1/sr, scattered radiance over incident irradiance) for angles of incidence t and directions that are
+counted from the specular one: the radial angle r away from it, and the azimuth p about it, 0 where the direction leans
+toward the surface's normal, counter-clockwise for who looks against the specular light. With n the normal, s the
+specular direction, e = (n - cos t s) / sin t and h = s x e the direction is
+
+    w = cos r s + sin r (cos p e + sin p h),        n . w = cos r cos t + sin r cos p sin t,
+
+and the total integrated scatter TIS(t) is the integral of f (n . w) sin r dr dp over all w above the surface. f is
+linear in t, p and r between the table's numbers, constant before its first and beyond its last angle of incidence, and
+zero beyond its last radial angle.
+
+Sampling. For angles of incidence one degree apart the scattered power is summed over cells that are finer than the
+table's; a path takes one of the two angles beside its own, with the probability of the power that it has there, then a
+ring of cells, a cell in it, and a place in the cell, even in solid angle. Between two such angles what falls below the
+surface by the difference is turned up, so that all that TIS says is scattered.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from math import log as real_log
 from typing import Any
@@ -203,3 +220,232 @@ def _check_total(scatter: Scatter, upper: float) -> None:
     total = total_scatter(scatter)  # a lobe that falls off scatters most at normal incidence
     if total > 1.0:
         raise ValueError(f"{scatter} would scatter {total:.4g} of the light; no surface scatters more than 1")
+
+
+STEPS = 90
+"""Intervals of the angle of incidence, from 0 to 90 degrees, for which directions are drawn."""
+LEAST_RINGS, LEAST_SECTORS = 240, 36
+MOST_CELLS = 120_000
+"""Rings times sectors of a table at most."""
+_CHECKED = np.arange(0.0, 91.0, 5.0)
+"""Angles of incidence, degrees, at which a table is asked whether it scatters more than there is, beside its own."""
+_GAUSS = (0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ScatterTable:
+    """BSDF in specular-relative angles.
+
+    Attributes:
+        incidence: ascending, radians, (I,).
+        azimuth: ascending, radians, (A,): a single one for a lobe that is round, 0 to pi for one that is the same on
+            both sides of the plane of incidence, else 0 to 2 pi.
+        radial: ascending from 0, radians, (R,).
+        values: 1/sr, (I, A, R).
+
+    Raises:
+        ValueError: angles that do not ascend or do not span what they must, negative values, or more than all of the
+            light scattered.
+    """
+
+    incidence: np.ndarray
+    azimuth: np.ndarray
+    radial: np.ndarray
+    values: np.ndarray
+
+    def __post_init__(self) -> None:
+        """Copy, freeze and check."""
+        for name in ("incidence", "azimuth", "radial", "values"):
+            array = np.array(getattr(self, name), np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        shape = (len(self.incidence), len(self.azimuth), len(self.radial))
+        if self.values.shape != shape or min(shape) < 1 or shape[2] < 2:
+            raise ValueError(f"values must be {shape} with two radial angles or more, found {self.values.shape}")
+        for axis in (self.incidence, self.azimuth, self.radial):
+            if not np.all(np.diff(axis) > 0.0):
+                raise ValueError("angles must ascend")
+        if not (self.incidence[0] >= 0.0 and self.incidence[-1] < 0.5 * np.pi):
+            raise ValueError("angles of incidence lie between 0 and less than 90 degrees")
+        if self.radial[0] != 0.0 or self.radial[-1] > np.pi * (1.0 + 1e-12):
+            raise ValueError("radial angles go from 0 to 180 degrees at most")
+        ends = (np.pi, 2.0 * np.pi)
+        if shape[1] > 1 and not (
+            self.azimuth[0] == 0.0 and np.min(np.abs(np.subtract(self.azimuth[-1], ends))) < 1e-9 * np.pi
+        ):
+            raise ValueError("azimuths go from 0 to 180 or to 360 degrees")
+        if not (np.all(np.isfinite(self.values)) and np.min(self.values) >= 0.0):
+            raise ValueError("a BSDF is finite and not negative")
+        if self.rings * self.sectors > MOST_CELLS:
+            raise ValueError(f"{self.rings} x {self.sectors} cells are more than {MOST_CELLS}")
+        largest = max(self.total(float(angle)) for angle in (*self.incidence, *np.radians(_CHECKED)))
+        if largest > 1.0:
+            raise ValueError(f"it would scatter {largest:.4g} of the light; no surface scatters more than 1")
+
+    @property
+    def rings(self) -> int:
+        """Cells along the radial angle: every interval of the table the same number of times."""
+        intervals = len(self.radial) - 1
+        return intervals * -(-LEAST_RINGS // intervals)
+
+    @property
+    def sectors(self) -> int:
+        """Cells along the azimuth, over half a turn or the whole."""
+        intervals = max(len(self.azimuth) - 1, 1)
+        return intervals * -(-LEAST_SECTORS // intervals)
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether azimuths end at half a turn, and the other half is the same."""
+        return len(self.azimuth) == 1 or self.azimuth[-1] < 1.5 * np.pi
+
+    def bsdf(self, incidence: float, azimuth: np.ndarray, radial: np.ndarray) -> np.ndarray:
+        """BSDF at one angle of incidence, 1/sr.
+
+        Args:
+            incidence: radians.
+            azimuth: radians, any; shape S.
+            radial: radians, 0 to pi; shape S.
+        """
+        table = self._at(incidence)
+        turn = np.mod(azimuth, 2.0 * np.pi)
+        turn = np.minimum(turn, 2.0 * np.pi - turn) if self.mirrored else turn
+        r = np.asarray(radial, np.float64)
+        k = np.clip(np.searchsorted(self.radial, r, side="right") - 1, 0, len(self.radial) - 2)
+        u = (r - self.radial[k]) / (self.radial[k + 1] - self.radial[k])
+        if len(self.azimuth) == 1:
+            low = high = np.zeros(r.shape, int)
+            v = np.zeros(r.shape)
+        else:
+            low = np.clip(np.searchsorted(self.azimuth, turn, side="right") - 1, 0, len(self.azimuth) - 2)
+            high = low + 1
+            v = (turn - self.azimuth[low]) / (self.azimuth[high] - self.azimuth[low])
+        f = (1.0 - v) * ((1.0 - u) * table[low, k] + u * table[low, k + 1])
+        f += v * ((1.0 - u) * table[high, k] + u * table[high, k + 1])
+        return np.where(r <= self.radial[-1] * (1.0 + 1e-12), f, 0.0)
+
+    def _at(self, incidence: float) -> np.ndarray:
+        """The table at one angle of incidence, (A, R)."""
+        place = np.interp(incidence, self.incidence, np.arange(len(self.incidence)))
+        k = min(int(place), max(len(self.incidence) - 2, 0))
+        w = place - k
+        return (1.0 - w) * self.values[k] + (w * self.values[k + 1] if w > 0.0 else 0.0)
+
+    def total(self, incidence: float) -> float:
+        """Total integrated scatter at an angle of incidence in radians, share of the incident power."""
+        return float(np.sum(self._power(incidence)))
+
+    @cached_property
+    def _edges(self) -> tuple[np.ndarray, np.ndarray]:
+        """Radial and azimuthal edges of the cells, radians."""
+        span = self.azimuth if len(self.azimuth) > 1 else np.array([0.0, np.pi])
+        out = []
+        for axis, count in ((self.radial, self.rings), (span, self.sectors)):
+            place = np.linspace(0.0, len(axis) - 1, count + 1)
+            out.append(np.interp(place, np.arange(len(axis)), axis))
+        return out[0], out[1]
+
+    def _power(self, incidence: float) -> np.ndarray:
+        """Scattered share into each cell, (rings, sectors), both halves together where they are the same."""
+        table, (radial, azimuth) = self._at(incidence), self._edges
+        power = np.zeros((self.rings, self.sectors))
+        dr, dp = np.diff(radial)[:, None], np.diff(azimuth)[None, :]
+        for a in _GAUSS:
+            along = _between(table, len(self.radial), self.rings, a)  # (A, rings)
+            r = radial[:-1, None] + a * dr
+            rise, lean = np.cos(r) * np.cos(incidence), np.sin(r) * np.sin(incidence)
+            for b in _GAUSS:
+                f = _between(along.T, len(self.azimuth), self.sectors, b)
+                up = rise + lean * np.cos(azimuth[None, :-1] + b * dp)
+                power += 0.25 * f * np.maximum(up, 0.0) * np.sin(r)
+        return power * dr * dp * (2.0 if self.mirrored else 1.0)
+
+    @cached_property
+    def drawn(self) -> DrawnScatter:
+        """Distributions from which directions are drawn."""
+        radial, azimuth = self._edges
+        share, rings, sectors = [], [], []
+        for angle in np.linspace(0.0, 0.5 * np.pi, STEPS + 1):
+            power = self._power(float(angle))
+            share.append(np.sum(power))
+            rings.append(_cumulative(np.sum(power, axis=1)[None])[0])
+            sectors.append(_cumulative(power))
+        return DrawnScatter(np.array(share), np.array(rings), np.array(sectors), np.cos(radial), azimuth, self.mirrored)
+
+    def reciprocity(self, count: int = 400, seed: int = 1) -> float:
+        """Rms of the relative difference of f with its directions exchanged; 0 for a reciprocal surface.
+
+        Of pairs of directions, even over the hemisphere and up to 80 degrees from the normal, for which the table knows
+        both; not a number where it knows none.
+
+        Args:
+            count: of pairs.
+            seed: of the pairs.
+        """
+        rng = np.random.default_rng(seed)
+        low, high = self.incidence[0], max(self.incidence[-1], self.incidence[0])
+        top = min(np.radians(80.0), high)
+        if not top > low:
+            return float("nan")
+        one, two = (np.arccos(rng.uniform(np.cos(top), np.cos(low), count)) for _ in range(2))
+        turn = rng.uniform(0.0, np.pi, count)
+        differences = []
+        for a, b, p in zip(one, two, turn, strict=True):
+            there, back = self._between(a, b, p), self._between(b, a, p)
+            if there is not None and back is not None and there + back > 0.0:
+                differences.append((there - back) / (0.5 * (there + back)))
+        # to 1e-9: below is the rounding of angles
+        return round(float(np.sqrt(np.mean(np.square(differences)))), 9) if differences else float("nan")
+
+    def _between(self, arriving: float, leaving: float, turn: float) -> float | None:
+        """BSDF from one polar angle to another, ``turn`` from the plane of incidence on the far side of the normal."""
+        specular = np.array([np.sin(arriving), 0.0, np.cos(arriving)])
+        out = np.array([np.sin(leaving) * np.cos(turn), np.sin(leaving) * np.sin(turn), np.cos(leaving)])
+        toward = np.array([-np.cos(arriving), 0.0, np.sin(arriving)])
+        side = np.cross(specular, toward)
+        radial = float(np.arccos(np.clip(specular @ out, -1.0, 1.0)))
+        if radial > self.radial[-1]:
+            return None
+        azimuth = float(np.arctan2(out @ side, out @ toward))
+        return float(self.bsdf(arriving, np.array([azimuth]), np.array([radial]))[0])
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnScatter:
+    """What directions are drawn from, for angles of incidence from 0 to 90 degrees in ``STEPS`` intervals.
+
+    Attributes:
+        share: TIS, (STEPS + 1,).
+        rings: cumulative shares of the rings, from 0 to 1, (STEPS + 1, rings + 1).
+        sectors: in each ring those of its sectors, (STEPS + 1, rings, sectors + 1).
+        cosines: of the rings' edges, descending, (rings + 1,).
+        azimuths: the sectors' edges, radians, (sectors + 1,).
+        mirrored: whether half of the draws go to the other side of the plane of incidence.
+    """
+
+    share: np.ndarray
+    rings: np.ndarray
+    sectors: np.ndarray
+    cosines: np.ndarray
+    azimuths: np.ndarray
+    mirrored: bool
+
+
+def _between(table: np.ndarray, knots: int, cells: int, place: float) -> np.ndarray:
+    """Values (N, knots), linear between knots, at a place of each of the cells that divide them, (N, cells)."""
+    if knots == 1:
+        return np.broadcast_to(table, (len(table), cells))
+    at = (np.arange(cells) + place) * (knots - 1) / cells
+    k = np.minimum(at.astype(int), knots - 2)
+    u = at - k
+    return np.asarray((1.0 - u) * table[:, k] + u * table[:, k + 1])
+
+
+def _cumulative(power: np.ndarray) -> np.ndarray:
+    """Cumulative shares along the last axis, from 0 to exactly 1, (N, K + 1); even where there is no power."""
+    total = np.sum(power, axis=-1, keepdims=True)
+    even = np.where(total > 0.0, power, 1.0)
+    sums = np.cumsum(even, axis=-1)
+    out = np.concatenate([np.zeros_like(sums[:, :1]), sums / sums[:, -1:]], axis=-1)
+    out[:, -1] = 1.0
+    return out

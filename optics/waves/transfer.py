@@ -26,7 +26,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.numerics.threads import cores, one_blas_thread
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 
 Part = Literal["all", "clear", "shadow"]
 

@@ -5,25 +5,28 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from scenes.specs.autocollimator_test import AutocollimatorTestSpec
-from scenes.specs.camera import CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_design import CameraDesignSpec
+from scenes.specs.autocollimators import AutocollimatorTestSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
-from scenes.specs.measured.orbit_check import OrbitCheckSpec
-from scenes.specs.measured.orbit_data import MeasuredAngleSpec, MeasuredCalibrationSpec, OrbitDataSpec
-from scenes.specs.measured.orbit_match import OrbitMatchSpec
+from scenes.specs.measured.orbit_data import (
+    MeasuredAngleSpec,
+    MeasuredCalibrationSpec,
+    OrbitCheckSpec,
+    OrbitDataSpec,
+    OrbitMatchSpec,
+)
 from scenes.specs.orbit.angle import OrbitAngleSpec
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.monitor import OrbitMonitorSpec
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.study import StudySpec
-from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableTestSpec
+from scenes.specs.turntable import MeasuredTurntableSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import read_yaml

@@ -107,7 +107,7 @@ def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: floa
     if kind is None:
         raise InputError(Issue("what kind of file is this?", str(path), allowed=", ".join(READS)))
     if kind == "batoid":
-        from scenes.lens.batoid_reader import read_batoid
+        from scenes.lens.batoid_file import read_batoid
 
         if wavelength is None:
             raise InputError(Issue("a file of batoid names no wavelength", str(path), allowed='--wavelength "620 nm"'))
@@ -219,7 +219,7 @@ def write(
 
             content = zemax_text(lens).replace("\n", "\r\n").encode("utf-16")
         else:
-            from scenes.lens.batoid_writer import batoid_text
+            from scenes.lens.batoid_file import batoid_text
 
             text, more = batoid_text(lens)
             notes += more

@@ -19,8 +19,16 @@ from optics.raytrace.assembly import Interaction
 from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
-from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription
-from scenes.lens.shapes import edge_entry, edge_size, facing, without_rim
+from scenes.lens.prescription import (
+    SEQUENCE,
+    LensSurface,
+    Note,
+    Prescription,
+    edge_entry,
+    edge_size,
+    facing,
+    without_rim,
+)
 from scenes.models.camera_design import camera_file
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec

@@ -13,12 +13,10 @@ from optics.geometry.pose import Pose
 from optics.geometry.surface import plane
 from optics.geometry.tree import AT_REST, State
 from optics.raytrace.assembly import Interaction
-from scenes.lens.prescription import LensSurface, Note, Prescription, Pupil
-from scenes.lens.shapes import joined
-from scenes.models.camera_assembly import line_body
-from scenes.models.camera_model import IMAGE, LIGHT, CameraModel
+from scenes.lens.prescription import LensSurface, Note, Prescription, Pupil, joined
+from scenes.models.camera_model import IMAGE, LIGHT, CameraModel, line_body
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 
 def prescription_of(model: CameraModel) -> Prescription:

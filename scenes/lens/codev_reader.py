@@ -18,14 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture, Circle
+from optics.geometry.aperture import Aperture, Circle, Edge
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
-from optics.geometry.surface_edge import Edge
 from optics.raytrace.assembly import Interaction
 from scenes.lens.codev_statements import CodevSurface, CodevSystem, statements, take
 from scenes.lens.prescription import (
     FARTHEST,
+    LARGEST_ORDER,
     NO_GLASSES,
     Chain,
     Glasses,
@@ -33,9 +33,11 @@ from scenes.lens.prescription import (
     Note,
     Prescription,
     Pupil,
+    clear,
+    even_asphere,
     glass_key,
+    polynomial,
 )
-from scenes.lens.shapes import LARGEST_ORDER, clear, even_asphere, polynomial
 from scenes.lens.statements import Source, Statement, read_lines
 
 _D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9

@@ -1,20 +1,261 @@
-"""A sequential prescription as other optical programs write it: surfaces one after the other, each in its own frame."""
+"""A sequential prescription as other optical programs write it, and its shapes as the tracer's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import comb, pi, remainder
+from typing import Any
 
 import numpy as np
 
-from optics.geometry.aperture import Aperture
+from optics.geometry import aperture
+from optics.geometry.aperture import Aperture, Circle, Edge, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.pose import Pose
-from optics.geometry.surface import Surface
-from optics.geometry.surface_edge import Edge
+from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
+from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.tree import Body, RigidTree
+from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+
+LARGEST_ORDER = 10
+"""Of polynomials and Zernike terms; beyond it monomials lose digits."""
+_POLYNOMIAL = {(a, n - a): (f"x{a}" if a > 1 else "x" * a) + (f"y{n - a}" if n - a > 1 else "y" * (n - a))
+               for n in (2, 3, 4) for a in range(n + 1)}  # fmt: skip
+
+
+def even_asphere(curvature: float, conic: float, powers: Mapping[int, float]) -> Surface:
+    """A conic with even powers of the radius, the second one among them.
+
+    Args:
+        curvature: 1/m.
+        conic: Schwarzschild's constant.
+        powers: power n -> coefficient of r^n, m^(1-n); n even, 2 to 20.
+    """
+    last = max((n for n, a in powers.items() if a != 0.0 and n > 2), default=2)
+    even = tuple(float(powers.get(n, 0.0)) for n in range(4, last + 1, 2))
+    second = powers.get(2, 0.0)
+    # the trace knows no r^2 beside the conic; x^2 + y^2 is the same
+    terms = (XYPolynomial(x2=second, y2=second),) if second else ()
+    return Surface(curvature, conic, even, terms=terms)
+
+
+def polynomial(surface: Surface, coefficients: Mapping[tuple[int, int], float], radius: float) -> Surface:
+    """The surface with a polynomial in x and y on top.
+
+    Args:
+        surface: without a figure or polynomial of its own.
+        coefficients: (a, b) -> c_ab of (x/radius)^a (y/radius)^b, metres.
+        radius: of the disk that the coefficients are for, metres.
+
+    Raises:
+        ValueError: an order above LARGEST_ORDER.
+    """
+    given = {k: c for k, c in coefficients.items() if c != 0.0}
+    order = max((a + b for a, b in given), default=0)
+    if order > LARGEST_ORDER:
+        raise ValueError(f"a polynomial of order {order}; at most {LARGEST_ORDER} is known")
+    if not given:
+        return surface
+    if set(given) <= set(_POLYNOMIAL) and not surface.terms:
+        term = XYPolynomial(**{_POLYNOMIAL[k]: c / radius ** sum(k) for k, c in given.items()})
+        return replace(surface, terms=(term,))
+    return surface.with_figure(ZernikeFigure(radius, (0.0, 0.0), zernike_of(given)))
+
+
+def zernike_of(coefficients: Mapping[tuple[int, int], float]) -> dict[int, float]:
+    """Zernike terms, Noll index -> amplitude, of a polynomial on the unit disk, (a, b) -> coefficient of x^a y^b."""
+    order = max((a + b for a, b in coefficients), default=0)
+    size = triangle_size(order)
+    matrix, wanted = np.zeros((size, size)), np.zeros(size)
+    for j in range(1, size + 1):
+        for a, b, c in cartesian_terms(j):
+            matrix[triangle_index(a, b), j - 1] += c
+    for (a, b), c in coefficients.items():
+        wanted[triangle_index(a, b)] = c
+    return {j: float(t) for j, t in enumerate(np.linalg.solve(matrix, wanted), start=1) if t}
+
+
+def moved_polynomial(
+    coefficients: Mapping[tuple[int, int], float], centre: tuple[float, float]
+) -> dict[tuple[int, int], float]:
+    """A polynomial in x - cx and y - cy as one in x and y."""
+    out: dict[tuple[int, int], float] = {}
+    cx, cy = centre
+    for (a, b), c in coefficients.items():
+        for i in range(a + 1):
+            for j in range(b + 1):
+                part = c * comb(a, i) * (-cx) ** (a - i) * comb(b, j) * (-cy) ** (b - j)
+                out[i, j] = out.get((i, j), 0.0) + part
+    return out
+
+
+def joined(surface: Surface) -> Surface:
+    """The surface with the Zernike terms of its own sag in its figure: one set of them, as other programs have it.
+
+    Raises:
+        ValueError: the figure is one on a grid, or terms about two places are of too high an order to be joined.
+    """
+    own = next((term for term in surface.terms if isinstance(term, ZernikeSag)), None)
+    if own is None:
+        return surface
+    rest = tuple(term for term in surface.terms if term is not own)
+    given = {j: float(a) for j, a in own.amplitudes.items() if a}
+    centre = (float(own.x0), float(own.y0))
+    figure = surface.figure
+    shape = replace(surface, terms=rest, figure=ZernikeFigure(float(own.radius), centre, given) if given else None)
+    if figure is None or not given:
+        return replace(shape, figure=figure) if figure is not None else shape
+    if not isinstance(figure, ZernikeFigure):
+        raise ValueError("Zernike terms of a sag beside a figure on a grid")
+    total: dict[tuple[int, int], float] = {}
+    assert isinstance(shape.figure, ZernikeFigure)
+    for one in (shape.figure, figure):
+        for pair, value in about_vertex(one).items():
+            total[pair] = total.get(pair, 0.0) + value
+    if max(a + b for a, b in total) > LARGEST_ORDER:
+        raise ValueError(f"Zernike terms beyond order {LARGEST_ORDER}")
+    radius = max(one.radius + float(np.hypot(*one.centre)) for one in (shape.figure, figure))
+    terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in total.items()})
+    return replace(shape, figure=ZernikeFigure(radius, (0.0, 0.0), terms))
+
+
+def about_vertex(figure: ZernikeFigure) -> dict[tuple[int, int], float]:
+    """A figure as a polynomial in x and y: (a, b) -> c_ab, m^(1-a-b)."""
+    order = max(figure.order, 0)
+    table = monomials(figure.terms, order, figure.radius)
+    own = {(n - b, b): float(table[triangle_index(n - b, b)]) for n in range(order + 1) for b in range(n + 1)}
+    return moved_polynomial(own, figure.centre)
+
+
+def clear(
+    circle: float | None = None,
+    hole: float = 0.0,
+    rectangle: tuple[float, float] | None = None,
+    ellipse: tuple[float, float] | None = None,
+    centre: tuple[float, float] = (0.0, 0.0),
+) -> Aperture | None:
+    """A clear aperture of what a file gives, in metres; None for nothing.
+
+    Raises:
+        ValueError: sizes that no aperture has.
+    """
+    if rectangle is not None:
+        return Rectangle(*rectangle, centre)
+    if ellipse is not None:
+        return Ellipse(*ellipse, centre)
+    if circle is not None:
+        return Circle(circle, centre, hole)
+    return None
+
+
+def facing(surface: LensSurface) -> LensSurface:
+    """The same surface in a frame whose z has no part against the prescription's: turned about its own x by half a
+    turn where it has, which is the same body.
+    """
+    if surface.pose.rotation[2, 2] >= 0.0:
+        return surface
+    return turned_over(surface)
+
+
+def turned_over(surface: LensSurface) -> LensSurface:
+    """The same surface, told in a frame that is turned about its x by half a turn."""
+    over = Pose(np.diag([1.0, -1.0, -1.0]))
+    shape = surface.surface
+    terms = []
+    for term in shape.terms:
+        if not isinstance(term, XYPolynomial):
+            raise TypeError(f"no rule for turning {type(term).__name__} over")
+        terms.append(XYPolynomial(**{n: -getattr(term, n) * (-1) ** b for (_, b), n in _POLYNOMIAL.items()}))
+    figure = shape.figure
+    if isinstance(figure, ZernikeFigure):
+        (cx, cy), given = figure.centre, figure.terms
+        # sag(x, y) -> -sag(x, -y): terms that are odd in y keep their sign
+        signs = {j: 1.0 if noll_to_nm(j)[1] < 0 else -1.0 for j in given}
+        figure = ZernikeFigure(figure.radius, (cx, -cy), {j: signs[j] * a for j, a in given.items()})
+    elif figure is not None:
+        raise TypeError("no rule for turning a grid over")
+    even = tuple(-a for a in shape.even)
+    edge = surface.aperture
+    if edge is not None:
+        edge = replace(edge, centre=(edge.centre[0], -edge.centre[1]))
+    return replace(
+        surface,
+        pose=surface.pose @ over,
+        surface=Surface(-shape.curvature, shape.conic, even, figure, tuple(terms)),
+        aperture=edge,
+        edges=tuple(map(aperture.turned_over, surface.edges)),
+    )
+
+
+def polynomial_of(shape: Surface) -> dict[tuple[int, int], float]:
+    """Polynomial of all that a surface has beyond its conic but a figure: (a, b) -> c_ab of x^a y^b, m^(1-a-b)."""
+    out: dict[tuple[int, int], float] = {}
+    for term in shape.terms:
+        if not isinstance(term, XYPolynomial):
+            raise TypeError(f"{type(term).__name__} is no polynomial")
+        for pair, name in _POLYNOMIAL.items():
+            out[pair] = out.get(pair, 0.0) + float(getattr(term, name))
+    for n, value in enumerate(shape.even, start=2):
+        for k in range(n + 1):
+            pair = (2 * (n - k), 2 * k)
+            out[pair] = out.get(pair, 0.0) + value * comb(n, k)
+    return {pair: c for pair, c in out.items() if c != 0.0}
+
+
+def without_rim(surface: LensSurface) -> LensSurface:
+    """A stop without its outer edge; the hole in it stays."""
+    rim = surface.aperture
+    hole = Edge(Circle(rim.inner, rim.centre), blocks=True) if isinstance(rim, Circle) and rim.inner else None
+    return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
+
+
+def edge_size(edge: Edge) -> float:
+    """Largest number of an edge, metres."""
+    shape = edge.shape
+    numbers = [*shape.centre]
+    match shape:
+        case Circle():
+            numbers.append(shape.radius)
+        case Ray():
+            numbers.append(shape.width)
+        case Polygon():
+            numbers += [value for corner in shape.corners for value in corner]
+        case _:
+            numbers += [shape.half_x, shape.half_y]
+    return max(map(abs, numbers))
+
+
+def edge_entry(edge: Edge) -> dict[str, Any]:
+    """An edge as a camera's file has it."""
+    shape = edge.shape
+    kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
+
+    def metres(*values: float) -> Any:
+        written = [format_quantity(float(value), LENGTH) for value in values]
+        return written if len(written) > 1 else written[0]
+
+    out: dict[str, Any] = {"blocks" if edge.blocks else "clear": kind}
+    if any(shape.centre):
+        out["centre"] = metres(*shape.centre)
+    match shape:
+        case Circle(radius, _, inner):
+            out["radius"] = metres(radius)
+            if inner:
+                out["inner"] = metres(inner)
+        case Ray(width, _):
+            out["width"] = metres(width)
+        case Polygon(corners, _):
+            out["corners"] = [metres(*corner) for corner in corners]
+        case _:
+            out["half"] = metres(shape.half_x, shape.half_y)
+    if edge.turn and not isinstance(shape, Circle | Polygon):
+        out["turn"] = format_quantity(remainder(edge.turn, 2.0 * pi), ANGLE)
+    return out
+
 
 SEQUENCE = "imaging"
 """Name of the way of the light in a prescription's assembly."""

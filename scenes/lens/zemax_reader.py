@@ -11,10 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Ellipse, Rectangle
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
-from optics.geometry.surface_edge import Edge, EdgeShape
 from optics.geometry.zernike import MAX_NOLL
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import (
@@ -26,9 +25,11 @@ from scenes.lens.prescription import (
     Note,
     Prescription,
     Pupil,
+    clear,
+    even_asphere,
     glass_key,
+    polynomial,
 )
-from scenes.lens.shapes import clear, even_asphere, polynomial
 from scenes.lens.statements import MOST_SURFACES, Source, Statement, joined, read_lines, split_words
 
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}

@@ -18,8 +18,7 @@ from optics.geometry.sag_terms import XYPolynomial
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
 from optics.raytrace.assembly import Interaction
 from scenes.lens.camera_writer import rounded
-from scenes.lens.prescription import LensSurface, Prescription
-from scenes.lens.shapes import facing, polynomial_of
+from scenes.lens.prescription import LensSurface, Prescription, facing, polynomial_of
 from scenes.yaml.errors import InputError
 
 MM = 1e3

@@ -26,7 +26,7 @@ from optics.materials.glass import glass
 from optics.raytrace.assembly import Assembly, Element, Interaction
 
 if TYPE_CHECKING:
-    from scenes.specs.autocollimator_test import AutocollimatorTestSpec, LensSpec
+    from scenes.specs.autocollimators import AutocollimatorTestSpec, LensSpec
 
 BENCH = "bench"
 AXES = ("X", "Y", "Z")

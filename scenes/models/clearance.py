@@ -19,7 +19,7 @@ from optics.geometry.tree import PlacedBodies
 from optics.raytrace.assembly import Assembly, Element
 from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, channel_of, prism_of
+from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, channel_of, prism_of
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 LEAST_GAP = 20e-6

@@ -21,8 +21,14 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
-from scenes.models.camera_assembly import camera_bodies, camera_elements, camera_sequences, focal_plane_body
-from scenes.models.camera_model import CameraModel, derive_camera
+from scenes.models.camera_model import (
+    CameraModel,
+    camera_bodies,
+    camera_elements,
+    camera_sequences,
+    derive_camera,
+    focal_plane_body,
+)
 from scenes.models.camera_sharpness import no_cameras
 from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
@@ -37,7 +43,7 @@ from scenes.models.monitor_chain import (
 from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
-from scenes.specs.channel import BASE, CENTRAL_PRISM, Channel
+from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel
 from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 

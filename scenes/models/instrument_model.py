@@ -13,8 +13,7 @@ from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, SIDES, Channel, prism_of
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, SIDES, Channel, InstrumentSpec, prism_of
 from scenes.specs.job import NodeInfo
 from scenes.yaml.errors import KeyPath
 

@@ -31,7 +31,7 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
-from scenes.specs.channel import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
+from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
 from scenes.yaml.errors import KeyPath
 
 if TYPE_CHECKING:

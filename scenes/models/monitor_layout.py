@@ -21,14 +21,20 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.obstruction import imaging_segments, rays_taken
 from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec
-from scenes.specs.channel import CENTRAL_PRISM, SIDES
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import ChannelParts, ChannelSpec, InstrumentSpec, MountedCameraSpec, ReturnFaceSpec
+from scenes.specs.instrument import (
+    CENTRAL_PRISM,
+    SIDES,
+    ChannelParts,
+    ChannelSpec,
+    InstrumentSpec,
+    MountedCameraSpec,
+    ReturnFaceSpec,
+)
 from scenes.specs.load import read_design
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.spec import Paths
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Paths, validate
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 
 if TYPE_CHECKING:

@@ -18,15 +18,14 @@ from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.element_numbers import media_along
-from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.system import SystemBatch, assemble, media_along
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import line_body
 from scenes.models.clearance import convex_bodies, remedy
 from scenes.models.instrument_model import MisplacedError, key_of
 from scenes.models.monitor_chain import beside
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, PRISM_0, PRISM_180, Channel
+from scenes.specs.instrument import BASE, PRISM_0, PRISM_180, Channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
 if TYPE_CHECKING:

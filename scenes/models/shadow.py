@@ -33,7 +33,7 @@ from optics.waves.pupil_stack import products, to_terms
 from scenes.models.clearance import convex_bodies
 from scenes.models.obstruction import imaging_segments, rays_taken
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 if TYPE_CHECKING:
     from scenes.models.instrument_model import Instrument

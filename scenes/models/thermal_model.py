@@ -29,7 +29,7 @@ from optics.thermal.heat import Temperature, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import THICKNESS, behind
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 SPACING = 0.25
 """Longest edge of the finite elements in a prism, metres. A linear field is met exactly by any mesh."""

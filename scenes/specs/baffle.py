@@ -11,9 +11,8 @@ from typing import Annotated, Literal, assert_never
 import numpy as np
 from pydantic import Field, model_validator
 
-from optics.geometry.aperture import Circle, Ellipse, Rectangle
+from optics.geometry.aperture import Circle, Edge, EdgeShape, Ellipse, Polygon, Ray, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.geometry.surface_edge import Edge, EdgeShape, Polygon, Ray
 from optics.materials.finish import BLACK, Finish
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import Problem

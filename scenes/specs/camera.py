@@ -1,6 +1,6 @@
-"""A camera, as a file in scenes/library/cameras gives it: its optical prescription, the line CCDs of its spectral bands
-with time delay and integration; and what is to be designed of the layout of a monitor.
-"""
+"""A camera as a file in scenes/library/cameras gives it: prescription, line CCDs, and what of it is to be optimised."""
+
+from __future__ import annotations
 
 from math import isinf
 from typing import Annotated, Literal
@@ -74,7 +74,7 @@ class BandSpec(Spec):
     tdi: TdiSpec = TdiSpec()
 
     @model_validator(mode="after")
-    def _spectrum_rises(self) -> "BandSpec":
+    def _spectrum_rises(self) -> BandSpec:
         first, last = self.spectrum
         if not first <= last:
             found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
@@ -127,7 +127,7 @@ class BeamRangesSpec(Spec):
     photons: PhotonRange | None = None
 
     @model_validator(mode="after")
-    def _from_less_to_more(self) -> "BeamRangesSpec":
+    def _from_less_to_more(self) -> BeamRangesSpec:
         for name in type(self).model_fields:
             given = getattr(self, name)
             if given is not None and not given[0] <= given[1]:
@@ -147,7 +147,7 @@ class TransferChoiceSpec(Spec):
     kind: Annotated[str, reflector_kinds(returns=True)] | None = None
 
     @model_validator(mode="after")
-    def _made_of_what_it_may(self) -> "TransferChoiceSpec":
+    def _made_of_what_it_may(self) -> TransferChoiceSpec:
         check_made(self.material, REFLECTORS[self.kind or "lateral_transfer"])
         return self
 
@@ -164,7 +164,7 @@ class ShiftChoiceSpec(Spec):
     kind: Annotated[str, reflector_kinds(returns=False)] | None = None
 
     @model_validator(mode="after")
-    def _made_of_what_it_may(self) -> "ShiftChoiceSpec":
+    def _made_of_what_it_may(self) -> ShiftChoiceSpec:
         check_made(self.material, REFLECTORS[self.kind or "rhomboid"])
         return self
 
@@ -196,7 +196,7 @@ class MonitorGoalSpec(Spec):
     height: PositiveLength | None = None
 
     @model_validator(mode="after")
-    def _something(self) -> "MonitorGoalSpec":
+    def _something(self) -> MonitorGoalSpec:
         if not self.wanted:
             raise Problem("what is the layout to reach?", "nothing", "one or several of angle, d_f and height")
         return self
@@ -324,13 +324,13 @@ class MirrorSpec(Spec):
     edges: Annotated[tuple[SurfaceEdgeSpec, ...], Field(min_length=1, max_length=100)] | None = None
 
     @model_validator(mode="after")
-    def _is_curved(self) -> "MirrorSpec":
+    def _is_curved(self) -> MirrorSpec:
         if self.radius == 0.0:
             raise Problem("a radius of curvature cannot be zero", "0 m", "a length other than zero", within=("radius",))
         return self
 
     @model_validator(mode="after")
-    def _index_where_light_refracts(self) -> "MirrorSpec":
+    def _index_where_light_refracts(self) -> MirrorSpec:
         if (self.light == "refracts") != (self.index is not None):
             problem = "a face of a lens has an index behind it, and nothing else has"
             found = "no index" if self.index is None else f"an index, light: {self.light or 'reflected'}"
@@ -398,7 +398,7 @@ class CameraSpec(Spec):
     edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
 
     @model_validator(mode="after")
-    def _stop_is_a_mirror(self) -> "CameraSpec":
+    def _stop_is_a_mirror(self) -> CameraSpec:
         if self.stop not in self.mirrors:
             names = names_text(self.mirrors)
             raise Problem(
@@ -411,7 +411,7 @@ class CameraSpec(Spec):
         return self
 
     @model_validator(mode="after")
-    def _lenses_stand_in_air(self) -> "CameraSpec":
+    def _lenses_stand_in_air(self) -> CameraSpec:
         inside = ""
         for name, mirror in self.mirrors.items():
             if mirror.index is None:
@@ -427,7 +427,7 @@ class CameraSpec(Spec):
         return self
 
     @model_validator(mode="after")
-    def _one_colour_through_glass(self) -> "CameraSpec":
+    def _one_colour_through_glass(self) -> CameraSpec:
         faces = [name for name, mirror in self.mirrors.items() if mirror.light == "refracts"]
         if faces and self.bands:
             problem = "a camera with lenses knows their index at its design wavelength alone, and has no bands"
@@ -455,3 +455,48 @@ class CameraSpec(Spec):
                 key = next(k for k in ("decentre", "rotate", "radius") if k == "radius" or getattr(mirror, k))
                 problem = f"{where} has curved mirrors about one axis"
                 raise self.error(problem, ("mirrors", name, key), allowed="mirrors without decentre and rotate")
+
+
+IMAGE = "image"
+Vary = Literal["radius", "conic", "A4", "A6", "A8", "z"]
+
+
+class CameraDesignSpec(Spec):
+    """What is to be optimised.
+
+    The focal length along the line, the entrance pupil, the field and its bias stay as they are.
+
+    Attributes:
+        camera: prescription to start from, by name or path.
+        name: of the new camera.
+        description: of the new camera, for people.
+        vary: mirror, or ``image`` -> what of it varies.
+        envelope: extent along the parent axis over all mirrors and the image, relative to the start's; the largest.
+        clearance: least distance of every beam, in the plane of symmetry, from the edge of every mirror and of the
+            focal plane that it passes, metres.
+        anamorphism: by how much the focal length along the line may differ from that across it, a share of the latter;
+            free where it is left out.
+        steps: in which the envelope is brought from the start's to the goal's.
+        starts: how many: the camera itself with the envelope shortened in steps, the same at once, and others drawn
+            about it. One start finds one local optimum.
+        seed: of the starts that are drawn.
+    """
+
+    camera: Reference
+    name: Name
+    description: Text = ""
+    vary: Annotated[Named[tuple[Vary, ...]], Field(min_length=1)]
+    envelope: Annotated[float, Quantity(SCALE, above_zero=True, largest="200 percent")] | None = None
+    clearance: Length = 0.02
+    anamorphism: Annotated[float, Quantity(SCALE, above_zero=True, largest="100 percent")] | None = None
+    steps: Annotated[Whole, Field(ge=1, le=100)] = 8
+    starts: Annotated[Whole, Field(ge=1, le=1000)] = 2
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _image_moves_only_along_z(self) -> CameraDesignSpec:
+        for name, quantities in self.vary.items():
+            wrong = [q for q in quantities if name == IMAGE and q != "z"]
+            if wrong:
+                raise Problem("the image is a plane", wrong[0], "z", within=("vary", name))
+        return self

@@ -11,7 +11,7 @@ from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
 from scenes.specs.job import FigureTerm, PlainPerturbationSpec
-from scenes.specs.turntable_test import DataFile, TableAngle, TurntableFiles
+from scenes.specs.turntable import DataFile, TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Angle, PositiveLength, Quantity, Vector, Vector3
 from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, Whole

@@ -53,7 +53,7 @@ def _is_term(term: str) -> str:
 Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
 Moment = Annotated[float, Quantity(MOMENT, largest="100000 h")]
 
-NO_MOTION = (0.0, 0.0, 0.0)
+NO_MOTION: tuple[float, float, float] = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
 FEWEST, MOST = 2, 1000
 """Numbers of times that a course may have."""

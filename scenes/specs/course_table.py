@@ -13,7 +13,7 @@ from scenes.specs.job import JobSpec, pivot_problem
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.units import (
     ANGLE,
     LENGTH,

@@ -13,9 +13,8 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradient
-from scenes.yaml.bsdf_file import ENDING, read_bsdf
-from scenes.yaml.coating_file import read_coating
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest
+from scenes.yaml.finish_files import ENDING, read_bsdf, read_coating
 from scenes.yaml.input_file import digest_of, is_file, unusable
 from scenes.yaml.node_table import (
     DECKS_NEED,

@@ -7,20 +7,18 @@ scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's na
 from pathlib import Path
 from typing import TypeVar
 
-from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
-from scenes.specs.camera import CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_design import CameraDesignSpec
+from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
+from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
 from scenes.specs.course_table import with_table
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)

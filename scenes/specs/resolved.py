@@ -1,31 +1,44 @@
-"""A job, or a test, together with everything it refers to, so that one file says all that went into a run."""
+"""A job, a laboratory test or a camera together with everything it refers to."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Generic, Self, TypeVar, cast
+from typing import Annotated, Any, Generic, Self, TypeVar, cast
 
 from pydantic import Field
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
-from scenes.specs.detector import DetectorSpec
+from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
+from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, TargetsSpec, with_tables
 from scenes.specs.load import (
+    CAMERAS,
+    INSTRUMENTS,
+    find_camera,
     find_disturbances,
+    find_turntable_test,
     instrument_path,
+    library_names,
     load_band_detectors,
     load_camera,
     load_detector,
     load_disturbances,
     load_instrument,
     load_job,
+    load_lab_test,
+    load_turntable_test,
     path_of_detector,
     paths_of_cameras,
 )
-from scenes.yaml.spec import Paths, Source, Spec
-from scenes.yaml.translate import validate
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.input_file import is_file, unusable
+from scenes.yaml.spec import Name, Paths, Source, Spec, validate
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
 TestType = TypeVar("TestType", bound=Spec)
 SetupType = TypeVar("SetupType", bound="ExperimentSetup")
@@ -63,7 +76,7 @@ class ResolvedJob(Spec):
         targets = self.job.render.targets or TargetsSpec()
         return targets if targets.frames else targets.model_copy(update={"frames": self.frames})
 
-    def with_render(self, frames: int, seed: int) -> "ResolvedJob":
+    def with_render(self, frames: int, seed: int) -> ResolvedJob:
         """The same with this number of frames and this seed, for values that a command overrides."""
         render = self.job.render.model_copy(update={"frames": frames, "seed": seed})
         return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
@@ -220,3 +233,318 @@ def read_setup(model: type[SetupType], path: str | Path) -> SetupType | None:
     # the test knows where it was read, so that what is found wrong later is told by its line
     test = setup.test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
     return setup.model_copy(update={"test": test})
+
+
+MEASURED = "measured"
+"""Key of a test whose data come from files and not from a simulated bench."""
+DATA_FILES = ("comparisons", "held_out", "spots", "mtf", "images")
+"""Keys of `measured` that name files."""
+MeasuredSetup = TypeVar("MeasuredSetup", bound="ExperimentSetup[Any]")
+
+
+class FocusSetup(ExperimentSetup[FocusTestSpec]):
+    """A focal-plane alignment with its camera and detectors.
+
+    Attributes:
+        camera: prescription and bands.
+        detectors: as the bands name them -> data sheet.
+    """
+
+    camera: CameraSpec
+    detectors: Paths[DetectorSpec]
+
+
+class DistortionSetup(ExperimentSetup[DistortionTestSpec]):
+    """A distortion test with its camera, detectors and turntable.
+
+    Attributes:
+        turntable: its dividing error and calibration.
+        camera: prescription and bands.
+        detectors: as the bands name them -> data sheet.
+    """
+
+    turntable: TurntableTestSpec
+    camera: CameraSpec
+    detectors: Paths[DetectorSpec]
+
+
+class TurntableSetup(ExperimentSetup[TurntableTestSpec]):
+    """A turntable test, which refers to nothing else."""
+
+
+class MeasuredFocusSetup(ExperimentSetup[MeasuredFocusSpec]):
+    """A focal-plane alignment on measurements."""
+
+
+class MeasuredDistortionSetup(ExperimentSetup[MeasuredDistortionSpec]):
+    """A distortion test on measurements."""
+
+
+class MeasuredTurntableSetup(ExperimentSetup[MeasuredTurntableSpec]):
+    """A turntable test on measurements."""
+
+
+def resolve_focus(path: str | Path) -> FocusSetup:
+    """Read a focal-plane alignment and all it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    if (again := read_setup(FocusSetup, path)) is not None:
+        _require_plane(again.test, again.camera)
+        _require_detectors(again, again.camera, again.detectors)
+        return again
+    test = load_lab_test(FocusTestSpec, path)
+    camera = load_camera(find_camera(test))
+    _require_plane(test, camera)
+    return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load_band_detectors(camera)))
+
+
+def resolve_distortion(path: str | Path) -> DistortionSetup:
+    """Read a distortion test and all it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    if (again := read_setup(DistortionSetup, path)) is not None:
+        _require_bands(again.test, again.camera, again.test.band)
+        _require_detectors(again, again.camera, again.detectors)
+        return again
+    test = load_lab_test(DistortionTestSpec, path)
+    camera = load_camera(find_camera(test))
+    _require_bands(test, camera, test.band)
+    turntable = load_turntable_test(find_turntable_test(test))
+    return DistortionSetup.model_construct(
+        test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load_band_detectors(camera))
+    )
+
+
+def resolve_turntable(path: str | Path) -> TurntableSetup:
+    """Read a turntable test; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: the file cannot be read or is not valid.
+    """
+    if (again := read_setup(TurntableSetup, path)) is not None:
+        return again
+    return TurntableSetup.model_construct(test=load_turntable_test(path))
+
+
+def resolve_focus_test(path: str | Path) -> FocusSetup | MeasuredFocusSetup:
+    """As `resolve_focus`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path)
+    return resolve_focus(path)
+
+
+def resolve_distortion_test(path: str | Path) -> DistortionSetup | MeasuredDistortionSetup:
+    """As `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
+    return resolve_distortion(path)
+
+
+def resolve_turntable_test(path: str | Path) -> TurntableSetup | MeasuredTurntableSetup:
+    """As `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for measurements."""
+    if is_measured(path):
+        return _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path)
+    return resolve_turntable(path)
+
+
+def is_measured(path: str | Path) -> bool:
+    """Whether a test's file, or a run's config.yaml, takes its data from measurements.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
+        return False
+    data = read_yaml(path).data
+    inner = data.get("test", data) if isinstance(data, dict) else None
+    return isinstance(inner, dict) and MEASURED in inner
+
+
+def _measured(setup: type[MeasuredSetup], model: type[Spec], path: str | Path) -> MeasuredSetup:
+    """The test with the paths of its data made absolute, so that a run's config.yaml finds them from anywhere."""
+    again = read_setup(setup, path)
+    test: Spec = load_lab_test(model, path) if again is None else again.test
+    folder = Path(test.source.file).parent.absolute()
+    measured = getattr(test, MEASURED)
+    changed = {MEASURED: _absolute(measured, folder)}
+    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update=changed)))
+
+
+def _absolute(files: Spec, folder: Path) -> Spec:
+    """The same section with every path absolute."""
+    changed: dict[str, Any] = {}
+    for name in type(files).model_fields:
+        value = getattr(files, name)
+        if isinstance(value, TurntableFiles):
+            changed[name] = _absolute(value, folder)
+        elif name in DATA_FILES and value is not None:
+            changed[name] = str(_found(files, name, folder / value))
+    return files.model_copy(update=changed)
+
+
+def _found(files: Spec, name: str, path: Path) -> Path:
+    """The path, if there is such a file."""
+    if is_file(path):
+        return path
+    try:
+        beside = [str(other.relative_to(path.parent)) for other in path.parent.iterdir() if other.suffix == path.suffix]
+    except OSError:
+        beside = []
+    meant = nearest(path.name, beside)
+    raise files.error(unusable(path), (name,), allowed="a CSV file, relative to this file", suggestion=meant)
+
+
+def _require_plane(test: Spec, camera: CameraSpec) -> None:
+    """Bands at one X' alone do not tell the tilt about the line."""
+    _require_bands(test, camera)
+    if len({band.offset for band in camera.bands.values()}) < 2:
+        raise test.error(
+            f"all bands of the camera {camera.name} stand at one X', so the tilt about the line cannot be told",
+            ("camera",),
+            allowed="a camera with bands at different offsets",
+        )
+
+
+def _require_detectors(setup: Spec, camera: CameraSpec, detectors: Mapping[str, DetectorSpec]) -> None:
+    """InputError unless the data sheets of all bands are there."""
+    for name, band in camera.bands.items():
+        require_detector(setup, ("camera", "bands", name, "detector"), band.detector, detectors)
+
+
+def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> None:
+    if not camera.bands:
+        raise test.error(
+            f"the camera {camera.name} has no line CCDs", ("camera",), allowed="a camera with `bands:` in its file"
+        )
+    if band is not None and band not in camera.bands:
+        names = tuple(camera.bands)
+        meant = nearest(band, names)
+        raise test.error("no such band", ("band",), found=band, allowed=names_text(names), suggestion=meant)
+
+
+ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run with one"
+
+
+class CameraSetup(Spec):
+    """A camera, with its instrument if it is to be looked at as mounted there.
+
+    Attributes:
+        camera: its prescription.
+        mounted: its name in the instrument.
+        instrument: that holds it; None for a camera by itself.
+        cameras: what the instrument's cameras are called -> prescription.
+    """
+
+    camera: CameraSpec
+    mounted: Name | None = None
+    instrument: InstrumentSpec | None = None
+    cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
+
+    @property
+    def title(self) -> str:
+        """What it is called in a report."""
+        return self.camera.name if self.instrument is None else f"{self.camera.name} as {self.mounted} of {self.where}"
+
+    @property
+    def where(self) -> str:
+        """The instrument's name, empty for none."""
+        return "" if self.instrument is None else self.instrument.name
+
+    def to_yaml(self) -> str:
+        """Text of a config.yaml, which ``resolve_camera`` reads back to the same values."""
+        return dump_yaml({key: value for key, value in self.plain().items() if value != {}})
+
+
+def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
+    """Read a camera and all it refers to.
+
+    Args:
+        file: name of a camera or instrument of the library, path of such a file, or a run's config.yaml.
+        name: which camera, where there are several.
+
+    Raises:
+        InputError: the file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
+    """
+    text = str(file)
+    if "/" not in text and not text.endswith((".yaml", ".yml")) and not is_file(Path(text)):
+        return _of_library(text, name)
+    yaml = read_yaml(file)
+    data = yaml.data if isinstance(yaml.data, dict) else {}
+    if "mirrors" in data:
+        return _alone(load_camera(Path(text)), text, name)
+    if "cameras" in data and "monitor" in data:
+        return _mounted(load_instrument(Path(text)), text, name)
+    return _of_run(yaml, name)
+
+
+def _of_library(text: str, name: str | None) -> CameraSetup:
+    cameras, instruments = library_names(CAMERAS), library_names(INSTRUMENTS)
+    if text in cameras:
+        return _alone(load_camera(text), text, name)
+    if text in instruments:
+        return _mounted(load_instrument(text), text, name)
+    allowed = f"{names_text(cameras)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
+    meant = nearest(text, (*cameras, *instruments))
+    raise InputError(Issue("no such camera or instrument", found=shown(text), allowed=allowed, suggestion=meant))
+
+
+def _alone(camera: CameraSpec, file: str, name: str | None) -> CameraSetup:
+    if name is not None and name != camera.name:
+        raise InputError(Issue(f"--camera {name}: the file holds one camera, {camera.name}", file))
+    return CameraSetup.model_construct(camera=camera, mounted=None, instrument=None, cameras=FrozenMap())
+
+
+def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraSetup:
+    chosen = _chosen(tuple(instrument.cameras), file, name)
+    files = paths_of_cameras(instrument)
+    cameras = {mounted.camera: load_camera(files[own]) for own, mounted in instrument.cameras.items()}
+    return CameraSetup.model_construct(
+        camera=cameras[instrument.cameras[chosen].camera],
+        mounted=chosen,
+        instrument=instrument,
+        cameras=FrozenMap(cameras),
+    )
+
+
+def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
+    """From a run's config.yaml; a study's has its own below ``base``."""
+    data: Any = yaml.data
+    if isinstance(data, dict) and {"mounted", "instrument"} <= set(data):
+        return validate(CameraSetup, yaml)
+    way: KeyPath = ("base",) if isinstance(data, dict) and "study" in data else ()
+    below = data.get("base") if way else data
+    one = below.get("camera") if isinstance(below, dict) else None
+    many = below.get("cameras") if isinstance(below, dict) else None
+    if isinstance(one, dict) and "mirrors" in one:
+        return _alone(_read(yaml, one, (*way, "camera")), yaml.file, name)
+    held = {key: c for key, c in many.items() if isinstance(c, dict)} if isinstance(many, dict) else {}
+    if held and all("mirrors" in camera for camera in held.values()):
+        chosen = _chosen(tuple(held), yaml.file, name)
+        camera = _read(yaml, held[chosen], (*way, "cameras", chosen))
+        return CameraSetup.model_construct(camera=camera, mounted=None, instrument=None, cameras=FrozenMap())
+    raise InputError(Issue("there is no camera's prescription in this file", yaml.file, 1, allowed=ALLOWED))
+
+
+def _read(yaml: YamlFile, data: Mapping[str, Any], way: KeyPath) -> CameraSpec:
+    """A camera that stands at ``way`` in a file."""
+    lines = {key[len(way) :]: line for key, line in yaml.lines.items() if key[: len(way)] == way}
+    camera = validate(CameraSpec, YamlFile(yaml.file, data, lines))
+    placed = camera.with_source(Source(yaml.file, yaml.lines, way))
+    assert isinstance(placed, CameraSpec)
+    return placed
+
+
+def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
+    """The camera that is meant. InputError if it is none, or nothing says which of several."""
+    if name is None:
+        if len(names) == 1:
+            return names[0]
+        raise InputError(Issue("which of its cameras is meant is not said", file, allowed=f"--camera {names[0]} ..."))
+    if name not in names:
+        allowed, meant = names_text(names), nearest(name, names)
+        raise InputError(Issue("no such camera", file, found=shown(name), allowed=allowed, suggestion=meant))
+    return name

@@ -12,7 +12,7 @@ from analysis.orbit.calibration_parameters import CalibrationError, CalibrationF
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.normal_equations import State, Weights, assemble
 from analysis.orbit.null_space import WORST, Gauge, RankError, solved
-from analysis.orbit.residual_weights import LARGEST_FACTOR, REJECT, robust_weights, standardised
+from analysis.orbit.residual_tests import LARGEST_FACTOR, REJECT, robust_weights, standardised
 from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.stepwise import stepwise
 from tests.analysis.test_three_line_model import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.mtf.bar_contrast import BarError, _design, _waves, measure_bars
+from analysis.mtf.bar_mtf import BarError, _design, _waves, measure_bars
 from analysis.spots.noise import NoiseModel
 
 FALSE_ALARM = 1e-6

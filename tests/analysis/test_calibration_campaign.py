@@ -7,8 +7,8 @@ from scipy import stats
 
 from analysis.orbit.adjustment import adjust
 from analysis.orbit.calibration_parameters import Noise, Prior, Unknowns
-from analysis.orbit.hidden_terms import FALSE_ALARM
 from analysis.orbit.null_space import Gauge
+from analysis.orbit.residual_tests import FALSE_ALARM
 from analysis.orbit.three_line_model import LineModel
 from tests.analysis.test_adjustment import INNER, LABORATORY, measured
 from tests.analysis.test_hidden_terms import random_walk, turned

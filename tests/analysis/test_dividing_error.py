@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.turntable.chauvenet import chauvenet, normal_reduction, rejection_rate
-from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate, step_kernel
+from analysis.turntable.dividing_error import (
+    CalibrationSeries,
+    DividingCompensation,
+    chauvenet,
+    choose,
+    compensate,
+    normal_reduction,
+    rejection_rate,
+    step_kernel,
+)
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4

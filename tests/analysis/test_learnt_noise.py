@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.spots.frame_screening import ScreenedFrames
-from analysis.spots.learnt_noise import FittedSpot, learnt_shift
-from analysis.spots.learnt_template import learn_template
+from analysis.spots.learnt_template import FittedSpot, learn_template, learnt_shift
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import FitTerms, fit_screened
 from analysis.spots.spot_positions import SeriesNoise, SpotError

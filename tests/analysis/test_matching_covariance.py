@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.matching import matches, window_halves
+from analysis.matching import matches, window_checks
 from analysis.matching.matches import MatchOptions, Reason
 from tests.analysis.stereo_pairs import Pair, layered, photographed, rivals, textured
 
@@ -134,7 +134,7 @@ def test_steps_between_layers_in_figures(monkeypatch) -> None:
     for name, changes in LAYERS.items():
         pairs = [layered(10, seed=seed, **changes)[0] for seed in range(24, 34)]
         for tested in (False, True) if name == next(iter(LAYERS)) else (True,):
-            monkeypatch.setattr(matches, "FALSE_ALARM", window_halves.FALSE_ALARM if tested else 0.0)
+            monkeypatch.setattr(matches, "FALSE_ALARM", window_checks.FALSE_ALARM if tested else 0.0)
             options = MatchOptions() if tested else MatchOptions(largest_risk=1.0)
             found = [judged(pair, options) for pair in pairs]
             accepted = float(np.mean(np.concatenate([used for used, *_ in found])))

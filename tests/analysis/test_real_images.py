@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage, stats
 
-from analysis.matching import matches, window_halves
+from analysis.matching import matches, window_checks
 from analysis.matching.matches import MatchOptions, match, resampled
 from analysis.mtf.slanted_edge import measure_edge
 from tests.analysis import real_images
@@ -104,7 +104,7 @@ def test_a_stereo_pair_in_figures(monkeypatch) -> None:
     """
     rows = []
     for tested in (False, True):
-        monkeypatch.setattr(matches, "FALSE_ALARM", window_halves.FALSE_ALARM if tested else 0.0)
+        monkeypatch.setattr(matches, "FALSE_ALARM", window_checks.FALSE_ALARM if tested else 0.0)
         places, found, true = against_disparities(10, 12, None if tested else MatchOptions(largest_risk=1.0))
         used = found.accepted
         place, error, covariance = places[used], (found.place - true)[used], found.covariance[used]

@@ -10,10 +10,10 @@ from scipy.special import j1
 from analysis.spots.centroid import energy_centroid, gaussian_fit
 from analysis.spots.frame_screening import ScreenedFrames
 from analysis.spots.noise import NoiseModel
-from analysis.spots.repaired_image import repaired_centroid
 from analysis.spots.screened_fit import FitTerms, ScreenedFit, fit_screened
 from analysis.spots.spot_positions import SpotPositions
 from analysis.spots.spot_template import SpotTemplate
+from analysis.spots.static_defects import repaired_centroid
 
 NOISE = NoiseModel(0.16, 12.0, 0.5, 100.0, 0.005, 5.0, 16100.0)
 PLACE, LIGHT, FRAMES = (31.4, 30.7), 4e5, 9

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from analysis.matching.window_halves import window_halves
-from analysis.matching.window_relief import LAG, WindowRelief, residual_correlation, window_relief
+from analysis.matching.window_checks import LAG, WindowRelief, residual_correlation, window_halves, window_relief
 
 SIDE = 15
 LAGS = [(r, c) for r in range(LAG + 1) for c in range(-LAG, LAG + 1) if r > 0 or c > 0]

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from analysis.orbit.angles import sensitivity
 from analysis.orbit.planes import METHODS, Station
-from analysis.orbit.sensitivity import sensitivity
 from tests.analysis.test_planes import ARCSEC, LOOK, SCENE, noisy, rotation
 
 AXES = "xyz"

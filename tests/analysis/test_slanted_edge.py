@@ -17,9 +17,9 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from analysis.mtf.edge_location import _direction, locate_edge, pixel_noise
+from analysis.mtf.edge_location import EdgeError, _direction, locate_edge, pixel_noise
 from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
-from analysis.mtf.slanted_edge import EdgeError, measure_edge
+from analysis.mtf.slanted_edge import measure_edge
 from analysis.spots.noise import NoiseModel
 
 FALSE_ALARM = 1e-6

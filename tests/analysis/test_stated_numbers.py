@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.limits import posterior_sigma
-from analysis.monitor.stated_numbers import elasticities, heavy_tails, stated_numbers, unseen
+from analysis.monitor.limits import elasticities, heavy_tails, posterior_sigma, stated_numbers, unseen
 
 RNG = np.random.default_rng(11)
 WHAT = ("rotate x", "rotate y", "shift x", "shift y", "figure Z4", "figure Z5")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import CalibrationError, CalibrationField, Noise
 from analysis.orbit.forward_intersection import check_errors, intersect
 from analysis.orbit.three_line_model import LineModel, Rays, bias_rotation, misclosure, partials
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS

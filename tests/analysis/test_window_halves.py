@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.matching.window_halves import FALSE_ALARM, STEP, WindowHalves, risk, window_halves
-from analysis.matching.window_relief import relief_field
+from analysis.matching.window_checks import FALSE_ALARM, STEP, WindowHalves, relief_field, risk, window_halves
 from tests.analysis.test_residual_correlation import SIDE, designs, fitted
 
 COUNT = 2000

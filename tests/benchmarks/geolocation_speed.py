@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from scenes.specs.orbit.flight import OrbitSpec
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from twin.orbit.flight.earth import Earth

@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench

@@ -9,9 +9,9 @@ from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.targets.collimator import Collimator, TooNarrowError
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import transfer
-from scenes.models.camera_assembly import ROOT, build_camera_under_test
+from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.load import load_camera
 from twin.targets.target_path import TargetPath

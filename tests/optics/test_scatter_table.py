@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from optics.materials.coating_table import CoatingTable
-from optics.materials.finish import Finish
-from optics.materials.scatter import ABg, total_scatter
-from optics.materials.scatter_table import STEPS, ScatterTable
+from optics.materials.finish import CoatingTable, Finish
+from optics.materials.scatter import STEPS, ABg, ScatterTable, total_scatter
 
 INCIDENCE = np.radians([0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0])
 HALF = np.radians(np.linspace(0.0, 180.0, 19))

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as Outline
 
-from optics.geometry.aperture import Circle, Ellipse, Rectangle
-from optics.geometry.surface_edge import Edge, Polygon, Ray, turned_over
+from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle, turned_over
 
 L_SHAPE = ((0.0, 0.0), (1.0, 0.0), (1.0, 0.4), (0.4, 0.4), (0.4, 1.0), (0.0, 1.0))
 SHAPES = (

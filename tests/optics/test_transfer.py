@@ -14,8 +14,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.waves import transfer
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_function import PupilFunction, circular_pupil, fit_pupils
-from optics.waves.pupil_stack import PupilStack
+from optics.waves.pupil_stack import PupilFunction, PupilStack, circular_pupil, fit_pupils
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera

@@ -15,7 +15,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
 from optics.waves.imaging import aim_collimated, imaging_field
-from optics.waves.pupil_function import PupilFunction, fit_pupils
+from optics.waves.pupil_stack import PupilFunction, fit_pupils
 from scenes.models.camera_model import CameraModel, field_direction
 
 WAVELENGTH = 650e-9

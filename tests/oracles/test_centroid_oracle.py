@@ -5,7 +5,7 @@ import pytest
 
 from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 centroids = pytest.importorskip("photutils.centroids", reason="photutils not installed (extra `oracles`)")
 pytestmark = pytest.mark.oracle

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from scenes.specs.measured.pass_files import PlatformFilesSpec
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects

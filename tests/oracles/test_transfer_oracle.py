@@ -8,7 +8,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.waves import transfer
-from optics.waves.pupil_function import fit_pupils
+from optics.waves.pupil_stack import fit_pupils
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
 from tests.oracles.peers import batoid_camera, batoid_rays

@@ -159,7 +159,7 @@ def _cameras() -> Iterator[Case]:
 
 
 def _labs() -> Iterator[Case]:
-    from scenes.specs.lab_setup import resolve_distortion, resolve_focus, resolve_turntable
+    from scenes.specs.resolved import resolve_distortion, resolve_focus, resolve_turntable
 
     resolvers = {"focus": resolve_focus, "distortion": resolve_distortion, "turntable": resolve_turntable}
     beside = {"focus": ("two_bands.yaml",)}

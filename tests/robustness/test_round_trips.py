@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scenes.specs.lab_setup import resolve_focus
-from scenes.specs.orbit.load import load_three_line_camera
-from scenes.specs.orbit.setup import resolve_angle, resolve_calibration, resolve_monitor
-from scenes.specs.resolved import resolve
+from scenes.specs.orbit.setup import load_three_line_camera, resolve_angle, resolve_calibration, resolve_monitor
+from scenes.specs.resolved import resolve, resolve_focus
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import ANGLE, LENGTH, PER_LENGTH3, SCALE, format_quantity, parse_quantity
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml

@@ -18,11 +18,10 @@ from scenes.models.autocollimator_model import (
     paraxial_focus,
     pinhole_body,
 )
-from scenes.specs.autocollimator_test import AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorTestSpec
 from scenes.specs.load import LAB, SCENES, library_names, load_autocollimator_test
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.laboratory.autocollimator_images import AutocollimatorPath
 

@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 import twin.camera.__main__
-from optics.geometry.aperture import Circle
+from optics.geometry.aperture import Circle, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
-from optics.geometry.surface_edge import Edge
 from optics.numerics import quadrature
 from optics.raytrace.assembly import Interaction
 from optics.waves.wavefront import fit_wavefront, orthonormal_parts
 from scenes.lens.__main__ import read_prescription
-from scenes.lens.batoid_writer import batoid_text
+from scenes.lens.batoid_file import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import prescription_of
 from scenes.lens.prescription import LensSurface
@@ -27,7 +26,7 @@ from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT

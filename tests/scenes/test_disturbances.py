@@ -23,7 +23,7 @@ from scenes.specs.load import (
 )
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.robustness.case import Reached, cut
 from twin.render import app

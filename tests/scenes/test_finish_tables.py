@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.models.measured_finishes import measured_finishes
+from scenes.models.scenery import measured_finishes
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
-from scenes.yaml.bsdf_file import read_bsdf
-from scenes.yaml.coating_file import read_coating
 from scenes.yaml.errors import InputError
+from scenes.yaml.finish_files import read_bsdf, read_coating
 
 JOB = "instrument: gf7_pair\nrender:\n  stray: {{paths: 20000, finishes: {finishes}}}\n"
 

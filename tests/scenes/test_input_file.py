@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_file import read_batoid
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import read_catalogue
 from scenes.lens.zemax_reader import read_zemax
 from scenes.specs.resolved import resolve
-from scenes.yaml.bsdf_file import read_bsdf
 from scenes.yaml.csv_table import table_text
 from scenes.yaml.errors import InputError
+from scenes.yaml.finish_files import read_bsdf
 from scenes.yaml.input_file import read_bytes, read_text
 from scenes.yaml.yaml_file import read_yaml
 

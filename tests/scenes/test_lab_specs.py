@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenes.models.camera_assembly import build_camera_under_test
+from scenes.models.camera_model import build_camera_under_test
 from scenes.specs.camera_tests import FocusTestSpec
-from scenes.specs.lab_setup import resolve_focus
 from scenes.specs.load import LAB, SCENES, library_names
+from scenes.specs.resolved import resolve_focus
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
 FILE = SCENES / LAB / "focus.yaml"

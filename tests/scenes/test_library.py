@@ -21,8 +21,7 @@ from scenes.specs.load import (
 )
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
 CAMERA_NAMES = ("gf7", "gf7_conic", "monitor")

@@ -7,8 +7,7 @@ import pytest
 
 from scenes.schema import json_schema
 from scenes.specs.load import LIBRARY, ORBIT, PAYLOADS, SCENES, load_camera, load_instrument
-from scenes.specs.orbit.load import load_three_line_camera
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
+from scenes.specs.orbit.setup import AngleSetup, load_three_line_camera, resolve_angle
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from tests.scenes.orbit_files import assert_told, write

@@ -7,8 +7,7 @@ import pytest
 
 from scenes.schema import json_schema
 from scenes.specs.load import DETECTORS, LIBRARY, ORBIT, PAYLOADS, SCENES
-from scenes.specs.orbit.load import load_three_line_camera
-from scenes.specs.orbit.setup import SimulateSetup, resolve_simulate
+from scenes.specs.orbit.setup import SimulateSetup, load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
 from tests.scenes.orbit_files import assert_told, write
 

@@ -7,8 +7,7 @@ from pydantic import TypeAdapter
 
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec, UtcTime, parse_utc
 from scenes.yaml.errors import InputError, Problem
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 
 PASSING = """

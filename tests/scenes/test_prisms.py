@@ -16,7 +16,7 @@ from optics.raytrace.reflectors import EDGE, Mount, prism_0, prism_180, roof_off
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.instrument_model import key_of
-from scenes.specs.channel import CENTRAL_KEY, CENTRAL_PRISM, PRISMS, prism_of
+from scenes.specs.instrument import CENTRAL_KEY, CENTRAL_PRISM, PRISMS, prism_of
 from tests.scenes.prism_errors import seen_outside, turn_by_mirrors
 
 N = 1.4565

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from scenes.models.disturbances import stated_motions
-from scenes.models.statement_excess import LIKELY, beyond_statement
+from scenes.models.job_state import LIKELY, beyond_statement
 from scenes.specs.resolved import resolve
 
 

@@ -7,7 +7,7 @@ import pytest
 from scenes.specs.load import EXAMPLES
 from scenes.specs.study import StudySpec, unit_of
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml, read_yaml
 

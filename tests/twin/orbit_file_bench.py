@@ -192,7 +192,7 @@ def interior_and_bias() -> tuple[np.ndarray, float]:
 def measured_points(seed: int, count: int, wrong: float = 0.0) -> tuple[list[list[object]], list[list[object]]]:
     """Rows of ground points and image points of th1's lines, with noise of 0.2 px and 1 m, all a little wrong."""
     from optics.geometry.pose import rotation_matrix
-    from scenes.specs.orbit.load import load_three_line_camera
+    from scenes.specs.orbit.setup import load_three_line_camera
     from twin.orbit.flight.line_camera import line_cameras
     from twin.orbit.flight.sensor import Sensor
 

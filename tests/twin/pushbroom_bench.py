@@ -8,7 +8,7 @@ import numpy as np
 
 from scenes.specs.load import load_detector
 from scenes.specs.orbit.flight import OrbitSpec
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.line_camera import line_cameras
 from twin.orbit.flight.orbit import propagate

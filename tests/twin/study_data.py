@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import StudySpec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.study.runs.sampling import draw
 

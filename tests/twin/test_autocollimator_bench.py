@@ -15,7 +15,7 @@ from optics.geometry.tree import Motion
 from optics.numerics.backend import Backend
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.autocollimator_model import UNITS, autocollimator_body, axis_body, mirror_body
-from scenes.specs.autocollimator_test import AutocollimatorSetup, BenchErrorsSpec
+from scenes.specs.autocollimators import AutocollimatorSetup, BenchErrorsSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
     Reader,

@@ -23,7 +23,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
 from scenes.specs.resolved import resolve, resolve_job
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
 from tests.twin.commands import invoke

@@ -9,14 +9,14 @@ import pytest
 import xarray as xr
 
 from optics.numerics import quadrature
-from scenes.models.camera_file import file_with_plane
+from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import FocalPlane, sharpness
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_setup import resolve_camera
 from scenes.specs.load import LIBRARY, load_camera
+from scenes.specs.resolved import resolve_camera
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import GF7, gf7_with

@@ -5,7 +5,7 @@ import pytest
 
 from optics.geometry.tree import Motion
 from optics.waves.diffraction import airy
-from optics.waves.pupil_function import circular_pupil
+from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import transfer
 from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams

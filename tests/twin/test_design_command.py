@@ -12,7 +12,7 @@ from scenes.models.camera_design import resolve_design
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import EXAMPLES, LIBRARY, load_camera
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from twin.design.__main__ import app
 

@@ -17,7 +17,7 @@ from optics.targets.target_image import target_image
 from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
 from optics.waves.transfer import TransferTable
-from scenes.specs.lab_setup import resolve_distortion
+from scenes.specs.resolved import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import distortion_numbers
 from twin.laboratory.distortion_report import distortion_report

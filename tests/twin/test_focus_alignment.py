@@ -16,8 +16,8 @@ from analysis.focal_plane.plane_fit import RigidMotion
 from optics.geometry.pose import Pose, rotation_matrix, rotation_vector
 from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.lab_setup import FocusSetup, resolve_focus
 from scenes.specs.load import LAB, SCENES
+from scenes.specs.resolved import FocusSetup, resolve_focus
 from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers

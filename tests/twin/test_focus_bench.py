@@ -11,11 +11,11 @@ from analysis.mtf.slanted_edge import measure_edge
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_assembly import ROOT
-from scenes.specs.lab_setup import resolve_focus
+from scenes.models.camera_model import ROOT
 from scenes.specs.load import LAB, SCENES
+from scenes.specs.resolved import resolve_focus
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
 from twin.targets.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import CirclePlatform
 from twin.orbit.flight.earth import Earth

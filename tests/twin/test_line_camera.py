@@ -12,11 +12,10 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_directions
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import dump_yaml, parse_yaml
 from twin.orbit.flight.line_camera import (
     along_track_angle,

@@ -15,12 +15,10 @@ from typer.testing import CliRunner
 import twin
 import twin.live.__main__ as command
 from scenes.models.monitor_layout import resolve_monitor_design
-from scenes.specs.camera_setup import resolve_camera
-from scenes.specs.lab_setup import resolve_turntable
 from scenes.specs.load import EXAMPLES, SCENES
-from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
-from scenes.specs.resolved import resolve
+from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.test_course import JOB as COURSE

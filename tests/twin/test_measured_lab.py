@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from analysis.focal_plane.through_focus import QUARTIC
-from scenes.specs.lab_setup import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
 from scenes.specs.load import SCENES, load_turntable_test
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
+from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.distortion_run import MeasuredDistortion, measure_files

@@ -14,10 +14,9 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from analysis.turntable.chauvenet import expected_rejections, normal_reduction, rejection_rate
-from analysis.turntable.dividing_error import CalibrationSeries
-from scenes.specs.lab_setup import resolve_focus_test
+from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections, normal_reduction, rejection_rate
 from scenes.specs.load import SCENES
+from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.measured_focus import align_measured

@@ -687,7 +687,7 @@ def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
     """A pass with an SP3 in GPS time and an AEM in UTC gives what tables of the same numbers give, but for a millimetre
     of the SP3's last digit and 1e-9 of the AEM's quaternions.
     """
-    from scenes.specs.measured.pass_files_setup import resolve_check
+    from scenes.specs.measured.orbit_data_setup import resolve_check
     from tests.twin.orbit_file_bench import aem, check_files, sp3
     from twin.orbit.conventions.check_export import exported as check_exported
     from twin.orbit.conventions.check_run import run_check

@@ -10,7 +10,7 @@ from analysis.monitor.monitoring import PER_SI
 from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.truth import trace_truth
 
 SHIFT, TURN, SCALE = 50e-6, 20 * ARCSEC, 20e-6  # the largest motions that are claimed

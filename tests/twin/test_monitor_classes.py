@@ -14,7 +14,7 @@ from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.raytrace.aim import aim
 from optics.waves.diffraction import image
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor import monitor_beams
 from twin.monitor.image_sampling import SPOT_RANGES
 from twin.monitor.monitor_path import MonitorPath

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from optics.raytrace import derivatives, trace
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_derivative import photon_derivative, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family

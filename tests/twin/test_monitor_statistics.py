@@ -9,7 +9,7 @@ from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import cramer_rao_bound
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 SEEDS = 200
 FRAMES = 9

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import twin.orbit.__main__ as command
-from scenes.specs.measured.orbit_check import OrbitCheckSpec
+from scenes.specs.measured.orbit_data import OrbitCheckSpec
+from scenes.specs.measured.orbit_data_setup import CheckSetup
 from scenes.specs.measured.pass_files import with_absolute_files
-from scenes.specs.measured.pass_files_setup import CheckSetup
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
@@ -162,8 +162,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     reader, to rounding of times (1e-11 s, 1e-7 m).
     """
     from scenes.specs.load import SCENES
-    from scenes.specs.measured.orbit_data_setup import resolve_measured_calibration
-    from scenes.specs.measured.pass_files_setup import resolve_check
+    from scenes.specs.measured.orbit_data_setup import resolve_check, resolve_measured_calibration
     from twin.orbit.conventions.check_export import measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
     from twin.orbit.measured.clock import Readings

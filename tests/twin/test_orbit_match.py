@@ -13,11 +13,10 @@ import tifffile
 
 import twin.orbit.__main__ as command
 from scenes.specs.load import ORBIT, SCENES
-from scenes.specs.measured.orbit_match import OrbitMatchSpec
+from scenes.specs.measured.orbit_data import OrbitMatchSpec
+from scenes.specs.measured.orbit_data_setup import MatchSetup
 from scenes.specs.measured.pass_files import with_absolute_files
-from scenes.specs.measured.pass_files_setup import MatchSetup
-from scenes.specs.orbit.load import load_three_line_camera
-from scenes.specs.orbit.setup import resolve_simulate
+from scenes.specs.orbit.setup import load_three_line_camera, resolve_simulate
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
@@ -124,7 +123,7 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
 
 def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> None:
     from scenes.specs.measured.orbit_data import OrbitDataSpec
-    from scenes.yaml.translate import validate
+    from scenes.yaml.spec import validate
     from scenes.yaml.yaml_file import read_yaml
     from twin.orbit.measured.measurement_tables import PassTables
 

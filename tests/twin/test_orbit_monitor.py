@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from tests.twin.commands import files, invoke, refused

@@ -11,10 +11,8 @@ from scipy.stats import chi2
 
 from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating
-from optics.materials.coating_table import CoatingTable
-from optics.materials.finish import Finish, reflectance
-from optics.materials.scatter import ABg
-from optics.materials.scatter_table import ScatterTable
+from optics.materials.finish import CoatingTable, Finish, reflectance
+from optics.materials.scatter import ABg, ScatterTable
 from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe

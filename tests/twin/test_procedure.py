@@ -19,8 +19,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.spec import Name, Number, Seed, Spec, Whole
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Name, Number, Seed, Spec, Whole, validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with

@@ -8,8 +8,8 @@ from scipy.stats import chi2
 
 from analysis.mtf.slanted_edge import measure_edge
 from scenes.specs.load import load_detector
-from scenes.specs.orbit.load import load_three_line_camera
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, TerrainSpec
+from scenes.specs.orbit.setup import load_three_line_camera
 from tests.twin.pushbroom_bench import LINE_TIME, LINES, PLACE, Ground, lines, optics
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from analysis.images.recording_time import recorded
 from analysis.spots.noise import NoiseModel
-from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import ROOT

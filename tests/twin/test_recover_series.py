@@ -9,7 +9,7 @@ import tifffile
 
 from optics.geometry.tree import State
 from scenes.specs.job import JobSpec
-from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import ResolvedJob, resolve_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import TimeSeries, run_series, series_states

@@ -16,7 +16,7 @@ from astropy import units
 from astropy.io import fits
 
 from analysis.images.image_file import ImageFile
-from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.specs.study import UNITS
 from tests.twin.commands import files, invoke

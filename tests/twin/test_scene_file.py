@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from optics.geometry.solid import face_plane
 from optics.geometry.tree import Motion
 from scenes.models.meshes import BOARD, CHIP, mirror_mesh
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.pictures.light_paths import FIELDS, trace_light_paths
 from twin.pictures.scene_file import TUBE, build_scene, motions
 

@@ -15,7 +15,7 @@ import twin
 from analysis.monitor.estimators import ESTIMATORS
 from analysis.monitor.monitoring import PARAMETERS
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, parse_yaml
 from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth

@@ -11,7 +11,7 @@ from scipy.integrate import quad, solve_ivp
 
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.flight import OrbitSpec
-from scenes.specs.orbit.load import load_three_line_camera
+from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from tests.twin.orbit_bench import RATE, CirclePlatform, turn
 from twin.orbit.flight.earth import Earth

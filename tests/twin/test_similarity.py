@@ -19,7 +19,7 @@ from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
 from optics.waves.imaging import imaging_rays
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import line_body
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery

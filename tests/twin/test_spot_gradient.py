@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions

@@ -19,7 +19,7 @@ from optics.raytrace.system import assemble
 from optics.targets.target_shapes import pinhole_target, star_target
 from optics.waves.diffraction import Grid, image
 from optics.waves.imaging import imaging_field
-from optics.waves.pupil_function import circular_pupil
+from optics.waves.pupil_stack import circular_pupil
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_model import LAUNCH_DISTANCE
 from scenes.models.shadow import imaging_shadows

@@ -7,7 +7,7 @@ from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_assembly import ROOT, build_camera_under_test
+from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.camera_tests import CameraUnderTestSpec, CollimatorSpec
 from scenes.specs.load import load_camera
 from twin.targets.target_path import TargetPath

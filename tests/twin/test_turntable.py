@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import choose, compensate
 from scenes.specs.load import EXAMPLES, load_turntable_test
-from scenes.specs.turntable_test import DividingErrorSpec, TurntableTestSpec
+from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
 from twin.laboratory.turntable_numbers import turntable_numbers

@@ -16,7 +16,7 @@ from optics.geometry.tree import Motion
 from optics.numerics.backend import load_backend
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment

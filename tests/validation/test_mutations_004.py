@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from analysis.focal_plane.plane_fit import FocalPlaneFit
-from analysis.turntable import chauvenet as criterion
 from analysis.turntable import dividing_error
+from analysis.turntable import dividing_error as criterion
 from analysis.turntable.dividing_error import DividingCompensation
 from optics.numerics.backend import load_backend
-from scenes.specs.lab_setup import resolve_distortion, resolve_focus
+from scenes.specs.resolved import resolve_distortion, resolve_focus
 from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.focus_alignment import align

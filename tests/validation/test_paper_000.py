@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from analysis.orbit.angles import sensitivity
 from analysis.orbit.planes import Station
-from analysis.orbit.sensitivity import sensitivity
 from optics.numerics.backend import load_backend
 from scenes.specs.orbit.angle import LINES, THREE_LINE_ANGLES
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass

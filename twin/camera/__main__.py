@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from scenes.specs.camera_setup import CameraSetup, resolve_camera
+from scenes.specs.resolved import CameraSetup, resolve_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
 from twin.run.command import Result, Session, print_report, run_command
 from twin.run.reference_frames import described

@@ -26,17 +26,16 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
-from optics.waves.pupil_function import PupilFunction
 from optics.waves.pupil_shadow import SMALLEST
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import fit_wavefront, orthonormal_parts, path_to_sphere
-from scenes.models.camera_assembly import ROOT, camera_alone
-from scenes.models.camera_model import CameraModel, derive_camera, field_direction
+from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction
 from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.run.reference_frames import frames_text
 from twin.targets.target_path import LineRays, TargetPath
 

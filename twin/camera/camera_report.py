@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from optics.geometry import zernike
-from scenes.models.camera_file import file_with_plane
+from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera.camera_plots import (
     curves_figure,

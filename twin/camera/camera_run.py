@@ -11,12 +11,12 @@ import xarray as xr
 
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
-from optics.waves.pupil_function import RoughWavefrontError
-from scenes.models.camera_file import with_plane
+from optics.waves.pupil_stack import RoughWavefrontError
+from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
-from scenes.specs.camera_setup import CameraSetup
+from scenes.specs.resolved import CameraSetup
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
 from twin.camera.field_maps import (
     Distortion,

@@ -34,9 +34,9 @@ from scenes.models.monitor_layout import (
     pupil_share,
 )
 from scenes.models.obstruction import monitor_beams, rays_taken
-from scenes.specs.channel import CENTRAL_PRISM, SIDES, prism_of
+from scenes.specs.instrument import CENTRAL_PRISM, SIDES, prism_of
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.monitor.information import Information, ground_of, information_of, quantity_rows
 from twin.sensors.area_detector import EmvaDetector

@@ -16,9 +16,8 @@ from scenes.models.monitor_layout import (
     layout_spec,
     resolve_monitor_design,
 )
-from scenes.specs.channel import channel_of, prism_of
 from scenes.specs.detector import DetectorSpec
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.design.layout_bench import LayoutBench, LayoutFacts

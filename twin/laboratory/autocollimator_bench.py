@@ -29,7 +29,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion, State
 from optics.numerics.backend import Backend
 from scenes.models.autocollimator_model import UNITS, autocollimator_body, axis_body, build_bench, ccd_body, mirror_body
-from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from twin.laboratory.autocollimator_images import AutocollimatorPath, SpotWindows, window_pattern
 from twin.sensors.area_detector import EmvaDetector
 

@@ -26,10 +26,10 @@ from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_shapes import Target, pinhole
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import TransferTable, transfer
-from scenes.models.camera_assembly import ROOT, build_camera_under_test
-from scenes.specs.lab_setup import DistortionSetup
+from scenes.models.camera_model import ROOT, build_camera_under_test
+from scenes.specs.resolved import DistortionSetup
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream

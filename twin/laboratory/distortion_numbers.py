@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.orientation.line_orientation import LINE_TERMS, LineOrientation
-from analysis.turntable.chauvenet import expected_rejections
+from analysis.orientation.interior import LINE_TERMS, LineOrientation
+from analysis.turntable.dividing_error import expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import DistortionSetup, resolve_distortion_test
-from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.resolved import DistortionSetup, ExperimentSetup, resolve_distortion_test
 from twin.laboratory.distortion_run import (
     DistortionRun,
     FoundEstimate,

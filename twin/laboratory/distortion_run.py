@@ -18,8 +18,12 @@ from numpy.typing import NDArray
 
 from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
 from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
-from analysis.orientation.interior import InteriorOrientation, fit_interior_orientation
-from analysis.orientation.line_orientation import LineOrientation, line_orientation
+from analysis.orientation.interior import (
+    InteriorOrientation,
+    LineOrientation,
+    fit_interior_orientation,
+    line_orientation,
+)
 from analysis.orientation.measurement import (
     CALIBRATED,
     SMOOTH,
@@ -34,8 +38,7 @@ from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
 from scenes.specs.camera_tests import DistortionFiles, MeasuredDistortionSpec
-from scenes.specs.lab_setup import DistortionSetup, MeasuredDistortionSetup
-from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
 from twin.laboratory.measured_readings import Comparisons, SpotReadings, read_spots, read_turntable

@@ -22,7 +22,7 @@ from scenes.specs.camera_tests import (
     MeasuredFocusSpec,
     NoiseSpec,
 )
-from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
 from twin.laboratory.distortion_run import SimulatedDistortion

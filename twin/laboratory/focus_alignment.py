@@ -38,7 +38,7 @@ from twin.sensors.area_detector import FixedPattern
 
 if TYPE_CHECKING:
     from scenes.specs.camera_tests import FocusTestSpec, MeasuredFocusSpec
-    from scenes.specs.lab_setup import FocusSetup
+    from scenes.specs.resolved import FocusSetup
 
 _MISSET, _PATTERNS, _LEVEL, _SETTING, _SCAN = range(5)
 

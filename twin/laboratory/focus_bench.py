@@ -16,15 +16,15 @@ from scipy.optimize import minimize_scalar
 
 from optics.geometry.pose import Pose
 from optics.numerics.backend import Backend
-from optics.waves.pupil_function import PupilFunction
-from scenes.models.camera_assembly import ROOT, CameraUnderTest, build_camera_under_test
+from optics.waves.pupil_stack import PupilFunction
+from scenes.models.camera_model import ROOT, CameraUnderTest, build_camera_under_test
 from twin.run.procedure import Advance, silent
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.edge_images import ALONG, DIRECTIONS, EdgeImager, EdgeOptics, knife_edge
 from twin.targets.target_path import LocalMap, TargetPath
 
 if TYPE_CHECKING:
-    from scenes.specs.lab_setup import FocusSetup
+    from scenes.specs.resolved import FocusSetup
 
 _SEARCH = 0.3e-3
 """Defocus up to which best focus is looked for, metres."""

@@ -12,8 +12,7 @@ from analysis.focal_plane.through_focus import FocusVertex
 from analysis.units import ARCMIN, ARCSEC
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
-from scenes.specs.lab_setup import FocusSetup, resolve_focus_test
-from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.resolved import ExperimentSetup, FocusSetup, resolve_focus_test
 from twin.laboratory.focus_alignment import Alignment, Shimming, State
 from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.laboratory.measured_focus import MeasuredAlignment, run_focus_test

@@ -25,8 +25,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.specs.camera_tests import FocusFiles, MeasuredFocusSpec, NoiseSpec
-from scenes.specs.lab_setup import FocusSetup, MeasuredFocusSetup
-from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.units import LENGTH

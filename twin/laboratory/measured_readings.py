@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from analysis.orientation.measurement import CALIBRATED, Spots
 from analysis.turntable.dividing_error import CalibrationSeries
 from scenes.specs.camera_tests import DistortionFiles
-from scenes.specs.turntable_test import TurntableFiles
+from scenes.specs.turntable import TurntableFiles
 from scenes.yaml.csv_table import Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import digest_of

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.turntable_test import DividingErrorSpec, TurntableTestSpec
+from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from twin.run.random_streams import stream
 
 Array = NDArray[np.float64]

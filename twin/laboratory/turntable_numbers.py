@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.turntable.angle_fits import AngleFit
-from analysis.turntable.chauvenet import expected_rejections
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.lab_setup import TurntableSetup, resolve_turntable_test
-from scenes.specs.resolved import ExperimentSetup
+from scenes.specs.resolved import ExperimentSetup, TurntableSetup, resolve_turntable_test
 from twin.laboratory.measured_readings import Comparisons
 from twin.laboratory.turntable_run import MeasuredTurntable, SimulatedTurntable, TurntableRun, rms, run_turntable_test
 from twin.run.plain_data import plain_data

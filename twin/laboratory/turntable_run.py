@@ -19,9 +19,8 @@ from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.lab_setup import MeasuredTurntableSetup
-from scenes.specs.resolved import ExperimentSetup
-from scenes.specs.turntable_test import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
+from scenes.specs.resolved import ExperimentSetup, MeasuredTurntableSetup
+from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.laboratory.measured_readings import Comparisons, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.run.procedure import Advance, silent

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from optics.geometry.tree import State
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.shadow import imaging_shadows
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job, target_band
 from scenes.yaml.errors import InputError

@@ -8,7 +8,7 @@ from typing import Any
 
 from scenes.specs.course import DEFAULT_PIVOT, FEWEST, MOST, moment
 from scenes.specs.job import JobSpec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.live.knobs import AXES, Knob, perturbation
 from twin.live.live_bench import LiveBench

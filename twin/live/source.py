@@ -12,11 +12,11 @@ from typing import Any
 from scenes.kinds.file_kinds import FileKind, kind_of, read_for
 from scenes.specs.job import JobSpec
 from scenes.specs.load import INSTRUMENTS, library_names
-from scenes.specs.measured.monitor_frames_setup import resolve_measurement
+from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.live.messages import MOST_FRAMES

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from scenes.specs.study import DesignSpec
-from scenes.specs.study_factor import FactorSpec
+from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import KeyPath
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.live.knobs import AXES, KINDS, knob_name

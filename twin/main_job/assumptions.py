@@ -9,8 +9,8 @@ import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Split, quantities, split
-from scenes.specs.channel import BASE
 from scenes.specs.course import moment
+from scenes.specs.instrument import BASE
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, Parameter

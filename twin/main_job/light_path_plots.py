@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from optics.geometry.solid import Solid, solid_mesh
 from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
+from scenes.specs.instrument import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 from twin.run.svg import (
     BLUE,

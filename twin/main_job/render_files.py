@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from scenes.specs.channel import Channel
+from scenes.specs.instrument import Channel
 from twin.main_job.deformation_results import deformation_numbers, faces_of
 from twin.main_job.heat_section import heat_numbers, heated_of
 from twin.main_job.job_tables import config_text, finish_names, finish_tables, table_names

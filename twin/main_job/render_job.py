@@ -14,9 +14,9 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.instrument_model import Instrument
-from scenes.models.measured_finishes import measured_finishes
 from scenes.models.obstruction import find_obstructions
-from scenes.specs.channel import PRISM_180, prism_of
+from scenes.models.scenery import measured_finishes
+from scenes.specs.instrument import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError

@@ -16,8 +16,8 @@ from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
-from scenes.models.measured_finishes import MeasuredFinishes
 from scenes.models.obstruction import Obstruction
+from scenes.models.scenery import MeasuredFinishes
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.monitor_reading import MonitorReading, stated_check
 from twin.monitor.crosstalk import CameraCrosstalk

@@ -11,7 +11,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.main_job.render_results import RenderRun
 from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.systematics import joined, systematics

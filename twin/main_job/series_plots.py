@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.spot_plots import marks
 from twin.monitor.time_series import TimeSeries

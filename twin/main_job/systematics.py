@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.monitor.monitoring import PER_SI
 from optics.geometry.tree import Motion
-from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.specs.instrument import BASE, CENTRAL_PRISM
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.monitor.motions import ElementaryMotion

@@ -13,7 +13,7 @@ from scipy.special import ndtr, ndtri
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
-from scenes.models.statement_excess import beyond_statement
+from scenes.models.job_state import beyond_statement
 from scenes.specs.course import moment
 from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated

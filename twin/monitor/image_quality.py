@@ -35,12 +35,11 @@ from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
-from scenes.models.camera_assembly import line_body
-from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.models.camera_model import LAUNCH_DISTANCE, line_body
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams, imaging_shadows
 from scenes.specs.camera import CameraSpec
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
 from twin.sensors.line_ccd import band_factors
 

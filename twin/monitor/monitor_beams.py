@@ -23,7 +23,7 @@ from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
 from optics.waves.wavefront import eikonal
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import Channel
+from scenes.specs.instrument import Channel
 from twin.monitor.image_sampling import UncertainImageError
 from twin.monitor.monitor_rays import Aimed, CcdRays, CoarseTrace, SpotFocus
 

@@ -31,8 +31,8 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of, on_deformed
 from scenes.models.thermal_model import ThermalModel
-from scenes.specs.channel import SIDES
 from scenes.specs.course import NO_MOTION
+from scenes.specs.instrument import SIDES
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob

@@ -17,11 +17,11 @@ from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
-from optics.raytrace.element_numbers import touched_bodies
+from optics.raytrace.system import touched_bodies
 from optics.waves.diffraction import PupilField, image
 from optics.waves.pixel_response import PixelResponse, UnsampledImageError
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.image_sampling import (
     GOOD,
     SPOT_RANGES,

@@ -9,7 +9,7 @@ from analysis.units import ARCSEC
 from optics.geometry.pose import triple
 from optics.geometry.tree import ORIGIN, Motion, State
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM
+from scenes.specs.instrument import BASE, CENTRAL_PRISM
 
 _UNITS = {"rotate": ("arcsec", ARCSEC), "shift": ("um", 1e-6), "scale": ("ppm", 1e-6), "figure": ("nm", 1e-9)}
 _AXES = "XYZ"

@@ -21,8 +21,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import state_of
-from scenes.specs.channel import BASE
-from scenes.specs.instrument import ErrorBudgetSpec
+from scenes.specs.instrument import BASE, ErrorBudgetSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 

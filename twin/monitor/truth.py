@@ -14,9 +14,9 @@ from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import LineChange, aim_chief_rays, chief_directions, line_change
 from optics.raytrace.system import SystemBatch, assemble
-from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.motions import ElementaryMotion
 
 LINE_POINTS = 41

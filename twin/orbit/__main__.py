@@ -13,8 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from scenes.specs.measured.orbit_data_setup import resolve_any_angle, resolve_any_calibration
-from scenes.specs.measured.pass_files_setup import resolve_check, resolve_match
+from scenes.specs.measured.orbit_data_setup import (
+    resolve_any_angle,
+    resolve_any_calibration,
+    resolve_check,
+    resolve_match,
+)
 from scenes.specs.orbit.setup import resolve_monitor, resolve_simulate
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import DISTANCE, parse_quantity

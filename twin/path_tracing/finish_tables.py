@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from optics.materials import coating_table, scatter_table
+from optics.materials import finish, scatter
 from optics.materials.finish import Finish
-from optics.materials.scatter_table import DrawnScatter
+from optics.materials.scatter import DrawnScatter
 from optics.numerics.backend import Backend
 from scenes.models.scene_surface import SceneSurface
 
@@ -47,15 +47,15 @@ class FinishTables:
 
     def shares(self, marks: Sequence[Any], cosine: Any, active: Any) -> tuple[Any, Any]:
         """Reflectance and transmittance of the coatings of paths that have one, by the cosine on the side of air."""
-        number, k, w = self._place(marks[0], cosine, coating_table.STEPS)
-        first = 2 * ((coating_table.STEPS + 1) * number + k)
+        number, k, w = self._place(marks[0], cosine, finish.STEPS)
+        first = 2 * ((finish.STEPS + 1) * number + k)
         has = active & (marks[0] > 0.5)
         low, high = ([self._get(self.coatings, first + n + step, has) for n in (0, 1)] for step in (0, 2))
         return (1.0 - w) * low[0] + w * high[0], (1.0 - w) * low[1] + w * high[1]
 
     def total(self, marks: Sequence[Any], cosine: Any, active: Any) -> Any:
         """Total integrated scatter of the tables of paths that have one."""
-        number, k, w = self._place(marks[1], cosine, scatter_table.STEPS)
+        number, k, w = self._place(marks[1], cosine, scatter.STEPS)
         has = active & (marks[1] > 0.5)
         first = self._uint(self._get(self.headers, _HEADER * number + 2, has)) + k
         return (1.0 - w) * self._get(self.numbers, first, has) + w * self._get(self.numbers, first + 1, has)
@@ -73,7 +73,7 @@ class FinishTables:
         """
         import drjit as dr
 
-        number, k, w = self._place(marks[1], cosine, scatter_table.STEPS)
+        number, k, w = self._place(marks[1], cosine, scatter.STEPS)
         has = active & (marks[1] > 0.5)
         header = [self._get(self.headers, _HEADER * number + n, has) for n in range(_HEADER)]
         rings, sectors, share, ring_sums, sector_sums, cosines, azimuths = (self._uint(v) for v in header[:7])

@@ -20,7 +20,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import Channel
+from scenes.specs.instrument import Channel
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.monitor_rays import Aimed
 from twin.path_tracing.families import nominal_codes

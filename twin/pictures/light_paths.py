@@ -14,9 +14,9 @@ from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 
 RIM = 48
 """Rays around the edge of a beam; the first is at +x of the stop or face, then counterclockwise."""

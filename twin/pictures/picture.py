@@ -18,7 +18,7 @@ import numpy as np
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE, CENTRAL_PRISM, PRISM_0, prism_of
+from scenes.specs.instrument import BASE, CENTRAL_PRISM, PRISM_0, prism_of
 from twin.pictures.light_paths import LightPaths, trace_light_paths
 from twin.pictures.picture_light import PictureError, Studio, colour_variant
 from twin.pictures.picture_scene import Part, View, framed, points_in_world, studio_parts

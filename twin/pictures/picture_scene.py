@@ -14,7 +14,7 @@ import trimesh
 
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import behind
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.pictures.light_paths import LightPaths
 from twin.pictures.scene_file import BLOCK, BRASS, DARK, GLASS, MIRROR, SILICON, build_scene, is_mirror
 

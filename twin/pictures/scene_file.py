@@ -28,7 +28,7 @@ from optics.geometry.tree import AT_REST, Body, PlacedBodies, State
 from scenes.models.instrument_model import Instrument
 from scenes.models.meshes import BOARD, CHIP, behind, board_size, mirror_mesh
 from scenes.specs.baffle import Plate
-from scenes.specs.channel import BASE, Channel
+from scenes.specs.instrument import BASE, Channel
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.pictures.light_paths import RIM, Beam, LightPaths, trace_light_paths
 

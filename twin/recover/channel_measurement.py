@@ -18,15 +18,20 @@ from analysis.spots.frame_screening import (
     screen_frames,
     shown_noise,
 )
-from analysis.spots.learnt_noise import FittedSpot, LearntShift, learnt_shift
-from analysis.spots.learnt_template import LearntTemplate, learn_template, without_slopes
+from analysis.spots.learnt_template import (
+    FittedSpot,
+    LearntShift,
+    LearntTemplate,
+    learn_template,
+    learnt_shift,
+    without_slopes,
+)
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PixelCorrection
-from analysis.spots.repaired_image import repaired_centroid
 from analysis.spots.screened_fit import CORE_SHARE, ScreenedFit, one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions, difference_covariance, noise_parts
 from analysis.spots.spot_template import SpotTemplate
-from analysis.spots.static_defects import Examined, examine, lone_pixels, refit
+from analysis.spots.static_defects import Examined, examine, lone_pixels, refit, repaired_centroid
 from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.yaml.errors import Issue
 from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_measure

@@ -15,8 +15,7 @@ from analysis.images.recording_time import recorded
 from analysis.spots.frame_screening import FramesError
 from analysis.spots.noise import NoiseModel
 from analysis.spots.photon_transfer import PhotonTransfer, PixelCorrection, photon_transfer, pixel_correction
-from scenes.specs.measured.monitor_frames import MeasurementSpec, per_channel
-from scenes.specs.measured.monitor_frames_setup import AFTER, BEFORE, MeasurementSetup
+from scenes.specs.measured.monitor_frames import AFTER, BEFORE, MeasurementSetup, MeasurementSpec, per_channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
 from scenes.yaml.spec import Spec
 

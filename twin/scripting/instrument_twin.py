@@ -23,7 +23,7 @@ from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
 from scenes.specs.load import load_camera as read_camera
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_job import render_job

@@ -14,8 +14,7 @@ import pandas as pd
 from optics.numerics.backend import load_backend
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.spec import Source
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Source, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.laboratory.laboratory_tests import LABORATORY_TESTS
 from twin.orbit.orbit_tests import ORBIT_TESTS

@@ -17,7 +17,7 @@ from analysis.monitor.monitoring import PARAMETERS
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.run.unfinished import scratch
 from twin.study.runs.config_tree import Tree

@@ -19,7 +19,7 @@ from optics.geometry.vector_shape import HalfPlane
 from optics.targets.target_image import EdgeProfile
 from optics.targets.target_shapes import slanted_edge
 from optics.waves.diffraction import Grid
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.camera import BandSpec
 from twin.sensors.line_ccd import LineCcd, band_wavelengths

@@ -19,7 +19,7 @@ from optics.raytrace.trace import BeamMissedError
 from optics.targets.target_image import target_image
 from optics.targets.target_shapes import Target, bar_group
 from optics.waves.diffraction import Grid
-from optics.waves.pupil_function import PupilFunction
+from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.specs.camera import BandSpec
 from twin.sensors.line_ccd import LineCcd, band_wavelengths

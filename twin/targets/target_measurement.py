@@ -6,14 +6,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from analysis.mtf.bar_contrast import BarError, BarMtf, measure_bars
-from analysis.mtf.slanted_edge import EdgeError, EdgeMtf, measure_edge
+from analysis.mtf.bar_mtf import BarError, BarMtf, measure_bars
+from analysis.mtf.edge_location import EdgeError
+from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.targets.target_shapes import TARGETS
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import imaging_shadows
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, target_band
 from twin.run.random_streams import stream

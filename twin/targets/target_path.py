@@ -25,10 +25,9 @@ from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
-from optics.waves.pupil_function import PupilFunction, fit_pupils
 from optics.waves.pupil_shadow import SMALLEST
-from scenes.models.camera_assembly import line_body
-from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel
+from optics.waves.pupil_stack import PupilFunction, fit_pupils
+from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams
 
 RINGS = 14

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from analysis.mtf.bar_contrast import BarMtf
-from analysis.mtf.edge_mtf import EdgeMtf
+from analysis.mtf.bar_mtf import BarMtf
+from analysis.mtf.slanted_edge import EdgeMtf
 from twin.run.data_files import FrameFacts
 
 NYQUIST = 0.5

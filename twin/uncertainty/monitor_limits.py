@@ -11,9 +11,8 @@ import numpy as np
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
-from analysis.monitor.limits import LeastSeen, Quantity, Split
+from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails
 from analysis.monitor.recovery import joint, judged_spots
-from analysis.monitor.stated_numbers import Elasticity, HeavyTail, elasticities, heavy_tails
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.units import ARCSEC

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, LeastSeen, Quantity
-from analysis.monitor.stated_numbers import unseen
-from scenes.specs.channel import BASE
+from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, LeastSeen, Quantity, unseen
+from scenes.specs.instrument import BASE
 from twin.run.artefact import SYMBOLS, shown_unit, significant
 from twin.uncertainty.monitor_limits import MonitorLimits
 

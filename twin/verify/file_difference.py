@@ -24,7 +24,7 @@ import xarray as xr
 
 from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.compare.run_differences import TOLD, Leaf, is_sigma, leaves, sigma_of
 

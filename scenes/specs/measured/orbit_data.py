@@ -3,17 +3,31 @@
 Nothing here has a default where two readings are usual: a file that does not say which one it means is refused.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.measured.pass_files import BodyAxes, PlatformFilesSpec
+from scenes.specs.measured.pass_files import (
+    AngleSigma,
+    BodyAxes,
+    ClockReading,
+    GroundFileSpec,
+    PlatformFilesSpec,
+    PointSigma,
+    RasterFileSpec,
+    TimeScale,
+)
 from scenes.specs.orbit.angle import Angles, EffectsSpec, Flag, Moment
 from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec, checked_schemes
 from scenes.specs.orbit.flight import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
+from scenes.specs.orbit.scene import ImagePointsSpec, LightEffectsSpec
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.spec import Name, Named, Reference, Spec
+from scenes.yaml.quantity import Quantity
+from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Whole
+from scenes.yaml.units import TIME
 
 
 class QuaternionSpec(Spec):
@@ -84,7 +98,7 @@ class PassFilesSpec(Spec):
     tie_points: Reference | None = None
 
     @model_validator(mode="after")
-    def _has_a_platform(self) -> "PassFilesSpec":
+    def _has_a_platform(self) -> PassFilesSpec:
         apart = (self.orbit is not None, self.attitude is not None)
         if (self.platform is not None) == any(apart) or (any(apart) and not all(apart)):
             given = [k for k in ("platform", "orbit", "attitude") if getattr(self, k) is not None]
@@ -266,9 +280,168 @@ class MeasuredAngleSpec(MeasuredTestSpec):
     errors: ReadingErrorsSpec
 
     @model_validator(mode="after")
-    def _knows_these_errors(self) -> "MeasuredAngleSpec":
+    def _knows_these_errors(self) -> MeasuredAngleSpec:
         tracker = self.errors.star_tracker
         if any(tracker.drift or ()) or any(tracker.walk):
             problem = "angles know of readings and slow errors of the attitude, not of a drift or a walk"
             raise Problem(problem, None, "`slow:`", within=("errors", "star_tracker"))
         return self
+
+
+TimeSigma = Annotated[float, Quantity(TIME, smallest="0 s", largest="100 s")]
+PixelSigma = Annotated[Number, Field(ge=0.0, le=10_000.0)]
+
+
+class LineTimesFileSpec(Spec):
+    """When lines were exposed: a table of camera, line and time.
+
+    Attributes:
+        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`.
+        time_scale: of the clock.
+        epoch: reading of that clock at 0 s, for tables with `time [s]`.
+        moment: which moment of its exposure a line's time is.
+    """
+
+    file: Reference
+    time_scale: TimeScale
+    epoch: ClockReading | None = None
+    moment: Literal["start", "middle", "end"]
+
+
+class ImagePointsFileSpec(Spec):
+    """Where lines see ground points: a table of point, camera, line, pixel and their sigmas.
+
+    Attributes:
+        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `sigma_line`, `sigma_pixel` and perhaps
+            `correlation`.
+        centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
+        first_pixel: number of the first pixel of a line.
+        first_pixel_sees: to which side of the track the first pixel looks.
+    """
+
+    file: Reference
+    centre: Literal["integer", "half"]
+    first_pixel: Annotated[Whole, Field(ge=0, le=1)]
+    first_pixel_sees: Literal["right", "left"]
+
+
+class UncertaintySpec(Spec):
+    """How wrong camera and platform may be, standard deviations: what hides a convention, if it is large enough.
+
+    Attributes:
+        attitude: of the measured attitude with the camera's mounting, about each axis.
+        position: of the orbit, along each axis.
+        interior: of each line's place in the focal plane, pixels along and across it.
+        scale: of each line's focal length, relative.
+        time: of the line times against those of orbit and attitude.
+    """
+
+    attitude: AngleSigma = 3e-4
+    position: PointSigma = 10.0
+    interior: PixelSigma = 20.0
+    scale: Annotated[Number, Field(ge=0.0, le=0.1)] = 1e-4
+    time: TimeSigma = 1e-3
+
+
+class OrbitCheckSpec(PayloadTestSpec):
+    """A check of the conventions of a pass in files.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        platform: orbit and attitude.
+        lines: times of the lines.
+        ground: points on the ground.
+        image_points: where the lines see them.
+        effects: what happens to the light between ground and camera.
+        uncertainty: how wrong camera and platform may be.
+        points: most of each line that are used.
+        shown: places of points that are printed for each reading.
+    """
+
+    platform: PlatformFilesSpec
+    lines: LineTimesFileSpec
+    ground: GroundFileSpec
+    image_points: ImagePointsFileSpec
+    effects: LightEffectsSpec = LightEffectsSpec()
+    uncertainty: UncertaintySpec = UncertaintySpec()
+    points: Annotated[Whole, Field(ge=4, le=1000)] = 60
+    shown: Annotated[Whole, Field(ge=1, le=20)] = 3
+
+    @property
+    def seed(self) -> int:
+        """Nothing is drawn."""
+        return 0
+
+
+class ImageWindowSpec(Spec):
+    """A part of an image.
+
+    Attributes:
+        row, column: of the file, of its first pixel, counted from 0.
+        rows, columns: its size.
+    """
+
+    row: Annotated[Whole, Field(ge=0)]
+    column: Annotated[Whole, Field(ge=0)]
+    rows: Annotated[Whole, Field(ge=32, le=50_000)]
+    columns: Annotated[Whole, Field(ge=32, le=50_000)]
+
+
+class LineImageFileSpec(Spec):
+    """A line's image in a file.
+
+    Attributes:
+        file: path, TIFF; a georeference in it is not used.
+        band: that is read, counted from 1.
+        first_line: number, in the table of times, of the image's first row.
+        first_pixel: pixel of the line, counted from 0, of the image's first column.
+        first_pixel_sees: to which side of the track the first column looks.
+        window: part that is matched; None for all.
+    """
+
+    file: Reference
+    band: Annotated[Whole, Field(ge=1, le=1000)] = 1
+    first_line: Annotated[Whole, Field(ge=0)] = 0
+    first_pixel: Annotated[Whole, Field(ge=0)] = 0
+    first_pixel_sees: Annotated[str, Field(pattern="^(right|left)$")]
+    window: ImageWindowSpec | None = None
+
+
+def _some_images(images: Named[LineImageFileSpec]) -> Named[LineImageFileSpec]:
+    if not images:
+        raise Problem("no images", "an empty mapping", "one line of the camera or more")
+    return images
+
+
+class OrbitMatchSpec(PayloadTestSpec):
+    """Points of an orthophoto, and tie points, sought in line images.
+
+    Attributes:
+        name: as the file is called; also of the pass in what is exported.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        platform: orbit and attitude.
+        lines: times of the lines.
+        images: line -> its image.
+        orthophoto: of the ground.
+        dem: of the ground.
+        control_sigma: of places of the orthophoto with their heights: in plan, each axis, and in height, metres.
+        effects: what happens to the light between ground and camera.
+        points: how many, and how they are matched.
+    """
+
+    platform: PlatformFilesSpec
+    lines: LineTimesFileSpec
+    images: Annotated[Named[LineImageFileSpec], AfterValidator(_some_images)]
+    orthophoto: RasterFileSpec
+    dem: RasterFileSpec
+    control_sigma: tuple[PointSigma, PointSigma]
+    effects: LightEffectsSpec = LightEffectsSpec()
+    points: ImagePointsSpec
+
+    @property
+    def seed(self) -> int:
+        """Nothing is drawn."""
+        return 0

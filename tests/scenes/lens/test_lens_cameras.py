@@ -13,14 +13,12 @@ from optics.materials.glass import N_BK7
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.__main__ import app
-from scenes.lens.batoid_reader import read_batoid
-from scenes.lens.batoid_writer import batoid_text
+from scenes.lens.batoid_file import batoid_text, read_batoid
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses
-from scenes.lens.prescription import SEQUENCE, Prescription
-from scenes.lens.shapes import joined
+from scenes.lens.prescription import SEQUENCE, Prescription, joined
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
@@ -28,7 +26,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera, load_instrument
 from scenes.yaml.errors import InputError
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.lens.files import BATOID, CODEV, SINGLET, TMA
 

@@ -10,7 +10,7 @@ from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.surface import ZernikeFigure
 from optics.materials.glass import N_BK7
 from optics.raytrace.assembly import Interaction
-from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_file import read_batoid
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalogues
 from scenes.lens.prescription import Prescription, glass_key

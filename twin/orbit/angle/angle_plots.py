@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from analysis.orbit.sensitivity import AXES
+from analysis.orbit.angles import AXES
 from analysis.units import ARCSEC
 from twin.orbit.angle.angle_run import AngleRun, Scatter
 from twin.run.svg import (

@@ -21,14 +21,15 @@ from analysis.orbit.angles import (
     AlongTrackAngles,
     AngleError,
     PlaneAngles,
+    Sensitivity,
     along_track_angles,
     angles_between,
     line_frame,
     look_angle,
+    sensitivity,
 )
 from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
-from analysis.orbit.sensitivity import Sensitivity, sensitivity
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly

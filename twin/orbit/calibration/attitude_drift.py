@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.hidden_terms import FALSE_ALARM, Rates
+from analysis.orbit.residual_tests import FALSE_ALARM, Rates
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec
 from twin.orbit.calibration.campaign import Campaign

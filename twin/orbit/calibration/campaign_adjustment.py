@@ -10,10 +10,10 @@ from typing import Literal
 
 import numpy as np
 
-from analysis.orbit.adjustment import Adjustment, Robust, adjust
+from analysis.orbit.adjustment import Adjustment, adjust
 from analysis.orbit.calibration_parameters import OFFSET, RATE, Prior, Unknowns
-from analysis.orbit.hidden_terms import FALSE_ALARM
 from analysis.orbit.null_space import Gauge
+from analysis.orbit.residual_tests import FALSE_ALARM, Robust
 from analysis.orbit.three_line_model import BIAS
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from analysis.orbit.adjustment import Adjustment
-from analysis.orbit.hidden_terms import Steps
+from analysis.orbit.residual_tests import Steps
 from twin.orbit.calibration.campaign import Campaign
 from twin.run.artefact import Cell, Table
 

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import intersect
-from analysis.orbit.residual_weights import REJECT
+from analysis.orbit.residual_tests import REJECT
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, Rejected
 from twin.orbit.calibration.campaign_adjustment import simultaneous

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.measured.pass_files_setup import CheckSetup, resolve_check
+from scenes.specs.measured.orbit_data_setup import CheckSetup, resolve_check
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried, run_check
 from twin.orbit.conventions.possible_readings import QUESTIONS, Changes, changed
 from twin.orbit.flight.earth import Earth, east_north_up

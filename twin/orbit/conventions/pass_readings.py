@@ -19,7 +19,7 @@ from twin.orbit.measured.platform_files import Conventions, PlatformReadings, re
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_check import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
+    from scenes.specs.measured.orbit_data import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
     from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 
 _LINES = (

@@ -29,7 +29,7 @@ from twin.orbit.measured.earth_orientation import constant_orientation
 from twin.orbit.measured.platform_files import Conventions, platform_table
 
 if TYPE_CHECKING:
-    from scenes.specs.measured.orbit_check import UncertaintySpec
+    from scenes.specs.measured.orbit_data import UncertaintySpec
 
 _TURN, _SHIFT, _DELAY, _RISE = 1e-5, 10.0, 1e-3, 10.0
 """Steps of the derivatives: radians, metres, seconds, metres."""

@@ -20,9 +20,9 @@ from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
-from scenes.models.camera_assembly import line_body
+from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.orbit.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
 
 TRACED_POINTS = 49

@@ -21,8 +21,8 @@ from scipy import constants, fft
 
 from optics.geometry.polygon import area
 from optics.geometry.zernike import cartesian_terms
-from optics.waves.pupil_function import PupilFunction, circular_pupil
 from optics.waves.pupil_shadow import PupilShadow, separate
+from optics.waves.pupil_stack import PupilFunction, circular_pupil
 from optics.waves.transfer import TransferTable
 from scenes.specs.camera import BandSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.measured.pass_files_setup import MatchSetup, resolve_match
+from scenes.specs.measured.orbit_data_setup import MatchSetup, resolve_match
 from twin.orbit.images.simulate_numbers import PointNumbers
 from twin.orbit.matching.match_run import Match, UserImage, run_match
 from twin.orbit.measured.map_part import MapPart

@@ -42,8 +42,8 @@ from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from scenes.specs.measured.orbit_match import LineImageFileSpec, OrbitMatchSpec
-    from scenes.specs.measured.pass_files_setup import MatchSetup
+    from scenes.specs.measured.orbit_data import LineImageFileSpec, OrbitMatchSpec
+    from scenes.specs.measured.orbit_data_setup import MatchSetup
 
 _BORDER = 5
 """Places along each side of an image that are followed to the ground."""

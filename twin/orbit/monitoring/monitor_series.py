@@ -25,8 +25,8 @@ from analysis.spots.spot_positions import (
 )
 from optics.geometry.tree import State
 from optics.numerics.threads import cores, one_blas_thread
-from scenes.specs.channel import CENTRAL_PRISM
 from scenes.specs.course import moment
+from scenes.specs.instrument import CENTRAL_PRISM
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.procedure import BenchError
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.orbit.monitored_camera import CalibratedLine, Sightings
+from analysis.orbit.forward_intersection import CalibratedLine, Sightings
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State, compose
 from optics.numerics.backend import Backend
@@ -22,8 +22,8 @@ from optics.raytrace.trace import BeamMissedError
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
-from scenes.specs.channel import BASE
 from scenes.specs.course import moment
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS

@@ -16,8 +16,7 @@ from scipy.stats import chi2, norm
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.intersection_angle import exact
-from analysis.orbit.forward_intersection import check_errors
-from analysis.orbit.monitored_camera import CalibratedLine, IntersectionError, between, intersect_pair
+from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, between, check_errors, intersect_pair
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS

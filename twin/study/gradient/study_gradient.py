@@ -20,8 +20,7 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
-from scenes.specs.study import ResponseSpec
-from scenes.specs.study_factor import FactorSpec
+from scenes.specs.study import FactorSpec, ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.monitor.image_quality import quality_dicts

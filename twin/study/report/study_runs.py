@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from scenes.specs.study import GRID, NOISE, StudySpec
-from scenes.specs.study_factor import FactorSpec
+from scenes.specs.study import GRID, NOISE, FactorSpec, StudySpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
 

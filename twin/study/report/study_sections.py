@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from scenes.specs.study_factor import FactorSpec
+from scenes.specs.study import FactorSpec
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, Undrawn, fixed, plain
 from twin.run.report import Section

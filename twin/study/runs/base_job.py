@@ -11,8 +11,7 @@ from analysis.measurement_error import MeasurementError
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
 from scenes.yaml.errors import InputError, KeyPath
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.procedure import Procedure, silent
 from twin.study.runs.config_tree import Tree, with_values

@@ -10,8 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import annotation_at
+from scenes.yaml.spec import Spec, annotation_at
 
 Tree = dict[str, Any]
 

@@ -13,8 +13,7 @@ from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Spec
-from scenes.yaml.translate import annotation_at, validate
+from scenes.yaml.spec import Spec, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.study.runs.config_tree import Tree, with_values
 

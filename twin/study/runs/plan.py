@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from scenes.yaml.errors import InputError, KeyPath, Problem
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
 from twin.study.runs.base_job import Run

@@ -17,13 +17,11 @@ from pydantic import TypeAdapter, ValidationError
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
-from scenes.specs.study import StudySpec
-from scenes.specs.study_factor import FactorSpec, Scalar
+from scenes.specs.study import FactorSpec, Scalar, StudySpec
 from scenes.yaml.csv_table import lines_of, table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.spec import Source, Spec
-from scenes.yaml.translate import validate
+from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import (
     LARGEST_BYTES,
     NO_TEXT,

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.orbit.angles import intersection_angles
+from analysis.orbit.angles import Sensitivity, intersection_angles, sensitivity
 from analysis.orbit.planes import Method, Strip
-from analysis.orbit.sensitivity import Sensitivity, sensitivity
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement

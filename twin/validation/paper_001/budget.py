@@ -15,7 +15,7 @@ from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.numerics.threads import cores, one_blas_thread
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.load import load_error_budget
 from scenes.specs.resolved import resolve_budget
 from twin.monitor.simulated_budget import BudgetLine, ErrorBudget, Together

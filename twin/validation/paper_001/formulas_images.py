@@ -17,7 +17,7 @@ from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import Truth
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg

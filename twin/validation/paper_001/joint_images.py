@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.validation.paper_001.formulas_images import PARAMETERS, MonitorImages, Ratio, quotient
 

@@ -19,7 +19,7 @@ import numpy as np
 from analysis.monitor import autocollimator
 from analysis.monitor.autocollimator import column_component, mean_difference, relation_factor
 from analysis.units import ARCSEC
-from scenes.specs.autocollimator_test import AutocollimatorSetup, AutocollimatorTestSpec
+from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.load import load_autocollimator_test
 from twin.laboratory.autocollimator_bench import (
     Reader,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.lab_setup import resolve_distortion
+from scenes.specs.resolved import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_run import SimulatedDistortion, measure, rms
 from twin.run.artefact import Cell, SvgFigure, Table

@@ -18,8 +18,8 @@ from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
-from scenes.models.camera_assembly import ROOT, build_camera_under_test
-from scenes.specs.lab_setup import DistortionSetup, resolve_distortion
+from scenes.models.camera_model import ROOT, build_camera_under_test
+from scenes.specs.resolved import DistortionSetup, resolve_distortion
 from twin.targets.target_path import TargetPath
 from twin.validation.checks.check import Check, CheckResult
 from twin.validation.checks.group import CheckGroup, Context

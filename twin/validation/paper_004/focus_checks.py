@@ -19,7 +19,7 @@ from analysis.units import MM_PER_M as MM
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.lab_setup import resolve_focus
+from scenes.specs.resolved import resolve_focus
 from twin.laboratory.focus_alignment import Alignment, State, align, line_turn, mount_of
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import NYQUIST

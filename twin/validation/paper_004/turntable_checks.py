@@ -12,12 +12,11 @@ from scipy.special import erfc
 from scipy.stats import norm
 
 from analysis.turntable.angle_fits import FITS, NotConvergedError, fit
-from analysis.turntable.chauvenet import rejection_rate
-from analysis.turntable.dividing_error import CalibrationSeries
+from analysis.turntable.dividing_error import CalibrationSeries, rejection_rate
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.lab_setup import resolve_turntable
-from scenes.specs.turntable_test import TurntableTestSpec
+from scenes.specs.resolved import resolve_turntable
+from scenes.specs.turntable import TurntableTestSpec
 from twin.laboratory.distortion_run import rms
 from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_report import FIT_NAMES

@@ -16,7 +16,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.models.instrument_model import Instrument
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath

@@ -14,7 +14,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from scenes.specs.channel import BASE
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family
 from twin.validation.checks.printed import load_printed

@@ -1,8 +1,9 @@
-"""The turntable test of paper 004 (section 3.3): a table with a dividing error that nobody knows, and its regional
-comparison with a polygon and an autocollimator, as a file in scenes/lab gives it.
+"""The turntable test of paper 004 (section 3.3): a table with a dividing error that nobody knows, and its calibration.
 
 Dividing error = reading - true angle. With `measured:` the comparisons are those of a real bench, from files.
 """
+
+from __future__ import annotations
 
 import math
 from typing import Annotated
@@ -37,7 +38,7 @@ class GraduationSpec(Spec):
     slope: Annotated[Number, Field(ge=0.0, le=4.0)]
 
     @model_validator(mode="after")
-    def _in_order(self) -> "GraduationSpec":
+    def _in_order(self) -> GraduationSpec:
         if self.last < self.first:
             raise Problem(
                 "the last harmonic is below the first", str(self.last), f"{self.first} or more", within=("last",)
@@ -140,7 +141,7 @@ class CalibrationPlanSpec(Spec):
         return round((self.last - self.first) / self.step) + 1
 
     @model_validator(mode="after")
-    def _makes_sense(self) -> "CalibrationPlanSpec":
+    def _makes_sense(self) -> CalibrationPlanSpec:
         shown = {name: format_quantity(getattr(self, name), ANGLE) for name in ("first", "last", "step")}
         if self.last == self.first:
             raise Problem("all angles would be the same", shown["last"], "an angle beyond the first", within=("last",))
@@ -191,7 +192,7 @@ class TurntableTestSpec(Spec):
     seed: Seed = 1
 
     @model_validator(mode="after")
-    def _camera_is_calibrated(self) -> "TurntableTestSpec":
+    def _camera_is_calibrated(self) -> TurntableTestSpec:
         plan = self.calibration
         if not plan.first < self.camera_angle < plan.last:
             region = f"between {format_quantity(plan.first, ANGLE)} and {format_quantity(plan.last, ANGLE)}"

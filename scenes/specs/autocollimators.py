@@ -1,6 +1,6 @@
-"""The test with two autocollimators, the principle experiment of paper 001 (section 3.1): both look at plane mirrors at
-an angle on a three-axis turntable. As a file in scenes/lab gives it.
-"""
+"""The test with two autocollimators, the principle experiment of paper 001 (section 3.1)."""
+
+from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -45,7 +45,7 @@ class LensSpec(Spec):
     focal_distance: PositiveLength
 
     @model_validator(mode="after")
-    def _is_curved(self) -> "LensSpec":
+    def _is_curved(self) -> LensSpec:
         for name in ("front_radius", "back_radius"):
             radius = getattr(self, name)
             if 2.0 * abs(radius) <= self.diameter:
@@ -80,7 +80,7 @@ class AutocollimatorSpec(Spec):
     frames: Frames = 9
 
     @model_validator(mode="after")
-    def _window_fits(self) -> "AutocollimatorSpec":
+    def _window_fits(self) -> AutocollimatorSpec:
         side = min(self.area_ccd.rows, self.area_ccd.columns)
         if self.window > side:
             raise Problem("larger than the area CCD", str(self.window), f"at most {side}", within=("window",))
@@ -176,7 +176,7 @@ class AutocollimatorTestSpec(Spec):
     errors: BenchErrorsSpec
 
     @model_validator(mode="after")
-    def _mirrors_fit(self) -> "AutocollimatorTestSpec":
+    def _mirrors_fit(self) -> AutocollimatorTestSpec:
         least = min(self.programme.narrow, *self._stand_angles())
         # neighbouring rims touch where the mirrors' planes meet: at radius tan(theta) from either middle
         from_middle = self.mirrors.radius * math.tan(least)
