@@ -63,7 +63,7 @@ def why_unreadable(error: BaseException) -> str:
     Libraries stumble over damaged files in ways that they do not foresee. A text that speaks of the inside of the
     program, such as the shapes of its arrays, helps nobody and is left out.
     """
-    inside = isinstance(error, LookupError | AttributeError | TypeError | AssertionError | OverflowError)
+    inside = isinstance(error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning)
     text = re.sub(r"\s+", " ", str(error)).strip()[:200]
     return "it is damaged" if inside or not text or "broadcast" in text or "unpack" in text else text
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from analysis.images.image_file import ImageFile
 from scenes.specs.resolved import resolve
@@ -20,6 +18,7 @@ from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
 from twin.run.data_table import TABLE_FORMATS, DataTable, MissingPackage
+from twin.run.netcdf_file import read_netcdf
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
 from twin.run.run_folder import MANIFEST, Manifest, RunFolder, altered, read_manifest
@@ -191,14 +190,9 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
         advance("frames", k + 1, len(pictures))
     for name, stem in EXPECTED.items():
         if name in manifest.sha256:
-            with (
-                _told(source / name),
-                # of a damaged file the library leaves the file open
-                xr.open_dataset(
-                    io.BytesIO((source / name).read_bytes()), engine="h5netcdf", decode_timedelta=False
-                ) as data,
-            ):
-                content = expected_fits(data.load(), [*about, *cards])
+            with _told(source / name):
+                data = read_netcdf((source / name).read_bytes())
+                content = expected_fits(data, [*about, *cards])
                 items = int(np.prod(data["photons"].shape[:-2]))
             yield _put(folder, f"{stem}.fits", content, name, "expected photons per pixel and frame", items)
 

@@ -20,13 +20,13 @@ from typing import Any
 import cv2
 import numpy as np
 import tifffile
-import xarray as xr
 
 from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.compare.run_differences import TOLD, Leaf, is_sigma, leaves, sigma_of
+from twin.run.netcdf_file import read_netcdf
 
 SAME, ROUNDED, DIFFERENT, LEFT_OUT = "same", "rounding", "different", "left out"
 REDRAWN = "drawn otherwise"
@@ -241,9 +241,9 @@ def _cell(text: str) -> Leaf:
 
 
 def _netcdf(content: bytes) -> Content:
-    with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as data:
-        arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
-        numbers = {f"attribute {name}": value for name, value in data.attrs.items() if isinstance(value, str | float)}
+    data = read_netcdf(content)
+    arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
+    numbers = {f"attribute {name}": value for name, value in data.attrs.items() if isinstance(value, str | float)}
     numbers.pop("attribute fingerprint", None)
     return Content(numbers, arrays, {})
 
