@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
 from scenes.yaml.errors import InputError
+from scenes.yaml.input_file import why_unreadable
+from twin.run.netcdf_file import read_netcdf
 from twin.run.provenance import Provenance
 from twin.run.run_folder import read_manifest
 from twin.run.versions import ROOT, source_digest, versions
@@ -204,11 +205,12 @@ def _data_difference(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[F
     """study.nc and study.json against what the chunks hold."""
     name = "study.nc"
     try:
-        with xr.open_dataset(folder / name, engine="h5netcdf") as data:
-            kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
+        data = read_netcdf((folder / name).read_bytes())
+        kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
         told = json.loads((folder / "study.json").read_bytes())
-    except (OSError, ValueError) as error:
-        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {error}"),)
+    # readers of spoilt files fail in ways that cannot be foreseen
+    except Exception as error:
+        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {why_unreadable(error)}"),)
     made = make_dataset(plan, whole)
     found = [
         array_difference(str(key), kept.get(str(key), np.array([])), np.asarray(made[key].values))
