@@ -60,6 +60,12 @@ RUNS = {
 }
 """What computes where no procedure is made of it, and writes what was computed."""
 COMMANDS = {"analysis.mtf.__main__"}
+LIBRARY = re.compile(r"twin|twin\.scripting\..*|twin\.study\.scripted")
+"""What other people's programs import."""
+TERMINALS = {"typer", "rich"}
+"""What options, exit codes and progress are made of: the layer of the commands, ``twin.run.cli`` and
+``twin.run.command``, begins there.
+"""
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
@@ -232,6 +238,14 @@ def test_what_computes_neither_draws_nor_fills_templates() -> None:
     assert set(computing()) >= {*RUNS, *procedures(), "twin.design.design_run"}
     ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
     assert [" imports ".join(way) for way in ways.values() if way] == []
+
+
+def test_the_library_knows_no_commands() -> None:
+    """Nor does anything that it imports: a test's type, its run and its report lie below what a terminal shows."""
+    library = [name for name in modules() if LIBRARY.fullmatch(name)]
+    assert set(library) >= {"twin", "twin.scripting.procedures", "twin.scripting.results", "twin.study.scripted"}
+    assert [" imports ".join(way) for name in library if (way := way_to(TERMINALS, name, every_import()))] == []
+    assert way_to(TERMINALS, "twin.run.command", every_import())
 
 
 def test_the_way_to_what_draws_is_found() -> None:

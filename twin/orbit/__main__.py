@@ -15,7 +15,8 @@ import typer
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, Seed
-from twin.run.command import Result, Session, add_tests, print_report, run_command
+from twin.run.command import Result, add_tests, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 if TYPE_CHECKING:

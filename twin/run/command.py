@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
@@ -40,40 +40,13 @@ from twin.run.cli import (
     result_table,
 )
 from twin.run.ending_signals import exit_on_terminate
-from twin.run.procedure import Advance, performed
+from twin.run.procedure import Advance, Session, performed
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 from twin.run.versions import program_digest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
-
-WRITE = "write the run folder"
-"""Name of the work in the progress display."""
-
-
-@dataclass(frozen=True)
-class Session:
-    """A command at work.
-
-    Attributes:
-        folder: its run folder, open.
-        backend: where to trace.
-        advance: shows the user how far it is.
-        started: seconds since the epoch.
-        clock: reading of the monotonic clock then.
-    """
-
-    folder: RunFolder
-    backend: Backend
-    advance: Advance
-    started: float
-    clock: float
-
-    @property
-    def seconds(self) -> float:
-        """Since the start."""
-        return time.monotonic() - self.clock
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
@@ -11,8 +13,15 @@ from scenes.specs.procedures import Procedure
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
+if TYPE_CHECKING:
+    from twin.run.run_folder import RunFolder
+
 Advance = Callable[[str, int, int], None]
 """Told what is being done, and how many of how many parts of it are."""
+
+
+WRITE = "write the run folder"
+"""Name of the last part of a command's work."""
 
 
 def silent(part: str, done: int, total: int) -> None:
@@ -65,3 +74,27 @@ def performed(
         raise InputError(*told.issues, *(Issue(text) for text in given)) from error
     except InputError as error:
         raise InputError(*error.issues, *(Issue(text) for text in given)) from error
+
+
+@dataclass(frozen=True)
+class Session:
+    """A command at work.
+
+    Attributes:
+        folder: its run folder, open.
+        backend: where to trace.
+        advance: shows the user how far it is.
+        started: seconds since the epoch.
+        clock: reading of the monotonic clock then.
+    """
+
+    folder: RunFolder
+    backend: Backend
+    advance: Advance
+    started: float
+    clock: float
+
+    @property
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.monotonic() - self.clock
