@@ -48,10 +48,14 @@ def read_netcdf(content: bytes) -> xr.Dataset:
     Raises:
         Exception: the file is damaged, in whatever way the libraries stumble over it; also where they would only warn.
     """
+    import h5py
     import xarray as xr
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # where HDF5 cannot open it, h5netcdf would leave half an object that prints an error of its own later
+        with h5py.File(io.BytesIO(content)):
+            pass
         # read from memory, since of a damaged file the library leaves the file open
         with xr.open_dataset(io.BytesIO(content), engine="h5netcdf", decode_timedelta=False) as data:
             return data.load()
