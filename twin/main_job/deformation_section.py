@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from analysis.units import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
-from twin.main_job.deformation_results import faces_of
+from twin.main_job.job_tables import faces_of
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import Cell, SvgFigure, Table, plain
 from twin.run.report import Section
