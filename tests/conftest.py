@@ -2,6 +2,7 @@
 
 import os
 import signal
+from collections.abc import Iterator
 from functools import cache
 
 import pytest
@@ -51,6 +52,16 @@ def pytest_configure(config: pytest.Config) -> None:
     if getattr(config.option, "numprocesses", None):
         for library in ("OPENBLAS", "OMP", "MKL"):
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_heartbeat() -> Iterator[None]:
+    """Commands inside this process tell no progress: whether a line comes before what a test reads is a matter of how
+    loaded the machine is. What is told of it has tests of its own.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("twin.run.cli.TICK_SECONDS", 3600.0)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from scenes.specs.procedures import PROCEDURES
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("optics", "scenes", "twin", "analysis")
 MAY_IMPORT = {
@@ -47,7 +49,7 @@ COMPUTE = (
     "twin/orbit/ground",
     "twin/study/runs",
 )
-"""Folders in which nothing draws, with all below them; beside them every module that makes a `Procedure`, and RUNS."""
+"""Folders in which nothing draws, with all below them; beside them the modules of tests that compute, and RUNS."""
 RUNS = {
     "twin.main_job.render_job",
     "twin.main_job.render_files",
@@ -65,6 +67,12 @@ INSIDE = re.compile(
     r"|twin\.orbit\.calibration\.(field_images|observations|flown_campaign|influences|screening)"
 )
 """What the validation does not import: commands, what shows and writes results, and the steps of `source_of`."""
+LIBRARY = re.compile(r"twin|twin\.scripting\..*|twin\.study\.scripted")
+"""What other people's programs import."""
+TERMINALS = {"typer", "rich"}
+"""What options, exit codes and progress are made of: the layer of the commands, ``twin.run.cli`` and
+``twin.run.command``, begins there.
+"""
 ROOMS = [
     *re.findall(
         r"^\| `((?:optics|scenes|analysis|twin)[a-z_/]*)` \|", (ROOT / "docs/architecture.md").read_text("utf-8"), re.M
@@ -126,8 +134,13 @@ def _finest(names: set[str]) -> Iterator[str]:
             yield name
 
 
+def procedures() -> set[str]:
+    """Modules that run a test or make its numbers, as the list of tests names them."""
+    return {function.path.partition(":")[0] for one in PROCEDURES.values() for function in (one.run, one.numbers)}
+
+
 def computing() -> list[str]:
-    """Modules that compute: those in `COMPUTE` and `RUNS`, and every one that makes a procedure of a test."""
+    """Modules that compute: those in `COMPUTE` and `RUNS`, and every one that runs a test or makes its numbers."""
     return [
         module
         for module, path in modules().items()
@@ -135,7 +148,7 @@ def computing() -> list[str]:
         and (
             module in RUNS
             or any(folder in COMPUTE for folder in map(Path.as_posix, path.parents))
-            or re.search(r"^[A-Z]+ = Procedure(\[.*\])?\(", (ROOT / path).read_text("utf-8"), re.M)
+            or module in procedures()
         )
     ]
 
@@ -228,11 +241,18 @@ def test_a_right_arrow_is_not_complained_about(tmp_path: Path, monkeypatch: pyte
 
 def test_what_computes_neither_draws_nor_fills_templates() -> None:
     """Nor does anything that it imports: a study needs no figures, and a run can be shown in any way."""
-    # those of the laboratory and of the orbit, by the modules that make their procedures
-    assert len([name for name in computing() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)]) == 9
-    assert set(computing()) >= {*RUNS, "twin.design.design_run"}
+    assert len({name for name in procedures() if re.match(r"twin\.(laboratory|orbit)\..*_numbers$", name)}) == 9
+    assert set(computing()) >= {*RUNS, *procedures(), "twin.design.design_run"}
     ways = {module: way_to(SHOWS, module, every_import()) for module in computing()}
     assert [" imports ".join(way) for way in ways.values() if way] == []
+
+
+def test_the_library_knows_no_commands() -> None:
+    """Nor does anything that it imports: a test's type, its run and its report lie below what a terminal shows."""
+    library = [name for name in modules() if LIBRARY.fullmatch(name)]
+    assert set(library) >= {"twin", "twin.scripting.procedures", "twin.scripting.results", "twin.study.scripted"}
+    assert [" imports ".join(way) for name in library if (way := way_to(TERMINALS, name, every_import()))] == []
+    assert way_to(TERMINALS, "twin.run.command", every_import())
 
 
 def test_the_way_to_what_draws_is_found() -> None:

@@ -22,6 +22,7 @@ import pytest
 from _pytest.mark.expression import Expression
 from typer._click.exceptions import MissingParameter
 
+import twin
 from docs.site.command_pages import parser, programs
 from docs.site.spec_examples import accepted, examples
 from scenes.models.disturbances import motions_of_spec
@@ -43,9 +44,13 @@ from scenes.yaml.yaml_file import parse_yaml
 from twin.laboratory.measured_focus import IMAGE_COLUMNS, MTF_COLUMNS
 from twin.laboratory.measured_readings import COMPARISON_COLUMNS, SPOT_COLUMNS
 from twin.orbit.measured.measurement_tables import COLUMNS
+from twin.run.console import PROGRAMS
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    *(ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "CHANGELOG")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
 _FENCE = re.compile(r"^```(\S*)[^\n]*\n(.*?)^```", re.M | re.S)
 
 
@@ -382,6 +387,8 @@ NOT_RUN = {
     "python -m tests.golden": "a test of its own runs it (tests/golden/test_golden.py)",
     "python -m tests.benchmarks": "a test of its own runs it (tests/benchmarks/test_limits.py)",
     "python -m pytest": "this is it",
+    "python -m docs.figures": "overwrites figures and pages; tests/test_figures.py holds them together",
+    "python -m twin.validate --fast": ".ci/run has it",
     "python -m docs.site": "a test of its own runs it (tests/test_site.py)",
     "python docs/draw_conventions.py": "overwrites a picture of the docs; a test of its own looks at what it imports",
     "python -m twin.validate --out": "the full run makes docs/validation; .ci/run has the fast one",
@@ -460,3 +467,11 @@ def test_a_script_runs(block: Piece, tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr[-2000:]
+
+
+def test_the_page_on_stability_names_what_there_is() -> None:
+    page = (ROOT / "docs/stability.md").read_text("utf-8")
+    commands, python = (re.findall(rf"\*\*{head}\*\*.*?(?=\n- )", page, re.S)[0] for head in ("Commands", "Python"))
+    named_there = re.findall(r"`(?:camtwin )?(\w+)`", commands)
+    assert sorted(named_there) == sorted(PROGRAMS)
+    assert set(twin.__all__) <= set(re.findall(r"`(\w+)`", python))

@@ -21,7 +21,11 @@ import xarray as xr
 import yaml
 from scipy import stats
 
+import scenes.kinds.file_kinds
+import scenes.schema
+import twin
 import twin.export.__main__
+import twin.lab
 import twin.render
 import twin.validate
 from analysis.monitor import recovery
@@ -57,10 +61,11 @@ from scenes.specs.instrument import PRISMS
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
-from scenes.specs.resolved import resolve
+from scenes.specs.procedures import FileKind, Procedure
+from scenes.specs.resolved import ExperimentSetup, resolve
 from scenes.specs.study import DesignSpec, Sampler
 from scenes.yaml.errors import InputError
-from scenes.yaml.spec import validate
+from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure
@@ -84,6 +89,7 @@ from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
 from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
+from twin.study.runs.base_job import Run
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
@@ -927,6 +933,86 @@ def test_an_output_format_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyP
     page = page_text(folder)
     assert '<a href="study.columns">' in page
     assert "study.missing" not in page
+
+
+# --- a whole test -----------------------------------------------------------------------------------------------------
+
+PROCEDURES = "scenes.specs.procedures.PROCEDURES"
+TOY_TEST = "tests.twin.test_procedure"
+"""The toy's own modules, which the entry names and which are imported when they are used."""
+LEVEL_STUDY = """name: levels
+base: {command: lab level, file: level.yaml}
+factors:
+  noise: {key: [test, sigma_arcsec], values: [0.5, 2.0]}
+design: {kind: grid}
+responses:
+  mean: {key: [level, mean_arcsec], sigma: [level, mean_arcsec_sigma]}
+"""
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
+    """Makes anew what reads the list of tests once, when a program starts; and again when the test ends."""
+
+    def start() -> None:
+        for module in (scenes.kinds.file_kinds, scenes.schema, twin.lab):
+            importlib.reload(module)
+
+    yield start
+    monkeypatch.undo()
+    start()
+
+
+@extends(PROCEDURES)
+def test_a_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callable[[], None]) -> None:
+    """One entry: command with its help, schema, messages about files, study and script know the toy."""
+    toy = Procedure(
+        "level",
+        setup=f"{TOY_TEST}:LevelSetup",
+        resolve=f"{TOY_TEST}:resolve",
+        run=f"{TOY_TEST}:measure",
+        numbers=f"{TOY_TEST}:numbers",
+        report=f"{TOY_TEST}:report",
+        files=(FileKind("level_test", f"{TOY_TEST}:LevelSpec", "a test of a level"),),
+        varied=True,
+        about="Read a level.",
+        frames={"readings_arcsec": "about the level's own axis"},
+    )
+    add(monkeypatch, PROCEDURES, "lab level", toy)
+    started()
+    file, out = tmp_path / "level.yaml", tmp_path / "run"
+    file.write_text("name: levels\nreadings: 5\nsigma_arcsec: 0.5\nseed: 3\n", "utf-8")
+    assert re.search(r"level +Read a level\.", invoke(twin.lab.app, "--help").stdout)
+    assert "Read a level." in invoke(twin.lab.app, "level", "--help").stdout
+    done = invoke(twin.lab.app, "level", file, "--out", out)
+    assert done.exit_code == 0, done.output
+    found = read(out, "level")
+    assert found["reference_frames"] == dict(toy.frames)
+    assert json_schema("level_test")["properties"].keys() == {"name", "readings", "sigma_arcsec", "seed"}
+    assert "lab level" in json_schema("study")["$defs"]["BaseSpec"]["properties"]["command"]["enum"]
+    refused = invoke(twin.lab.app, "focus", file, "--out", tmp_path / "none")
+    said = " ".join(refused.stderr.split())
+    assert f"this is a test of a level, which twin.lab focus does not read; python -m twin.lab level {file}" in said
+    result = twin.perform("lab level", file, seed=4)
+    assert result.numbers["readings_arcsec"] == np.random.default_rng(4).normal(0.0, 0.5, 5).tolist()
+    assert twin.perform("lab level", file).numbers["mean_arcsec"] == found["mean_arcsec"]
+    (tmp_path / "study.yaml").write_text(LEVEL_STUDY, "utf-8")
+    setup = resolve_study(tmp_path / "study.yaml")
+    key = ("test", "sigma_arcsec")
+    runs = [Run(0, ((key, 0.5),), None), Run(1, ((key, 2.0),), None)]
+    quiet, loud = setup.job.evaluate(setup.tree, runs, load_backend())
+    assert quiet["level"]["mean_arcsec"] == found["mean_arcsec"]
+    assert loud["level"]["mean_arcsec"] == pytest.approx(4.0 * found["mean_arcsec"])
+
+
+def test_everything_that_the_list_of_tests_names_is_there() -> None:
+    for name, procedure in registered(PROCEDURES)[2].items():
+        assert re.fullmatch("(lab|orbit|design) [a-z]+", name)
+        assert issubclass(procedure.model, ExperimentSetup)
+        for function in (procedure.resolve, procedure.run, procedure.numbers, procedure.report):
+            assert callable(function.get()), name
+        assert procedure.export is None or callable(procedure.export.get())
+        assert all(issubclass(kind.model, Spec) for kind in procedure.files)
 
 
 # --- orbits -----------------------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -11,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from docs.site.command_pages import programs
+from docs.site.command_pages import commands, programs
 from tests.twin.live_page import running
-from twin.run.console import PROGRAMS
+from twin.run.console import COMPLETE, PROGRAMS
 
 ROOT = Path(__file__).resolve().parents[1]
-CONSOLE = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]["twin"]
+CONSOLE = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]["camtwin"]
 OURS = ("optics", "scenes", "twin", "analysis")
 
 
@@ -39,7 +40,7 @@ def started(place: Path, *words: str, here: str = "") -> subprocess.CompletedPro
 def console(place: Path) -> str:
     """The script that pip makes of the entry point, in a folder of its own."""
     module, _, name = CONSOLE.partition(":")
-    script = place / "bin" / "twin"
+    script = place / "bin" / "camtwin"
     script.parent.mkdir(exist_ok=True)
     script.write_text(f"import sys\nfrom {module} import {name}\nsys.exit({name}())\n", "utf-8")
     return str(script)
@@ -92,14 +93,37 @@ def test_programs_of_others_keep_their_folder(tmp_path):
 
 
 def test_the_console_command_knows_every_program(tmp_path):
-    assert sorted(PROGRAMS.values()) == sorted(programs())
+    modules = [module for module, _ in PROGRAMS.values()]
+    assert sorted(modules) == sorted(programs())
+    for module, line in PROGRAMS.values():
+        assert [name for name in commands(module) if len(commands(module)) > 2 and name.split()[-1] not in line] == []
     script = console(tmp_path)
     listed = started(tmp_path, script, "--help")
-    assert all(module in listed.stdout for module in programs())
+    assert all(f"\n  {name:11}  {line}\n" in listed.stdout for name, (_, line) in PROGRAMS.items())
     assert started(tmp_path, script).returncode == 2
     wrong = started(tmp_path, script, "rendre")
     assert wrong.returncode == 2
-    assert "choose render" in wrong.stderr
+    assert "Did you mean 'render'" in wrong.stderr
+    assert started(tmp_path, script, "--version").stdout.endswith(f" from {ROOT}\n")
+
+
+def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
+    done = started(tmp_path, "-X", "importtime", console(tmp_path), "--help")
+    found = set(re.findall(r"\| +([\w.]+)$", done.stderr, re.M))
+    assert "typer" in found
+    assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"), [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pixel", {"--pixel-size"})]
+)
+def test_shells_are_offered_programs_subcommands_and_options(tmp_path, monkeypatch, typed, offered):
+    words = ["camtwin", *typed.split(" ")]
+    for name, value in ((COMPLETE, "complete_bash"), ("COMP_WORDS", " ".join(words)), ("COMP_CWORD", len(words) - 1)):
+        monkeypatch.setenv(name, str(value))
+    assert set(started(tmp_path, console(tmp_path)).stdout.split()) == offered
+    monkeypatch.delenv(COMPLETE)
+    assert COMPLETE in started(tmp_path, console(tmp_path), "--show-completion", "bash").stdout
 
 
 @pytest.mark.slow

@@ -54,10 +54,10 @@ _PLACES = {
 def __getattr__(name: str) -> Any:
     if name == "study":
         # a package that can be called, see there
-        return importlib.import_module("twin.study")
+        return importlib.import_module(f"{__name__}.study")
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_PLACES[name]), name)
+    return getattr(importlib.import_module(__name__.removesuffix("twin") + _PLACES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -106,7 +106,7 @@ def examine(quick: bool = False) -> list[Check]:
         )
     if not quick:
         checks.append(_gpu())
-    return [*checks, *_pins(), *_lock()]
+    return [*checks, *_versions(), *_lock()]
 
 
 def _python() -> Check:
@@ -147,14 +147,14 @@ def _llvm() -> Check:
 
 def _probe(name: str, arguments: list[str], describe: Any) -> Check:
     try:
-        return Check(name, "ok", describe(run_probe(["-m", "twin.run.probe", *arguments])))
+        return Check(name, "ok", describe(run_probe(["-m", f"{__package__}.run.probe", *arguments])))
     except RuntimeError as error:
         return Check(name, "failed", str(error))
 
 
 def _gpu() -> Check:
     try:
-        result = run_probe(["-m", "twin.run.probe", "gpu"])
+        result = run_probe(["-m", f"{__package__}.run.probe", "gpu"])
     except RuntimeError as error:
         return Check("GPU", "note", f"--backend cuda does not work: {error}")
     if not result["available"]:
@@ -173,8 +173,8 @@ def _gpu_name() -> str:
     return ", ".join(answer.stdout.split("\n")).strip(", ") or "NVIDIA GPU"
 
 
-def pinned() -> dict[str, str]:
-    """Name -> version of every dependency that pyproject.toml pins and that this Python and platform use.
+def requirements() -> list[Requirement]:
+    """Dependencies with the versions that pyproject.toml allows, those that this Python and platform use.
 
     Read from the installed distribution, or from pyproject.toml when the twin runs from a folder without being
     installed.
@@ -184,27 +184,20 @@ def pinned() -> dict[str, str]:
     except importlib.metadata.PackageNotFoundError:
         project = Path(__file__).resolve().parent.parent / "pyproject.toml"
         lines = tomllib.loads(project.read_text("utf-8"))["project"]["dependencies"] if project.exists() else []
-    pins = {}
-    for requirement in map(Requirement, lines):
-        pin = next(iter(requirement.specifier), None)
-        here = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
-        if here and pin is not None and pin.operator == "==":
-            pins[requirement.name] = pin.version
-    return pins
+    every = map(Requirement, lines)
+    return [one for one in every if one.marker is None or one.marker.evaluate({"extra": ""})]
 
 
-def _pins() -> list[Check]:
+def _versions() -> list[Check]:
     checks = []
-    for name, version in pinned().items():
+    for one in requirements():
         try:
-            found = importlib.metadata.version(name)
+            found = importlib.metadata.version(one.name)
         except importlib.metadata.PackageNotFoundError:
-            checks.append(Check(name, "failed", f"not installed; pip install {name}=={version}"))
+            checks.append(Check(one.name, "failed", f"not installed; pip install '{one.name}{one.specifier}'"))
             continue
-        if found != version:
-            checks.append(Check(name, "note", f"{found}, tested with {version}"))
-        else:
-            checks.append(Check(name, "ok", found))
+        good = one.specifier.contains(found, prereleases=True)
+        checks.append(Check(one.name, *(("ok", found) if good else ("note", f"{found}, asked for {one.specifier}"))))
     return checks
 
 

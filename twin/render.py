@@ -31,7 +31,8 @@ from twin.run.cli import (
     print_whole,
     result_table,
 )
-from twin.run.command import Result, Session, run_command
+from twin.run.command import Result, run_command
+from twin.run.procedure import Session
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 

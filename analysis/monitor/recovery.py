@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_
 __all__ = [
     "CENTROIDS",
     "Estimates",
+    "MeasuredSpots",
     "Recovery",
     "estimates",
     "estimates_of",
@@ -38,6 +40,8 @@ __all__ = [
 
 Array = NDArray[np.float64]
 CENTROIDS = ("ml", "gaussian", "energy")
+MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
+"""Spots with how good their fits are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,19 +165,21 @@ def judged_spots(
 
 
 def recover(
-    before: NDArray[np.uint16],
-    after: NDArray[np.uint16],
+    before: NDArray[Any] | MeasuredSpots,
+    after: NDArray[Any],
     calibration: MonitorCalibration,
     centroid: str = "ml",
     threads: int = 1,
     disturbances: Disturbances | None = None,
     keep_parts: bool = False,
     motions: Mapping[str, MotionModel] | None = None,
+    frames: int | None = None,
 ) -> Recovery:
     """Recover all parameters.
 
     Args:
-        before: (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state.
+        before: (C, frames, H, W) or (S, C, frames, H, W) grey values of the nominal state, or what `judged_spots` gave
+            of them.
         after: (S, C, frames, H, W) grey values of the states to be measured.
         calibration: of the nominal instrument; C must be its number of spots.
         centroid: `ml`, `gaussian` or `energy`.
@@ -183,12 +189,19 @@ def recover(
         keep_parts: of the noise, which are large.
         motions: estimator -> the motions by which it reads, traced again to see whether they are linear; None to take
             them so.
+        frames: of which each image is the mean, (C, H, W) and (S, C, H, W); None where these are frames.
     """
-    spots, frames = after.shape[1], after.shape[2]
-    if spots != calibration.spots or before.shape[-4] != spots:
+    spots = after.shape[1]
+    axis = -4 if frames is None else -3
+    if spots != calibration.spots or (isinstance(before, np.ndarray) and before.shape[axis] != spots):
         raise ValueError(f"recovery: the calibration has {calibration.spots} spots, the images {spots}")
-    first, fits = judged_spots(_flat(mean_frames(before)), before.shape[-3], calibration, centroid, threads)
-    second, more = judged_spots(_flat(mean_frames(after)), frames, calibration, centroid, threads)
+
+    def judged(images: NDArray[Any]) -> MeasuredSpots:
+        mean, count = (mean_frames(images), images.shape[-3]) if frames is None else (np.asarray(images, float), frames)
+        return judged_spots(_flat(mean), count, calibration, centroid, threads)
+
+    first, fits = judged(before) if isinstance(before, np.ndarray) else before
+    second, more = judged(after)
     spread = difference_covariance(first, second, calibration.noise)
     evidence = SpotEvidence(fits, more)
     return recovery_of(first, second, spread, calibration, disturbances, keep_parts, evidence, motions)

@@ -88,6 +88,16 @@ class SpotEvidence:
         """Number of the state whose spots fit least."""
         return int(np.argmax(np.max(self.widening, axis=1)))
 
+    def course_doubt(self, moments: Sequence[str], names: Sequence[str]) -> str | None:
+        """Why sigma does not hold at the worst of the states; None where it holds at all.
+
+        Args:
+            moments: of the states, in words.
+            names: of the spots.
+        """
+        told, bad = self.doubt(self.worst, names), int(np.count_nonzero(~self.holds))
+        return None if told is None else f"at {moments[self.worst]}, the worst of {bad} times: {told.text}"
+
     def doubt(self, state: int = 0, names: Sequence[str] = ()) -> SpotDoubt | None:
         """Why sigma does not hold for a state; None where it does.
 

@@ -127,7 +127,7 @@ def screen_frames(frames: NDArray[Any], noise: NoiseModel, bad: Mask | None = No
         bad: (H, W) pixels that are known to be bad; None for none.
 
     Raises:
-        FramesError: too few of the frames hold the light.
+        FramesError: too few of the frames hold the light, or none of their pixels can be used.
     """
     values = np.asarray(frames, dtype=np.float64)
     finite = np.isfinite(values)
@@ -252,6 +252,12 @@ def _compared(values: Array, finite: Mask, bad: Mask, noise: NoiseModel) -> _Com
     count = len(values)
     # what is saturated does not follow the light
     usable = finite & ~bad & ~_saturated(values, noise)
+    blind = np.flatnonzero(~usable.any(axis=(1, 2)))
+    if blind.size:
+        raise FramesError(
+            f"every pixel of {_numbers(blind)} is saturated or known to be bad",
+            "frames below saturation, and a map of bad pixels that leaves some",
+        )
     threshold = float(norm.isf(FALSE_ALARM / (2.0 * values.size)))
     if count > 2:
         reference = np.broadcast_to(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import importlib
 import inspect
 from functools import cache
 from itertools import groupby
@@ -11,9 +10,8 @@ from pathlib import Path
 from textwrap import dedent
 from typing import Any
 
-import typer
-
 from docs.site.markdown import anchor, code, prose, sentence, table
+from twin.run.console import parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("twin", "analysis", "scenes", "optics")
@@ -43,25 +41,6 @@ def _runs(path: Path) -> bool:
     return any(isinstance(node, ast.If) and ast.unparse(node.test) == "__name__ == '__main__'" for node in last)
 
 
-@cache
-def parser(program: str) -> Any:
-    """The command of a program, with its parser; of a program with subcommands the group.
-
-    Raises:
-        LookupError: neither a Typer application ``app`` nor a function ``main``.
-    """
-    module = importlib.import_module(program)
-    if hasattr(module, "__path__"):
-        module = importlib.import_module(f"{program}.__main__")
-    app = getattr(module, "app", None)
-    if app is None:
-        if not hasattr(module, "main"):
-            raise LookupError(f"{program}: neither app nor main")
-        app = typer.Typer(add_completion=False)
-        app.command()(module.main)
-    return typer.main.get_command(app)
-
-
 def commands(program: str) -> dict[str, Any]:
     """Words that call a command -> the command, of all subcommands of a program."""
     command = parser(program)
@@ -74,8 +53,9 @@ def command_page() -> str:
     parts = [
         """# Commands
 
-Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), and has a `--help` that says the
-same as this page. All that make a run folder share `--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
+Each is `.venv/bin/python -m NAME` (an environment of your own: `python -m NAME`), or `camtwin` with the last part of
+the name, `camtwin render`, and has a `--help` that says the same as this page. All that make a run folder share
+`--out`, `--seed`, `--backend`, `--force`, `--json` and `--quiet`;
 what is in the folders says [the next page](run_folders/index.md). Exit codes: 0 success, 2 bad input (one line for
 each fault with file, line and key; nothing is written), 1 anything else, 130 interrupted.
 """

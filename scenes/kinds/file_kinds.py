@@ -1,65 +1,28 @@
 """All kinds of YAML files, how one is told from its keys, and which command reads it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 from scenes.specs.autocollimators import AutocollimatorTestSpec
-from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
+from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
-from scenes.specs.measured.orbit_data import (
-    MeasuredAngleSpec,
-    MeasuredCalibrationSpec,
-    OrbitCheckSpec,
-    OrbitDataSpec,
-    OrbitMatchSpec,
-)
-from scenes.specs.orbit.angle import OrbitAngleSpec
-from scenes.specs.orbit.calibration import OrbitCalibrationSpec
-from scenes.specs.orbit.monitor import OrbitMonitorSpec
-from scenes.specs.orbit.simulate import OrbitSimulateSpec
+from scenes.specs.measured.orbit_data import OrbitDataSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.procedures import PROCEDURES, FileKind
 from scenes.specs.study import StudySpec
-from scenes.specs.turntable import MeasuredTurntableSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import read_yaml
 
 Given = TypeVar("Given")
 
 SLIPS = 1
 """Keys that a file of a kind may have and the kind does not know: a typing error does not make it another kind."""
-
-
-@dataclass(frozen=True)
-class FileKind:
-    """A kind of file.
-
-    Attributes:
-        name: of its JSON Schema.
-        model: what it may say.
-        what: it is, with article, for messages.
-        command: that reads it, as the user calls it; empty for what only other files name.
-        place: where other files name it; empty for what only a command reads.
-    """
-
-    name: str
-    model: type[Spec]
-    what: str
-    command: str = ""
-    place: str = ""
-
-    def strangers(self, keys: set[str]) -> int | None:
-        """How many of the keys are none of this kind's; None if one that it needs is missing."""
-        fields = self.model.model_fields
-        needed = {name for name, item in fields.items() if item.is_required()}
-        return len(keys - set(fields)) if needed <= keys else None
 
 
 _VALIDATED = "the checks of `python -m twin.validate`"
@@ -75,8 +38,6 @@ FILE_KINDS = (
         "twin.camera",
         "an instrument's `cameras: {NAME: {camera: FILE}}`",
     ),
-    FileKind("camera_design", CameraDesignSpec, "an optimisation of a camera", "twin.design camera"),
-    FileKind("monitor_design", MonitorDesignSpec, "a search for a monitor's layout", "twin.design monitor"),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
     FileKind(
         "disturbances",
@@ -86,27 +47,18 @@ FILE_KINDS = (
     ),
     FileKind("error_budget", ErrorBudgetSpec, "an error budget", place=_VALIDATED),
     FileKind("principle_experiment", AutocollimatorTestSpec, "a test of two autocollimators", place=_VALIDATED),
-    FileKind("focus_test", FocusTestSpec, "a focus test", "twin.lab focus"),
-    FileKind("distortion_test", DistortionTestSpec, "a distortion test", "twin.lab distortion"),
-    FileKind("turntable_test", TurntableTestSpec, "a turntable test", "twin.lab turntable"),
-    FileKind("measured_focus", MeasuredFocusSpec, "a focus test on measurements", "twin.lab focus"),
-    FileKind("measured_distortion", MeasuredDistortionSpec, "a distortion test on measurements", "twin.lab distortion"),
-    FileKind("measured_turntable", MeasuredTurntableSpec, "a turntable test on measurements", "twin.lab turntable"),
-    FileKind("orbit_angle", OrbitAngleSpec, "a test of intersection angles", "twin.orbit angle"),
-    FileKind("orbit_calibration", OrbitCalibrationSpec, "an in-orbit calibration", "twin.orbit calibrate"),
-    FileKind("orbit_simulate", OrbitSimulateSpec, "a simulation of images of the ground", "twin.orbit simulate"),
-    FileKind("orbit_check", OrbitCheckSpec, "a check of the conventions of a pass", "twin.orbit check"),
-    FileKind("orbit_match", OrbitMatchSpec, "points to be measured in line images", "twin.orbit match"),
-    FileKind("orbit_monitor", OrbitMonitorSpec, "a test of monitoring in orbit", "twin.orbit monitor"),
-    FileKind("measured_calibration", MeasuredCalibrationSpec, "a calibration on measurements", "twin.orbit calibrate"),
-    FileKind("measured_angle", MeasuredAngleSpec, "intersection angles on measurements", "twin.orbit angle"),
+    *(
+        replace(kind, command=f"twin.{command}")
+        for command, procedure in PROCEDURES.items()
+        for kind in procedure.files
+    ),
     FileKind("orbit_data", OrbitDataSpec, "measurements of passes", place="`data: DIR` of a test on measurements"),
     FileKind(
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
     ),
     FileKind("study", StudySpec, "a study", "twin.study"),
 )
-"""Every kind, in the order in which their schemas are listed."""
+"""Every kind, in the order in which their schemas are listed; those of tests are in the list of these."""
 
 _RESOLVED = {"job": "job", "study": "study"}
 """Key of a config.yaml that names its kind; those of tests have ``test``, which is told as its own file would be."""

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from scenes.specs.procedures import studied
 from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
 from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Seed, Spec, Text, Whole
 from scenes.yaml.units import split_quantity, unit_ratio
@@ -381,16 +382,6 @@ UNITS = {
 }
 """Ending of a result's key -> unit."""
 
-BaseCommand = Literal[
-    "render",
-    "lab focus",
-    "lab distortion",
-    "lab turntable",
-    "orbit angle",
-    "orbit calibrate",
-    "orbit monitor",
-]
-
 
 class BaseSpec(Spec):
     """The job that every run of the study changes.
@@ -401,7 +392,7 @@ class BaseSpec(Spec):
             name in the library.
     """
 
-    command: BaseCommand
+    command: Annotated[str, OneOf(lambda: ("render", *studied()))]
     file: Reference
 
 

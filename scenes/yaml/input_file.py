@@ -1,6 +1,7 @@
 """Bytes and text of files that nobody has vetted: every file that a user names is read by one of these."""
 
 import hashlib
+import re
 import stat
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,6 +55,17 @@ def read_text(path: str | Path, what: str, most: int, ends: Sequence[str]) -> st
         line = content[: error.start].count(b"\n") + 1
         problem = f"not UTF-8 text: byte 0x{content[error.start]:02x}"
         raise InputError(Issue(problem, str(path), line)) from None
+
+
+def why_unreadable(error: BaseException) -> str:
+    """What a library's error tells a user about a damaged file, in at most 200 characters of one line.
+
+    Libraries stumble over damaged files in ways that they do not foresee. A text that speaks of the inside of the
+    program, such as the shapes of its arrays, helps nobody and is left out.
+    """
+    inside = isinstance(error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning)
+    text = re.sub(r"\s+", " ", str(error)).strip()[:200]
+    return "it is damaged" if inside or not text or "broadcast" in text or "unpack" in text else text
 
 
 MISSING = "no such file"

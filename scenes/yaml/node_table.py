@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import re
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import LEAST_NODES
 from scenes.yaml.csv_table import LARGEST_TABLE, Column, Table, read_table
 from scenes.yaml.errors import InputError, Issue, names_text, nearest, shown
-from scenes.yaml.input_file import digest_of, is_file, no_file
+from scenes.yaml.input_file import digest_of, is_file, no_file, why_unreadable
 from scenes.yaml.units import LENGTH, TEMPERATURE, TEMPERATURE_DIFFERENCE, unit_ratio
 
 PLACES, MOVES = ("x", "y", "z"), ("dx", "dy", "dz")
@@ -192,8 +191,7 @@ def _of_mesh(path: Path, unit: str, field: str | None, what: str, need: str) -> 
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        reason = re.sub(r"\s+", " ", str(error)).strip()[:200] or type(error).__name__
-        raise InputError(Issue(f"meshlane cannot read this mesh: {reason}", file)) from None
+        raise InputError(Issue(f"meshlane cannot read this mesh: {why_unreadable(error)}", file)) from None
     if field is None and len(fields) != 1:
         text = f"no {what} at its nodes" if not fields else f"several {what} at its nodes"
         remedy = need if not fields else "field: one of " + names_text(sorted(fields))

@@ -165,3 +165,9 @@ def test_coarse_frames_are_no_cosmic_rays_and_have_no_other_noise(shape):
     screened = screen_frames(frames, noise)
     assert screened.findings == ()
     assert noise_ratio(frames, noise) is None
+
+
+def test_frames_without_a_pixel_that_can_be_used_are_refused():
+    frames = np.full((4, 16, 16), 100.0)
+    with pytest.raises(FramesError, match="every pixel of frames 1, 2, 3, 4 is saturated or known to be bad"):
+        screen_frames(frames + np.arange(256.0).reshape(16, 16), coarse(), np.ones((16, 16), bool))

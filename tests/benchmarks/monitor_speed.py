@@ -13,6 +13,7 @@ from scenes.specs.instrument import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench
+from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.state_reading import StateReader
 from twin.sensors.poisson_numbers import poisson_numbers
 
@@ -40,19 +41,19 @@ def random_states(count: int, seed: int) -> list[State]:
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Milliseconds per state, amortised over a batch; calibration and kernels are not what is timed."""
     setup = bench.experiment("gf7_pair")
-    list(setup.measure(random_states(QUICK_STATES, 1), FRAMES, 1))
+    list(observe(setup, random_states(QUICK_STATES, 1), Observing(one_detector(setup, FRAMES, 1), stated=False)))
     count = QUICK_STATES if quick else STATES
     states = random_states(count, 2)
 
     def batch(_: Any) -> list[Any]:
-        return list(setup.measure(states, FRAMES, 1))
+        return list(observe(setup, states, Observing(one_detector(setup, FRAMES, 1), stated=False)))
 
     def quiet(best: Mapping[str, Spent]) -> bool:
         return 1e3 * best["batch"].wall_s / count <= LIMIT_MS
 
     rounds, most = (1, 1) if quick else (ROUNDS, MOST_ROUNDS)
     spent = in_turns({"batch": Work(batch)}, rounds, most, quiet)["batch"]
-    assert sum(len(recovery.after) for _, recovery in spent.result) == count
+    assert sum(len(found.numbers) for found in spent.result) == count
     wall, cpu = 1e3 * spent.wall_s / count, 1e3 * spent.cpu_s / count
     reader = StateReader(setup, FRAMES, 1)
 

@@ -22,23 +22,18 @@ from scenes.models.camera_sharpness import (
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.load import LIBRARY, library_names, load_camera
+from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
 from tests.oracles.test_reference_cameras import bundle, wavefront_error
 from tests.twin.commands import invoke
 from twin.camera.camera_optics import CameraOptics
-from twin.design.design_run import DESIGN
-from twin.laboratory.distortion_numbers import DISTORTION
-from twin.laboratory.focus_numbers import FOCUS
-from twin.orbit.angle.angle_numbers import ANGLE
-from twin.orbit.calibration.calibration_numbers import CALIBRATION
-from twin.orbit.monitoring.monitoring_numbers import MONITOR
 from twin.study.__main__ import app as study_app
 
 GF7 = (LIBRARY / "cameras" / "gf7.yaml").read_text("utf-8")
 M2 = "z: -2.01593047747168 m"
-EXAMPLES = {FOCUS: "focus", DISTORTION: "distortion", MONITOR: "monitor", ANGLE: "angle"}
+EXAMPLES = {"lab focus": "focus", "lab distortion": "distortion", "orbit monitor": "monitor"}
 
 
 def gf7_with(tmp_path: Path, z: str, name: str = "gf7_moved") -> Path:
@@ -148,17 +143,18 @@ def test_the_best_plane_is_best(backend, tmp_path) -> None:
 def test_every_test_that_has_a_camera_warns(backend, tmp_path) -> None:
     """All but the design, whose start is there to be improved, and tests without a camera's prescription."""
     blurred = load_camera(gf7_with(tmp_path, "-2.02 m"))
-    for procedure in (FOCUS, DISTORTION, MONITOR):
-        setup = procedure.resolve(EXAMPLES[procedure])
-        assert cameras_of(setup), procedure.kind
+    for name, file in EXAMPLES.items():
+        procedure = PROCEDURES[name]
+        setup = procedure.resolve(file)
+        assert cameras_of(setup), name
         assert procedure.judged
         assert blur_warnings(setup, backend) == ()
         update = {"camera": blurred} if hasattr(setup, "camera") else {"cameras": FrozenMap({"gf7": blurred})}
         (text,) = blur_warnings(setup.model_copy(update=update), backend)
         assert "is blurred as designed" in text
-    assert not cameras_of(CALIBRATION.resolve("calibrate"))
-    assert not cameras_of(ANGLE.resolve("angle"))  # a payload's lines have no mirrors
-    assert not DESIGN.judged
+    assert not cameras_of(PROCEDURES["orbit calibrate"].resolve("calibrate"))
+    assert not cameras_of(PROCEDURES["orbit angle"].resolve("angle"))  # a payload's lines have no mirrors
+    assert not PROCEDURES["design camera"].judged
 
 
 def test_a_camera_in_a_runs_config_is_named_there(backend, tmp_path) -> None:

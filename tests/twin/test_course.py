@@ -23,6 +23,7 @@ from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 
@@ -105,7 +106,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
     truth = trace_truth(experiment.instrument, experiment.backend, states)
     photons = experiment.path.expected_photons(states)
     after = experiment.frames_after(photons, 2, 7)
-    ((_, recovery),) = experiment.measure(states, 2, 7, disturbances=experiment.disturbances)
+    recovery = next(observe(experiment, states, Observing(one_detector(experiment, 2, 7)))).recovery
     with xr.open_dataset(folder / "course.nc", engine="h5netcdf", decode_timedelta=False) as data:
         assert data.photons.dims == ("time", "channel", "row", "column")
         assert list(data.time.values) == [0.0, 720.0, 1800.0]

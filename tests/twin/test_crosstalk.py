@@ -9,13 +9,13 @@ from analysis.units import ARCSEC
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.truth import trace_truth
 
-PIXEL_NOISE = (1e-3) ** 2 * np.eye(4)  # px^2, weighs the four coordinates alike
+PIXEL_NOISE = (1e-3) ** 2 * np.eye(8)  # px^2, weighs all coordinates alike
 
 
 @pytest.fixture(scope="module", params=["gf7_pair", "monitor_pair"])
 def table(request, experiment):
     setup = experiment(request.param)
-    return setup, crosstalk(setup, dict.fromkeys(setup.instrument.cameras, PIXEL_NOISE))
+    return setup, crosstalk(setup, PIXEL_NOISE)
 
 
 def row(cameras, camera, label):

@@ -22,7 +22,7 @@ from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from tests.twin.path_bench import scene_beam
-from twin.main_job.deformation_results import deformation_warnings
+from twin.main_job.job_tables import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.render import app
 from twin.study.runs.perturbed_job import JobMaker

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from optics.numerics.llvm import VARIABLE, LibraryMissing, ensure_llvm, find_llvm
 from twin import doctor
@@ -69,11 +70,20 @@ def test_the_variant_is_the_one_asked_for() -> None:
     assert doctor.run_probe(["-m", "twin.run.probe", "render", "llvm_ad_rgb"])["variant"] == "llvm_ad_rgb"
 
 
-def test_every_dependency_is_pinned() -> None:
-    pins = doctor.pinned()
-    assert len(pins) > 10
-    assert pins["mitsuba"] == "3.9.1"
-    assert pins["drjit"] == "1.5.0"
+def test_every_dependency_is_asked_for_in_a_range_that_is_here() -> None:
+    asked = {one.name: one.specifier for one in doctor.requirements()}
+    assert len(asked) > 10
+    assert asked["mitsuba"].contains("3.9.1")
+    assert not asked["mitsuba"].contains("3.8.0")
+    assert {check.status for check in doctor._versions()} == {"ok"}
+
+
+def test_a_version_out_of_its_range_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = [Requirement("numpy>=99,<100"), Requirement("no-such-package>=1")]
+    monkeypatch.setattr(doctor, "requirements", lambda: wanted)
+    other, missing = doctor._versions()
+    assert (other.status, missing.status) == ("note", "failed")
+    assert "<100,>=99" in other.detail
 
 
 def test_llvm_is_the_one_of_the_package(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -243,7 +243,7 @@ def start(words: str, target: Path) -> subprocess.Popen:
 
 
 COMMANDS = {
-    "render": "twin.render tests/golden/jobs/render.yaml",
+    "render": "twin.render tests/golden/jobs/perturb.yaml",
     "design": "twin.design tests/golden/jobs/design.yaml",
     "uncertainty": "twin.uncertainty gf7_pair --states 4",
     "study": "twin.study {study} --workers 1",

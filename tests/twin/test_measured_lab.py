@@ -21,11 +21,11 @@ from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
 from scenes.yaml.errors import InputError
 from twin.lab import app
-from twin.laboratory.distortion_run import MeasuredDistortion, measure_files
+from twin.laboratory.distortion_run import DistortionRun, measure_files
 from twin.laboratory.export import export_turntable
 from twin.laboratory.measured_focus import MeasuredAlignment, align_measured
-from twin.laboratory.measured_readings import read_comparisons, read_turntable
-from twin.laboratory.turntable_run import MeasuredTurntable, analyse, run_turntable
+from twin.laboratory.measured_readings import read_turntable
+from twin.laboratory.turntable_run import TurntableRun, run_turntable
 from twin.orbit.flight.line_camera import line_cameras
 
 EXAMPLES = SCENES / "lab" / "measured"
@@ -53,7 +53,7 @@ def write(path: Path, rows: Sequence[Sequence[object]]) -> None:
         csv.writer(stream).writerows(rows)
 
 
-def distortion_of(folder: Path) -> MeasuredDistortion:
+def distortion_of(folder: Path) -> DistortionRun:
     return measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
 
 
@@ -61,12 +61,11 @@ def focus_of(folder: Path) -> MeasuredAlignment:
     return align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
 
 
-def turntable_of(folder: Path, names: Sequence[str] = ("cubic_spline", "fourier")) -> MeasuredTurntable:
+def turntable_of(folder: Path, names: Sequence[str] = ("cubic_spline", "fourier")) -> TurntableRun:
     """Without the network, which takes nearly all of the time."""
     spec = resolve_turntable_test(folder / "turntable.yaml").test
-    found = read_comparisons(spec.measured.comparisons, spec.measured.reference)  # type: ignore[union-attr]
-    choice, compensation = analyse(found.series, None, 1, names, 10)
-    return MeasuredTurntable(found.series, None, choice, compensation, spec, 1, found, None, ())  # type: ignore[arg-type]
+    measured = spec.measured.model_copy(update={"held_out": None, "folds": 10})  # type: ignore[union-attr]
+    return run_turntable(spec.model_copy(update={"measured": measured}), 1, names=names)
 
 
 # --- closed loops ----------------------------------------------------------------------------------------
@@ -227,7 +226,7 @@ def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     np.testing.assert_array_equal(again.compensated.fit.covariance, before.compensated.fit.covariance)
     np.testing.assert_array_equal(again.compensated.distortion, before.compensated.distortion)
     found = turntable_of(folder)
-    np.testing.assert_array_equal(found.comparisons.lines, run.comparisons.lines)
+    np.testing.assert_array_equal(found.tables[0].lines, run.tables[0].lines)
     np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
 
 

@@ -539,7 +539,7 @@ def test_intersection_angles_of_measured_passes(tmp_path) -> None:
     for seed in range(4):
         setup = small(**no_thermal())
         file = export(tmp_path / str(seed), setup, flown(setup, seed))
-        found = run_measured_angle(resolve_measured_angle(angle_file(file.parent)), None, 0)
+        found = run_measured_angle(resolve_measured_angle(angle_file(file.parent)))
         true = line_cameras(changed_payload(setup.test, setup.camera))
         for one in found.passes:
             truth = np.array([along_track_angle(true[a], true[b]) for a, b in one.pairs.values()])
@@ -651,7 +651,7 @@ def test_angles_of_a_simulation_and_of_its_exported_files(tmp_path, changes) -> 
     for name, text in angle_exported(run_).items():
         (tmp_path / "out" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "out" / name).write_text(text)
-    again = run_measured_angle(resolve_measured_angle(tmp_path / "out/angle.yaml"), None, 0)
+    again = run_measured_angle(resolve_measured_angle(tmp_path / "out/angle.yaml"))
     assert len(again.passes) == 1
     one, two = run_.estimate, again.passes[0].estimate
     for method in one.angles:
@@ -719,9 +719,7 @@ def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
     for file in ("data.yaml", "other.yaml"):
         test = {"name": "angle", "camera": "./camera.yaml", "data": file, "errors": errors, "time": "0 s"}
         (folder / "angle.yaml").write_text(dump_yaml(test))
-        found.append(
-            run_measured_angle(resolve_measured_angle(folder / "angle.yaml"), None, 0).passes[0].estimate.along
-        )
+        found.append(run_measured_angle(resolve_measured_angle(folder / "angle.yaml")).passes[0].estimate.along)
     assert found[0].values == pytest.approx(found[1].values, abs=0.02 * found[0].sigma.min())
     # files that are missing are told by their key, with the nearest name
     passes["platform"]["orbit"]["file"] = "pas.sp3"

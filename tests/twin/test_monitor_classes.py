@@ -127,11 +127,13 @@ from optics.geometry.tree import Motion
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve_job
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
 setup = MonitorExperiment(resolve_job(JobSpec(instrument="gf7_pair")), load_backend("llvm"))
 rng = np.random.default_rng(5)
 states = [{"base/forward/focal_plane": Motion(shift=tuple(3e-5 * rng.normal(size=3)))} for _ in range(7)]
 digest = hashlib.sha256()
-for _, found in setup.measure(states, 3, 1, chunk=4):
+for seen in observe(setup, states, Observing(one_detector(setup, 3, 1), chunk=4, stated=False)):
+    found = seen.recovery
     for array in (found.after, found.shift_covariance, found.parameters["forward"]["model"].vector):
         digest.update(np.ascontiguousarray(array).tobytes())
 print(digest.hexdigest())

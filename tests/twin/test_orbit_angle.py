@@ -289,7 +289,7 @@ def test_contract(done) -> None:
 
 def test_run_folder(done) -> None:
     folder, _ = done
-    tables = {"methods", "change", "scatter", "difference", "frames", "effects", "sensitivity"}
+    tables = {"methods", "planes", "change", "scatter", "difference", "frames", "effects", "sensitivity"}
     drawings = {
         "geometry",
         "scatter-passes",

@@ -18,6 +18,7 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import load_camera
+from scenes.specs.procedures import Procedure
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.spec import Name, Number, Seed, Spec, Whole, validate
 from scenes.yaml.yaml_file import read_yaml
@@ -28,7 +29,7 @@ from twin.run.artefact import SvgFigure, Table
 from twin.run.cli import Heartbeat
 from twin.run.command import add_test
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Advance, BenchError, Procedure
+from twin.run.procedure import Advance, BenchError
 from twin.run.report import Report, Section, one_sentence
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 
@@ -109,7 +110,7 @@ def test_statements_become_one_sentence() -> None:
     assert one_sentence("It is.", "MTF falls", "Δα is read") == "It is; MTF falls; Δα is read."
 
 
-LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers)
+LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers, report, about="Read a level.", varied=True)
 
 
 @pytest.fixture
@@ -122,7 +123,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable:
     def main() -> None:
         """Instruments of one's own."""
 
-    add_test(app, "own.bench", "level", resolve, lambda: (LEVEL, report), "Read a level.")
+    add_test(app, "own.bench", "level", replace(LEVEL, run=lambda *given: LEVEL.run(*given)))
     return lambda *arguments: invoke(app, *arguments)
 
 
@@ -213,8 +214,7 @@ def test_a_blurred_camera_is_told_wherever_a_test_has_one(monkeypatch: pytest.Mo
     def main() -> None:
         """Instruments of one's own."""
 
-    test = Procedure("level", FocusedSetup, with_camera, measure, numbers)
-    add_test(app, "own.bench", "level", with_camera, lambda: (test, report), "Read a level.")
+    add_test(app, "own.bench", "level", replace(LEVEL, setup=FocusedSetup, resolve=with_camera))
     path, out = tmp_path / "level.yaml", tmp_path / "run"
     path.write_text(FILE, "utf-8")
     done = invoke(app, "level", path, "--out", out)
@@ -261,7 +261,7 @@ def test_a_report_that_cannot_be_made_costs_no_numbers(tmp_path: Path, monkeypat
     def main() -> None:
         """Instruments of one's own."""
 
-    add_test(app, "own.bench", "level", LEVEL.resolve, lambda: (LEVEL, fail), "Read a level.")
+    add_test(app, "own.bench", "level", replace(LEVEL, report=fail))
     path, out = tmp_path / "level.yaml", tmp_path / "run"
     path.write_text(FILE, "utf-8")
     done = invoke(app, "level", path, "--out", out)

@@ -21,6 +21,7 @@ import tifffile
 import xarray as xr
 
 import twin.main_job.render_command
+import twin.main_job.render_folder
 import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
@@ -121,8 +122,8 @@ def ready(repeated, monkeypatch):
     def few(*given):
         return {SCENE: bytes, SUMMARY: bytes, IRRADIANCE: drawings(*given)[IRRADIANCE]}
 
-    monkeypatch.setattr(twin.main_job.render_command, "drawings", few)
-    monkeypatch.setattr(twin.main_job.render_command, "render_report", lambda *_: "")
+    monkeypatch.setattr(twin.main_job.render_folder, "drawings", few)
+    monkeypatch.setattr(twin.main_job.render_folder, "render_report", lambda *_: "")
 
 
 def no_font(*_):
@@ -130,8 +131,8 @@ def no_font(*_):
 
 
 def test_a_drawing_that_fails_is_a_note_and_a_file_that_fails_is_left_out():
-    made = {"motions": "<svg>1</svg>", "side": _tried(no_font), SUMMARY: _tried(no_font), SCENE: _tried(bytes)}
-    drawn, missing = without_failed(made)
+    made = {"motions": "<svg>1</svg>", "side": _tried("side", no_font), SUMMARY: _tried(SUMMARY, no_font)}
+    drawn, missing = without_failed(made | {SCENE: _tried(SCENE, bytes)})
     assert missing == tuple(
         f"{what} could not be drawn: RuntimeError: no such font <x>"
         for what in ("the figure 'side'", "the file summary.png")

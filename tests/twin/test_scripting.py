@@ -336,6 +336,31 @@ def test_a_study_runs_from_a_script_without_a_guard(tmp_path: Path) -> None:
         assert float(found.forward_d_f_true[run]) == pytest.approx(float(truth.d_f_um.sel(camera="forward")), rel=1e-9)
 
 
+def test_the_users_process_stays_as_it_is() -> None:
+    """What commands do with their own, the garbage collector's threshold and what comes at the end, no import does."""
+    code = (
+        "import atexit, gc, sys\n"
+        "atexit.register(lambda: print(gc.get_freeze_count()))\n"  # the last of all that is done
+        "def state(): return gc.get_threshold(), sys.excepthook\n"
+        "before = state()\n"
+        "import twin\n"
+        "for name in twin.__all__: getattr(twin, name)\n"
+        "from twin.scripting.procedures import TESTS\n"
+        "for load in TESTS.values(): load()\n"
+        "assert state() == before, (state(), before)\n"
+        "assert 'typer' not in sys.modules and 'twin.run.cli' not in sys.modules\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(twin.__file__).parent.parent, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["0"], done.stdout
+    begun = "import gc\nfrom scenes.yaml.interrupt import end_quietly\nend_quietly()\nprint(gc.get_threshold()[0])"
+    done = subprocess.run(
+        [sys.executable, "-c", begun], cwd=Path(twin.__file__).parent.parent, capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout) > 10_000
+
+
 def test_a_row_with_one_unit_is_a_list() -> None:
     from scenes.specs.job import PerturbationSpec
 

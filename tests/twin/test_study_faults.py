@@ -14,9 +14,9 @@ import pytest
 import twin.study.__main__ as command
 from analysis.measurement_error import MeasurementError
 from optics.numerics.physical_error import PhysicalError
+from scenes.specs.procedures import Procedure
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT, wait_for, write_study
-from twin.run.procedure import Procedure
 from twin.sensors.area_detector import EmvaDetector
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 from twin.study.runs.chunk_store import ChunkStore
@@ -92,7 +92,7 @@ def test_only_named_errors_are_failures(fault) -> None:
     class NamedMeasurement(MeasurementError, ValueError):
         pass
 
-    base = ProcedureBase(Procedure("toy", Toy, None, None, None))
+    base = ProcedureBase(Procedure("toy", Toy, None, None, None, None))
     for what in ("lost", "unmeasured"):
         assert base.evaluate({"what": what}, [Run(0, (), None)], None) == [Failure("no light")]
     with pytest.raises(fault, match="no light"):

@@ -17,7 +17,13 @@ from twin.study.report.stated_noise import impossible, noise_share
 from twin.study.report.study_analysis import convergences, pareto_front, ranks_of
 from twin.study.report.study_report import summary
 from twin.study.report.study_runs import Factor, StudyRuns
-from twin.study.report.study_statistics import describe, quantile_ranks, runs_for_quantile, share_interval, std_interval
+from twin.study.report.study_statistics import (
+    describe,
+    quantile_interval,
+    runs_for_quantile,
+    share_interval,
+    std_interval,
+)
 from twin.study.runs.sampling import quantiles
 
 FALSE_ALARM = 1e-6
@@ -53,7 +59,7 @@ def test_quantiles_of_a_normal_sample() -> None:
 def test_intervals_hold_what_they_promise(q) -> None:
     """Over 2000 samples of 60: order statistics at least 95%, the standard deviation's near 95%."""
     samples = np.random.default_rng(8).normal(0.0, 1.0, (2000, 60))
-    low, high = quantile_ranks(60, q)
+    low, high = (None if end is None else int(end) for end in quantile_interval(np.arange(60.0), q))
     ordered = np.sort(samples, axis=1)
     truth = stats.norm.ppf(q)
     inside = np.ones(2000, bool) if low is None else ordered[:, low] <= truth
@@ -67,12 +73,12 @@ def test_intervals_hold_what_they_promise(q) -> None:
 
 
 def test_ranks_by_the_binomial_distribution() -> None:
-    low, high = quantile_ranks(100, 0.5)
+    low, high = quantile_interval(np.arange(100.0), 0.5)
     # textbook: for the median of 100 the 40th and the 61st value
     assert (low, high) == (39, 60)
     assert runs_for_quantile(0.997) == 1228
-    assert quantile_ranks(1227, 0.997)[1] is None
-    assert quantile_ranks(1228, 0.997)[1] == 1227
+    assert quantile_interval(np.arange(1227.0), 0.997)[1] is None
+    assert quantile_interval(np.arange(1228.0), 0.997)[1] == 1227
 
 
 def test_clopper_pearson() -> None:

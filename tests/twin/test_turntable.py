@@ -19,8 +19,8 @@ from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
 from twin.laboratory.turntable_numbers import turntable_numbers
-from twin.laboratory.turntable_report import sections
-from twin.laboratory.turntable_run import SimulatedTurntable, run_turntable
+from twin.laboratory.turntable_report import turntable_report
+from twin.laboratory.turntable_run import TurntableRun, run_turntable
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4
@@ -33,7 +33,7 @@ def with_plan(**changes: object) -> TurntableTestSpec:
 
 
 @pytest.fixture(scope="module")
-def run() -> SimulatedTurntable:
+def run() -> TurntableRun:
     """All five fits; three folds instead of ten, to save trainings of the network."""
     return run_turntable(with_plan(folds=3), 1)
 
@@ -156,7 +156,7 @@ def test_without_errors_the_truth_comes_out() -> None:
     assert np.max(np.abs(left[inside])) < 1e-3 * ARCSEC
 
 
-def test_contract(run: SimulatedTurntable) -> None:
+def test_contract(run: TurntableRun) -> None:
     result = json.loads(json.dumps(turntable_numbers(run), allow_nan=False))
     assert set(result["fits"]) == set(FITS) == set(result["truth"]["fits"])
     assert not result["failed"]
@@ -176,16 +176,16 @@ def test_contract(run: SimulatedTurntable) -> None:
     assert sum(not k for p in result["points"] for k in p["kept"]) == result["rejected"]
 
 
-def test_network_weights_stay_within_the_points(run: SimulatedTurntable) -> None:
+def test_network_weights_stay_within_the_points(run: TurntableRun) -> None:
     """A linearisation with more effective parameters than points would be one at no minimum."""
     for fit in run.fits.values():
         assert 2.0 < fit.effective_parameters < 41.0 + 1e-6
 
 
-def test_report(run: SimulatedTurntable) -> None:
-    parts = sections(run, turntable_numbers(run))
+def test_report(run: TurntableRun) -> None:
+    parts = turntable_report(run).sections
     artefacts = [artefact for part in parts for artefact in part.artefacts]
-    assert len({artefact.name for artefact in artefacts}) == len(artefacts) == 5
+    assert len({artefact.name for artefact in artefacts}) == len(artefacts) == 7
     assert all(artefact.content() for artefact in artefacts)
     text = " ".join(paragraph for part in parts for paragraph in part.text)
     assert "50 whole periods" in text

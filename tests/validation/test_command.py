@@ -263,7 +263,7 @@ def test_a_row_says_which_sides_of_its_claim_it_compares(comparison, said, fake,
     first, second = (line.split(" | ") for line in summary.splitlines() if line.startswith("| `"))
     assert (first[3], second[3]) == (comparison, "")
     page = (tmp_path / "run/validation.html").read_text("utf-8")
-    assert page.count(f'<span class="sigma">{comparison}</span>') == 1
+    assert page.count(f"<small>{comparison}</small>") == 1
 
 
 def test_a_number_that_is_not_printed_needs_one_that_is_implied():

@@ -14,7 +14,8 @@ import typer
 
 from scenes.specs.resolved import CameraSetup, resolve_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, Session, print_report, run_command
+from twin.run.command import Result, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"

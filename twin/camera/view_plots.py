@@ -8,12 +8,12 @@ from matplotlib.collections import QuadMesh
 from matplotlib.patches import Circle
 
 from twin.camera.camera_optics import Mtf, Spot, Wavefront
-from twin.run.svg import BLUE, GREY, INK, LIGHT, VERMILION, plain_axes
+from twin.run.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, plain_axes
 
 LINE, TRACK = BLUE, VERMILION
 """Colours of the direction along the line, and along the track."""
 
-WAVES = "RdBu_r"
+WAVES = DIVERGING
 """Colour map of wavefront errors, white where there is none."""
 
 

@@ -14,7 +14,8 @@ import typer
 
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.cli import AsJson, Force, Options, Out, Quiet
-from twin.run.command import Result, Session, print_report, run_command
+from twin.run.command import Result, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 DIFFERENT = 1

@@ -8,7 +8,7 @@ from twin.compare.comparison import Comparison, verdict
 from twin.compare.run_differences import ArrayDifference, Differences, Leaf, RunResults, images_of, is_sigma
 from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
 from twin.run.report import Report, Section, one_sentence
-from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, to_png, to_svg
+from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
 """Changes of a figure: the largest for their sigma."""
@@ -182,8 +182,7 @@ def _picture(first: np.ndarray, second: np.ndarray, names: tuple[str, str], titl
             axis.set_title(name)
         figure.colorbar(shown, ax=axes[:2], shrink=0.8)
         delta = second - first
-        end = float(np.max(np.abs(delta))) or 1.0
-        shown = axes[2].imshow(delta, cmap="RdBu_r", vmin=-end, vmax=end, interpolation="nearest")
+        shown = signed_map(axes[2], delta, interpolation="nearest")
         axes[2].set_title("difference")
         figure.colorbar(shown, ax=axes[2], shrink=0.8)
         for axis in axes:

@@ -14,12 +14,13 @@ from typing import Any
 
 import numpy as np
 import tifffile
-import xarray as xr
 
 from scenes.yaml.errors import InputError, Issue
+from scenes.yaml.input_file import why_unreadable
 from scenes.yaml.json_file import read_json
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
+from twin.run.netcdf_file import read_netcdf
 from twin.run.run_folder import MANIFEST, Manifest, read_manifest
 
 Leaf = float | int | str | bool | None
@@ -373,12 +374,11 @@ def _arrays(run: RunResults, file: str) -> dict[str, np.ndarray]:
     try:
         if file.endswith(".tiff"):
             return {"": np.asarray(tifffile.imread(path))}
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            return {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
+        data = read_netcdf(path.read_bytes())
+        return {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
     # the libraries fail on spoilt files in ways that cannot be foreseen
     except Exception as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        problem = f"cannot be read as a {'TIFF' if file.endswith('.tiff') else 'netCDF'} file: {reason}"
+        problem = f"cannot be read as a {'TIFF' if file.endswith('.tiff') else 'netCDF'} file: {why_unreadable(error)}"
         raise InputError(Issue(problem, str(path), allowed="the file as the run wrote it")) from None
 
 

@@ -8,7 +8,6 @@ if __name__ == "__main__":
     end_quietly()
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,12 +16,11 @@ from typer.core import TyperGroup
 
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import kind_of
-from scenes.models.camera_design import resolve_design
-from scenes.models.monitor_layout import resolve_monitor_design
+from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
-from twin.run.command import Test, run_test
+from twin.run.command import run_test
 
 PROGRAM = "twin.design"
 
@@ -92,7 +90,8 @@ def camera(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    run_test(PROGRAM, "camera", file, resolve_design, _design, Options(out, seed, backend, force, as_json, quiet))
+    options = Options(out, seed, backend, force, as_json, quiet)
+    run_test(PROGRAM, "camera", PROCEDURES["design camera"], file, options)
 
 
 @app.command("monitor")
@@ -122,27 +121,16 @@ def monitor(
     """
     journal = Path(f"{out if out is not None else Path('runs') / file.stem}.search")
     count = cores() if workers is None else workers
-    load = partial(_monitor, count, journal, resume)
+    procedure = PROCEDURES["design monitor"]
+
+    def run(*given: Any) -> Any:
+        if not resume:
+            journal.unlink(missing_ok=True)
+        return procedure.run(*given, workers=count, journal=journal)
+
     options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "monitor", file, resolve_monitor_design, load, options)
+    run_test(PROGRAM, "monitor", replace(procedure, run=run), file, options)
     journal.unlink(missing_ok=True)  # what came of it stands in the run folder
-
-
-def _design() -> Test[Any]:
-    from twin.design.design_report import design_report
-    from twin.design.design_run import DESIGN
-
-    return DESIGN, design_report
-
-
-def _monitor(workers: int, journal: Path, resume: bool) -> Test[Any]:
-    from twin.design.monitor_design import MONITOR_DESIGN, run_monitor_design
-    from twin.design.monitor_report import monitor_design_report
-
-    if not resume:
-        journal.unlink(missing_ok=True)
-    run = partial(run_monitor_design, workers=workers, journal=journal)
-    return replace(MONITOR_DESIGN, run=run), monitor_design_report
 
 
 if __name__ == "__main__":

@@ -21,12 +21,11 @@ from scenes.models.camera_design import (
     camera_of,
     operands_of,
     prescription_of,
-    resolve_design,
     variables_of,
 )
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import BLURRED
-from twin.run.procedure import Advance, BenchError, Procedure, silent
+from twin.run.procedure import Advance, BenchError, silent
 
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
 line CCD. Made by python -m twin.design from {start}: least squares of the wavefront error over the field."""
@@ -207,7 +206,3 @@ def _held_text(held: tuple[Held, ...], start: str) -> str:
             text += f", which {start} breaks by {1e3 * one.start:.3g} mm"
         parts.append(f"{text}; easing it by 1 mm is worth {1e-3 * one.worth:.2g} waves)")
     return " and ".join(parts)
-
-
-# the start is there to be improved, however blurred it is
-DESIGN = Procedure("design", CameraDesignSetup, resolve_design, run_design, design_numbers, judged=False)

@@ -14,7 +14,6 @@ from scenes.models.monitor_layout import (
     MonitorDesignSetup,
     instrument_file,
     layout_spec,
-    resolve_monitor_design,
 )
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
@@ -24,7 +23,7 @@ from twin.design.layout_bench import LayoutBench, LayoutFacts
 from twin.design.layout_search import Found, Search, merit, optima
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
-from twin.run.procedure import Advance, BenchError, Procedure, silent
+from twin.run.procedure import Advance, BenchError, silent
 
 MOST_POINTS = 6
 """Layouts that are drawn and written, at most."""
@@ -311,7 +310,4 @@ def monitor_design_numbers(run: MonitorDesignRun) -> dict[str, Any]:
     }
 
 
-MONITOR_DESIGN = Procedure(
-    "layouts", MonitorDesignSetup, resolve_monitor_design, run_monitor_design, monitor_design_numbers, judged=False
-)
-__all__ = ["MONITOR_DESIGN", "MonitorDesignRun", "run_monitor_design", "verdict"]
+__all__ = ["MonitorDesignRun", "monitor_design_numbers", "run_monitor_design", "verdict"]

@@ -15,7 +15,8 @@ import typer
 from scenes.yaml.errors import nearest
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, Session, print_report, run_command
+from twin.run.command import Result, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 from twin.run.run_folder import Manifest
 

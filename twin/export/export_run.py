@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 
 from analysis.images.image_file import ImageFile
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.input_file import is_file
+from scenes.yaml.input_file import is_file, why_unreadable
 from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_fits, read_frames, run_cards
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
 from twin.run.data_table import TABLE_FORMATS, DataTable, MissingPackage
+from twin.run.netcdf_file import read_netcdf
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
 from twin.run.run_folder import MANIFEST, Manifest, RunFolder, altered, read_manifest
@@ -159,7 +159,7 @@ def _told(place: Path) -> Iterator[None]:
         raise
     # readers of spoilt files fail in ways that cannot be foreseen
     except Exception as error:
-        problem = f"cannot be read as a file of a run: {error}"
+        problem = f"cannot be read as a file of a run: {why_unreadable(error)}"
         raise InputError(Issue(problem, str(place), allowed="the file as the run wrote it")) from None
 
 
@@ -190,11 +190,9 @@ def _frames(source: Path, manifest: Manifest, folder: RunFolder, advance: Advanc
         advance("frames", k + 1, len(pictures))
     for name, stem in EXPECTED.items():
         if name in manifest.sha256:
-            with (
-                _told(source / name),
-                xr.open_dataset(source / name, engine="h5netcdf", decode_timedelta=False) as data,
-            ):
-                content = expected_fits(data.load(), [*about, *cards])
+            with _told(source / name):
+                data = read_netcdf((source / name).read_bytes())
+                content = expected_fits(data, [*about, *cards])
                 items = int(np.prod(data["photons"].shape[:-2]))
             yield _put(folder, f"{stem}.fits", content, name, "expected photons per pixel and frame", items)
 

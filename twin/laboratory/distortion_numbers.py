@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,18 +12,10 @@ from numpy.typing import NDArray
 from analysis.orientation.interior import LINE_TERMS, LineOrientation
 from analysis.turntable.dividing_error import expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.resolved import DistortionSetup, ExperimentSetup, resolve_distortion_test
-from twin.laboratory.distortion_run import (
-    DistortionRun,
-    FoundEstimate,
-    MeasuredDistortion,
-    SimulatedDistortion,
-    rms,
-    run_distortion,
-)
+from twin.laboratory.distortion_run import DistortionRun, FoundEstimate, SimulatedDistortion, rms
+from twin.laboratory.measured_readings import SpotReadings
 from twin.laboratory.turntable_numbers import FileNumbers, RejectedNumbers
-from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
+from twin.run.plain_data import WHERE_KNOWN, plain_data
 
 Array = NDArray[np.float64]
 JOINT_MODEL = "L = constant + principal_distance tan W - principal_point tan^2 W + radial3 tan^3 W"
@@ -229,11 +221,42 @@ class TruthNumbers:
 
 
 @dataclass(frozen=True)
+class RejectedSpotNumbers:
+    """An exposure that Chauvenet's criterion takes out, and where it stands."""
+
+    file: str
+    line: int
+    point: int
+    reading_deg: float
+    from_mean_um: float
+
+    @classmethod
+    def of(cls, run: DistortionRun, readings: SpotReadings) -> tuple[RejectedSpotNumbers, ...]:
+        """All of them, of a run on measurements."""
+        own = run.compensated
+        # what the sets are compared by
+        rest = own.position - run.about * np.tan(own.angle)
+        mean = run.means.mean(rest)
+        return tuple(
+            cls(
+                readings.file.file,
+                int(readings.lines[i, s]),
+                int(i) + 1,
+                float(np.degrees(run.reading[i, s])),
+                1e6 * float(rest[i, s] - mean[i]),
+            )
+            for i, s in np.argwhere(run.rejected)
+        )
+
+
+@dataclass(frozen=True)
 class DistortionNumbers:
     """distortion.json. Without a calibration of the turntable raw and compensated are the same.
 
     principal_distance_mm is the balanced one, the slope that leaves the smallest distortion over these points, and
-    principal_point_mm belongs to it; radial3_mm is that of `joint`, whose f is another.
+    principal_point_mm belongs to it; radial3_mm is that of `joint`, whose f is another. chi_square is that of the
+    smooth model against the stated noise alone; covariance_mm2 that of constant, principal distance and principal
+    point.
     """
 
     name: str
@@ -256,50 +279,6 @@ class DistortionNumbers:
     estimates: Mapping[str, EstimateNumbers]
     noise: NoiseNumbers
     compensation: CompensationNumbers | None
-
-
-@dataclass(frozen=True)
-class SimulatedDistortionNumbers(DistortionNumbers):
-    """distortion.json of a simulated bench."""
-
-    truth: TruthNumbers
-
-
-@dataclass(frozen=True)
-class RejectedSpotNumbers:
-    """An exposure that Chauvenet's criterion takes out, and where it stands."""
-
-    file: str
-    line: int
-    point: int
-    reading_deg: float
-    from_mean_um: float
-
-    @classmethod
-    def of(cls, run: MeasuredDistortion) -> tuple[RejectedSpotNumbers, ...]:
-        """All of them."""
-        own = run.compensated
-        # what the sets are compared by
-        rest = own.position - run.spec.focal_length * np.tan(own.angle)
-        mean = run.means.mean(rest)
-        return tuple(
-            cls(
-                run.readings.file.file,
-                int(run.readings.lines[i, s]),
-                int(i) + 1,
-                float(np.degrees(run.reading[i, s])),
-                1e6 * float(rest[i, s] - mean[i]),
-            )
-            for i, s in np.argwhere(run.rejected)
-        )
-
-
-@dataclass(frozen=True)
-class MeasuredDistortionNumbers(DistortionNumbers):
-    """distortion.json of measurements. Chi-square: of the smooth model against the stated noise alone. Covariance: of
-    constant, principal distance and principal point, square millimetres.
-    """
-
     chi_square: float
     degrees_of_freedom: int
     probability: float
@@ -307,87 +286,72 @@ class MeasuredDistortionNumbers(DistortionNumbers):
     covariance_mm2: Array
     stated_exposure_um: float
     across_range_um: float | None
-    rejected_readings: tuple[RejectedSpotNumbers, ...]
-    rejected_comparisons: tuple[RejectedNumbers, ...]
-    files: tuple[FileNumbers, ...]
+    rejected_readings: tuple[RejectedSpotNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
+    rejected_comparisons: tuple[RejectedNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
+    files: tuple[FileNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
+    truth: TruthNumbers | None = field(default=None, metadata=WHERE_KNOWN)
 
     @classmethod
-    def of(cls, run: MeasuredDistortion) -> MeasuredDistortionNumbers:
+    def of(cls, run: DistortionRun) -> DistortionNumbers:
         """Of a run."""
-        across = run.readings.across
-        files = [run.readings.file, *(table.file for table in run.tables)]
+        fit, smooth, table, readings = run.compensated.fit, run.compensated.smooth, run.compensation, run.readings
+        f, p = (fit.terms.index(term) for term in ("principal_distance", "principal_point"))
+        across = None if readings is None else readings.across
         return cls(
-            **_found(run, run.spec.name),
+            name=run.test.name,
+            seed=run.seed,
+            principal_distance_mm=1e3 * fit.value("principal_distance"),
+            principal_distance_mm_sigma=1e3 * fit.sigma("principal_distance"),
+            principal_point_mm=1e3 * fit.value("principal_point"),
+            principal_point_mm_sigma=1e3 * fit.sigma("principal_point"),
+            correlation=float(fit.correlation[f, p]),
+            principal_point_observable=bool(fit.point.observable),
+            principal_point_statement=fit.point.statement,
+            rms_raw_um=1e6 * rms(run.raw.smooth.residual),
+            rms_compensated_um=1e6 * rms(smooth.residual),
+            zero_arcsec=run.compensated.zero / ARCSEC,
+            joint=JointNumbers.of(run),
+            points=PointNumbers.of(run),
+            radial3_mm=1e3 * smooth.value("radial3"),
+            radial3_mm_sigma=1e3 * smooth.sigma("radial3"),
+            correlations=CorrelationNumbers(smooth.terms, smooth.correlation),
+            estimates={key: EstimateNumbers.of(e) for key, e in run.found_estimates.items()},
+            noise=NoiseNumbers(
+                centroid_um=1e6 * rms(run.spots.temporal),
+                centroid_columns_um=1e6 * rms(run.spots.fixed),
+                exposure_um=1e6 * run.means.scatter,
+                white_raw_um=1e6 * run.raw.white,
+                white_compensated_um=1e6 * run.compensated.white,
+                rejected=int(np.sum(run.present)) - int(np.sum(run.means.keep)),
+                rejected_expected_of_good=expected_rejections(run.present.sum(axis=1)),
+            ),
+            compensation=None
+            if table is None
+            else CompensationNumbers(
+                fit=table.fit.name,
+                repeatability_arcsec=table.repeatability / ARCSEC,
+                common_arcsec=table.common / ARCSEC,
+                smooth_arcsec=table.smooth / ARCSEC,
+                white_arcsec=table.white / ARCSEC,
+            ),
             chi_square=run.stated.chi_square,
             degrees_of_freedom=run.stated.degrees_of_freedom,
             probability=run.stated.probability,
-            covariance_terms=run.compensated.fit.terms,
-            covariance_mm2=1e6 * run.compensated.fit.covariance,
+            covariance_terms=fit.terms,
+            covariance_mm2=1e6 * fit.covariance,
             stated_exposure_um=1e6 * float(np.sqrt(np.mean(run.spots.temporal**2, where=run.present))),
             across_range_um=None if across is None else 1e6 * float(np.ptp(across)),
-            rejected_readings=RejectedSpotNumbers.of(run),
-            rejected_comparisons=tuple(one for table in run.tables for one in RejectedNumbers.of(table)),
-            files=tuple(FileNumbers(**asdict(file)) for file in files),
+            rejected_readings=None if readings is None else RejectedSpotNumbers.of(run, readings),
+            rejected_comparisons=None
+            if readings is None
+            else tuple(one for table in run.tables for one in RejectedNumbers.of(table)),
+            files=None
+            if readings is None
+            else tuple(FileNumbers(**asdict(file)) for file in (readings.file, *(one.file for one in run.tables))),
+            truth=TruthNumbers.of(run) if isinstance(run, SimulatedDistortion) else None,
         )
-
-
-def _found(run: DistortionRun, name: str) -> dict[str, Any]:
-    """Fields of `DistortionNumbers`."""
-    fit, smooth, table = run.compensated.fit, run.compensated.smooth, run.compensation
-    f, p = (fit.terms.index(term) for term in ("principal_distance", "principal_point"))
-    counts = run.means.keep.shape[1] * np.ones(len(run.reading), np.int64)
-    taken = run.means.keep.size
-    if isinstance(run, MeasuredDistortion):
-        counts, taken = run.present.sum(axis=1), int(np.sum(run.present))
-    return {
-        "name": name,
-        "seed": run.seed,
-        "principal_distance_mm": 1e3 * fit.value("principal_distance"),
-        "principal_distance_mm_sigma": 1e3 * fit.sigma("principal_distance"),
-        "principal_point_mm": 1e3 * fit.value("principal_point"),
-        "principal_point_mm_sigma": 1e3 * fit.sigma("principal_point"),
-        "correlation": float(fit.correlation[f, p]),
-        "principal_point_observable": bool(fit.point.observable),
-        "principal_point_statement": fit.point.statement,
-        "rms_raw_um": 1e6 * rms(run.raw.smooth.residual),
-        "rms_compensated_um": 1e6 * rms(smooth.residual),
-        "zero_arcsec": run.compensated.zero / ARCSEC,
-        "joint": JointNumbers.of(run),
-        "points": PointNumbers.of(run),
-        "radial3_mm": 1e3 * smooth.value("radial3"),
-        "radial3_mm_sigma": 1e3 * smooth.sigma("radial3"),
-        "correlations": CorrelationNumbers(smooth.terms, smooth.correlation),
-        "estimates": {key: EstimateNumbers.of(e) for key, e in run.found_estimates.items()},
-        "noise": NoiseNumbers(
-            centroid_um=1e6 * rms(run.spots.temporal),
-            centroid_columns_um=1e6 * rms(run.spots.fixed),
-            exposure_um=1e6 * run.means.scatter,
-            white_raw_um=1e6 * run.raw.white,
-            white_compensated_um=1e6 * run.compensated.white,
-            rejected=taken - int(np.sum(run.means.keep)),
-            rejected_expected_of_good=expected_rejections(counts),
-        ),
-        "compensation": None
-        if table is None
-        else CompensationNumbers(
-            fit=table.fit.name,
-            repeatability_arcsec=table.repeatability / ARCSEC,
-            common_arcsec=table.common / ARCSEC,
-            smooth_arcsec=table.smooth / ARCSEC,
-            white_arcsec=table.white / ARCSEC,
-        ),
-    }
 
 
 def distortion_numbers(run: DistortionRun) -> dict[str, Any]:
     """Contents of distortion.json without its frames."""
-    if isinstance(run, MeasuredDistortion):
-        return dict(plain_data(MeasuredDistortionNumbers.of(run)))
-    assert isinstance(run, SimulatedDistortion)
-    found = _found(run, run.setup.test.name)
-    return dict(plain_data(SimulatedDistortionNumbers(**found, truth=TruthNumbers.of(run))))
-
-
-DISTORTION = Procedure[ExperimentSetup[Any], DistortionRun](
-    "distortion", DistortionSetup, resolve_distortion_test, run_distortion, distortion_numbers
-)
+    return dict(plain_data(DistortionNumbers.of(run)))

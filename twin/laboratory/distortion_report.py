@@ -1,176 +1,144 @@
-"""Report of a distortion test: the main table, figures, sections."""
+"""Report of a distortion test: what was found, how well, and what limits it; of a simulated bench also beside its
+truth.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.spots.centroid import mean_frames
+from analysis.orientation.distortion_model import design
+from analysis.orientation.interior import gain
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.laboratory.distortion_numbers import distortion_numbers
-from twin.laboratory.distortion_run import SimulatedDistortion, rms
-from twin.laboratory.turntable_report import FIT_NAMES
-from twin.run.artefact import FAR, Cell, OwnDecimals, SvgFigure, Table, decimals_for
+from twin.laboratory.distortion_plots import COMPENSATED, RAW, curve_svg, spot_svg
+from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion, rms
+from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
+from twin.run.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts
 from twin.run.report import Report, Section, one_sentence
-from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-RAW, COMPENSATED = "angles as read", "compensated angles"
-
-
-def curve_svg(run: SimulatedDistortion) -> str:
-    """Distortion over the field, and its error against the truth."""
-    with look("distortion-curve"):
-        figure = new_figure(6.4)
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.25, 1.0))
-        field = np.degrees(run.compensated.fit.angle)
-        above.plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
-        for measured, name, colour, marker, shift in (
-            (run.raw, RAW, ORANGE, "s", -0.005),
-            (run.compensated, COMPENSATED, BLUE, "o", 0.005),
-        ):
-            style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
-            above.errorbar(field + shift, 1e6 * measured.distortion, 1e6 * measured.sigma, **style)
-            below.errorbar(field + shift, 1e6 * run.error(measured), 1e6 * measured.sigma, **style)
-        below.axhline(0.0, color=GREY, lw=0.8)
-        above.set_title("Distortion D = L − c − f tan W + p tan² W", loc="left")
-        below.set_title("Measured − true", loc="left")
-        below.set_xlabel("field angle W [deg]")
-        for axes in (above, below):
-            axes.set_ylabel("µm")
-            dress(axes)
-        return to_svg(figure)
-
-
-def points_svg(run: SimulatedDistortion) -> str:
-    """Each point's error and its departure from a smooth curve, raw and compensated."""
-    with look("distortion-points"):
-        figure = new_figure(4.6)
-        both = run.raw, run.compensated
-        panels = {
-            "Error of the distortion against the truth": [1e6 * np.abs(run.error(one)) for one in both],
-            "Distance from the smooth curve": [1e6 * np.abs(one.smooth.residual) for one in both],
-        }
-        every = figure.subplots(len(panels), 1)
-        for axes, (title, (raw, compensated)) in zip(every, panels.items(), strict=True):
-            number = np.arange(1, len(raw) + 1)
-            axes.bar(number - 0.2, raw, 0.4, color=ORANGE, label=f"{RAW}, rms {_rms(raw):.2f} µm")
-            axes.bar(number + 0.2, compensated, 0.4, color=BLUE, label=f"{COMPENSATED}, rms {_rms(compensated):.2f} µm")
-            axes.set_title(title, loc="left")
-            axes.set_ylabel("µm")
-            axes.set_xlim(0.0, len(raw) + 1.0)
-            dress(axes)
-        every[-1].set_xlabel("point")
-        return to_svg(figure)
-
-
-def spot_svg(run: SimulatedDistortion) -> str:
-    """The spot in the middle of the field, and the row through its centre."""
-    with look("distortion-spot"):
-        figure = new_figure(3.6)
-        picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
-        point = len(run.record.column) // 2
-        image = mean_frames(run.record.frames[point, 0])
-        pitch = run.bench.ccd.band.pitch
-        column = run.spots.position[point, 0] + run.bench.design_offset[point]
-        column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
-        row = run.spots.row[point, 0]
-        shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
-        picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
-        angle = np.linspace(0.0, 2.0 * np.pi, 181)
-        radius = run.bench.radius
-        picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
-        picture.set(xlabel="column, along the line", ylabel="row, along the track")
-        figure.colorbar(shown, ax=picture, label="DN")
-        values = image[round(row)]
-        profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
-        profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
-        profile.set(xlabel="column", ylabel="DN")
-        dress(profile, columns=1)
-        return to_svg(figure)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def dress(axes: Axes, columns: int = 3) -> None:
-    """A light grid, a legend and room for it; columns: of the legend."""
-    low, high = axes.get_ylim()
-    # room for the legend above the data
-    axes.set_ylim(low, high + 0.18 * (high - low))
-    axes.grid(axis="y", color=LIGHT, lw=0.6)
-    axes.set_axisbelow(True)
-    axes.legend(loc="upper right" if columns == 1 else "upper center", ncols=columns)
-    plain_axes(axes)
-
-
-Array = NDArray[np.float64]
 SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
+ZERO_SHARE = 0.3
+"""Of sigma of the principal point: a zero of the angles that moves it by more is told."""
 
 
-def distortion_report(run: SimulatedDistortion) -> Report:
+def distortion_report(run: DistortionRun) -> Report:
     """Report of a distortion test."""
     data = distortion_numbers(run)
-    truth, test = data["truth"], run.setup.test
-    fit = run.compensated.fit
-    count, sets = run.record.reading.shape
-    numbers = np.linspace(0, count - 1, SHOWN).astype(int)
-    width = run.bench.images.width
-    facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
+    simulated = run if isinstance(run, SimulatedDistortion) else None
+    frames, facts = _frames(simulated) if simulated is not None else ({}, {})
+    sections = [_curve(run, data), _joint(data["joint"]), _estimates(run, data), _noise(run, data)]
+    if run.compensation is not None:
+        sections.insert(1, _compensation(run))
     return Report(
         title="Interior orientation and distortion",
-        verdict=_verdict(data, truth),
-        lead=(typeset(fit.point.statement),),
-        facts=(
-            ("camera", f"{test.camera}, band {test.band}"),
-            (
-                "points, sets",
-                f"{count} over ±{np.degrees(run.bench.turn[-1]):.3f}°, {sets} sets of {test.frames} frames",
-            ),
+        verdict=_verdict(run, data),
+        lead=(_typeset(run.compensated.fit.point.statement),),
+        facts=_facts(run, data),
+        summary=_summary(run, data),
+        sections=tuple(sections),
+        images=FrozenMap(frames),
+        image_facts=FrozenMap(facts),
+        warnings=_warnings(run, data),
+    )
+
+
+def _frames(run: SimulatedDistortion) -> tuple[dict[str, np.ndarray], dict[str, FrameFacts]]:
+    """Frames that are kept of a simulated bench, and what is known of them."""
+    test = run.setup.test
+    facts = FrameFacts(f"{test.camera}, line CCD {test.band}", run.bench.ccd.band.pitch, note="spot of the pinhole")
+    numbers = np.linspace(0, len(run.reading) - 1, SHOWN).astype(int)
+    names = {f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}
+    return names, dict.fromkeys(names, facts)
+
+
+def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    count, sets = run.reading.shape
+    first, last = np.degrees([np.min(run.compensated.fit.angle), np.max(run.compensated.fit.angle)])
+    facts = [("points, sets", f"{count} from {first:.3f}° to {last:.3f}°, {sets} sets, {np.sum(run.present)} spots")]
+    if run.compensation is not None:
+        angles = f"compensated by {FIT_NAMES[run.compensation.fit.name]} of the turntable's calibration"
+    if isinstance(run.test, MeasuredDistortionSpec):
+        files = run.test.measured
+        if run.compensation is None:
+            angles = f"as read, each good to {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
+        facts += [
+            ("angles", f"{angles}; the line's middle is imaged at {format_quantity(files.zero, ANGLE)}"),
+            ("focal length, about", format_quantity(run.about, LENGTH)),
+            *(("file", f"{one['file']}, {one['rows']} rows") for one in data["files"]),
+        ]
+    if isinstance(run, SimulatedDistortion):
+        test = run.setup.test
+        facts += [
+            ("angles", f"{angles}, {run.setup.turntable.name}"),
+            ("camera", f"{test.camera}, band {test.band}, {test.frames} frames of each spot"),
             (
                 "pinhole",
                 f"{format_quantity(test.pinhole, LENGTH)} in a collimator of "
-                f"{format_quantity(test.collimator.focal_length, LENGTH)}: {width:.1f} pixels in the image",
+                f"{format_quantity(test.collimator.focal_length, LENGTH)}: {run.bench.images.width:.1f} pixels in the "
+                "image",
             ),
-            ("turntable", f"{run.setup.turntable.name}, dividing error by {FIT_NAMES[run.compensation.fit.name]}"),
             (
                 "spots along the track",
-                f"over {truth['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
+                f"over {data['truth']['row_smile_um']:.0f} µm: smile of the mapping and tilt of the axis",
             ),
-        ),
-        summary=_summary(data),
-        sections=(_curve(run), _compensation(run), joint_section(data["joint"]), _estimates(run), _noise(run, data)),
-        images=FrozenMap({f"spot-{i + 1:02d}": run.record.frames[i, 0] for i in numbers}),
-        image_facts=FrozenMap({f"spot-{i + 1:02d}": facts for i in numbers}),
-        warnings=_warnings(run),
-    )
+        ]
+    return (*facts, ("description", run.test.description))
 
 
-def _verdict(data: Mapping[str, Any], truth: Mapping[str, Any]) -> str:
-    found, sigma = data["principal_distance_mm"], data["principal_distance_mm_sigma"]
-    ratio = abs(found - truth["principal_distance_mm"]) / sigma
-    well = "within" if ratio <= FAR else "outside"
-    with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
-    gain = "compensating them helps" if with_it < without else "compensating them does not help"
+def _limit(run: DistortionRun) -> str:
+    """What makes most of the principal distance's sigma."""
+    fit = run.compensated.fit
+    k = fit.terms.index("principal_distance")
+    parts = _shares(run)
+    name = max(parts, key=lambda one: parts[one])
+    share = parts[name] / fit.covariance[k, k]
+    return f"{name}, {100.0 * share:.0f} % of its variance"
+
+
+def _shares(run: DistortionRun) -> dict[str, float]:
+    """Variance of the principal distance by its causes, square metres."""
+    fit, means = run.compensated.fit, run.means
+    k = fit.terms.index("principal_distance")
+    row = gain(design(fit.angle, fit.terms))[k]
+    angles = fit.noise - np.diag(np.hypot(means.sigma, run.compensated.white) ** 2)
+    return {
+        "the scatter between the sets": float(row**2 @ means.sigma**2),
+        "the angles' covariance": float(row @ angles @ row),
+        "what points scatter about a smooth curve": float(np.sum(row**2) * run.compensated.white**2),
+    }
+
+
+def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> str:
+    noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
+    expected, truth = noise["rejected_expected_of_good"], data.get("truth")
+    known = f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
+    beside = ""
+    if truth is not None:
+        ratio = abs(f - truth["principal_distance_mm"]) / sigma
+        well = "within" if ratio <= FAR else "outside"
+        beside = f", {well} {FAR:g} σ of the truth ({truth['principal_distance_mm']:.4f} mm, {ratio:.1f} σ)"
+        with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
+        gain = "compensating them helps" if with_it < without else "compensating them does not help"
+        known += f" and wrong by {with_it:.2f} µm rms, with angles as read by {without:.2f} µm: {gain}"
     return one_sentence(
-        f"The balanced principal distance is {found:.3f} ± {sigma:.3f} mm, {well} {FAR:g} σ of the truth "
-        f"({truth['principal_distance_mm']:.3f} mm, {ratio:.1f} σ)",
-        f"distortion is measured to {with_it:.2f} µm rms with compensated angles and {without:.2f} µm with angles as "
-        f"read: {gain}, see the curve and the compensation",
+        f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm{beside}, limited by {_limit(run)}",
+        f"{known}, and points lie within {data['rms_compensated_um']:.2f} µm rms of a smooth curve",
+        f"chi-square {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise, "
+        f"{noise['rejected']} of {int(np.sum(run.present))} spots rejected where {expected:.0f} are expected of good "
+        "ones, see the noise",
     )
 
 
-def typeset(text: str) -> str:
+def _typeset(text: str) -> str:
     """A statement of the analysis, which is plain ASCII, as the report and the terminal show it."""
     for plain, shown in (
         ("+-", "±"),
@@ -185,91 +153,139 @@ def typeset(text: str) -> str:
     return text
 
 
-def _warnings(run: SimulatedDistortion) -> tuple[str, ...]:
+def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
     out = []
-    kept = int(np.sum(run.truth.gross & run.means.keep))
-    if kept:
-        out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
-    left = run.bench.true_offset - run.bench.design_offset
-    slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
-    sigma = run.compensated.fit.sigma("principal_distance")
-    if abs(slope) > 0.5 * sigma:
+    fit = run.compensated.fit
+    f, sigma = fit.value("principal_distance"), fit.sigma("principal_distance")
+    if isinstance(run, SimulatedDistortion):
+        kept = int(np.sum(run.truth.gross & run.means.keep))
+        if kept:
+            out.append(f"gross errors that Chauvenet's criterion does not find and that stay in the means: {kept}")
+        left = run.bench.true_offset - run.bench.design_offset
+        slope = float(np.polyfit(np.tan(run.bench.turn), left, 1)[0])
+        if abs(slope) > 0.5 * sigma:
+            out.append(
+                "as-built coma that grows over the field moves energy centroids against chief rays and f by "
+                f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
+                "fields"
+            )
+    moved = abs(fit.value("constant"))
+    if isinstance(run.test, MeasuredDistortionSpec) and moved > ZERO_SHARE * fit.sigma("principal_point"):
+        sense = -1.0 if run.test.measured.reversed else 1.0
+        zero = run.test.measured.zero + sense * run.compensated.zero
         out.append(
-            "as-built coma that grows over the field moves energy centroids against chief rays and f by "
-            f"{1e6 * slope:.0f} µm, which no sigma holds ({1e6 * sigma:.0f} µm): measure the wavefront at several "
-            "fields"
+            f"the line's middle is imaged {run.compensated.zero / ARCSEC:.3g} arcsec from `zero`, which moves the "
+            f"principal point by {1e3 * moved:.3g} mm and is in no sigma: with zero: {np.degrees(zero):.9f} deg it is "
+            "gone"
+        )
+    if abs(f / run.about - 1.0) > 0.05:
+        out.append(
+            f"the principal distance is {f:.4g} m, but `focal_length` says {run.about:.4g} m: are the "
+            "units of angles and places right?"
+        )
+    if data["probability"] < DOUBTFUL:
+        out.append(
+            "the points scatter about a smooth curve more than the stated noise allows; the excess, "
+            f"{data['noise']['white_compensated_um']:.2f} µm, is in all sigmas as if it were independent from point to "
+            "point"
+        )
+    if run.compensation is None:
+        out.append(
+            "no calibration of the turntable: a dividing error with long waves passes for distortion, and no sigma "
+            "holds it but `angle_sigma`"
         )
     return tuple(out)
 
 
-def _summary(data: Mapping[str, Any]) -> Table:
-    truth = data["truth"]
+def _summary(run: DistortionRun, data: Mapping[str, Any]) -> Table:
+    truth = data.get("truth") or {}
+    # six digits, which tables show of a number, are too few for f
     rows: list[tuple[Cell, ...]] = [
         (
             "balanced principal distance [mm]",
-            # six digits, which tables show of a number, are too few here
             f"{data['principal_distance_mm']:.4f}",
             data["principal_distance_mm_sigma"],
-            f"{truth['principal_distance_mm']:.4f}",
+            f"{truth.get('principal_distance_mm', 0.0):.4f}",
         ),
         (
             "principal point [mm]",
-            data["principal_point_mm"],
+            f"{data['principal_point_mm']:.3f}",
             data["principal_point_mm_sigma"],
-            truth["principal_point_mm"],
+            truth.get("principal_point_mm"),
         ),
-        ("correlation of the two", data["correlation"], None, None),
-        ("residual of smooth model, raw angles [µm rms]", data["rms_raw_um"], None, None),
-        ("residual of smooth model, compensated [µm rms]", data["rms_compensated_um"], None, None),
-        ("error of distortion, raw angles [µm rms]", truth["error_rms_raw_um"], None, None),
-        ("error of distortion, compensated [µm rms]", truth["error_rms_compensated_um"], None, None),
+        ("correlation of the two", f"{data['correlation']:.3f}", None, None),
+        ("radial term of the joint model [mm]", f"{data['radial3_mm']:.3f}", data["radial3_mm_sigma"], None),
+        ("residual of smooth model [µm rms]", f"{data['rms_compensated_um']:.3f}", None, None),
     ]
+    if run.compensation is not None:
+        rows.append(("residual of smooth model, angles as read [µm rms]", f"{data['rms_raw_um']:.3f}", None, None))
+    rows.append(("chi-square of the smooth model", f"{data['chi_square']:.1f}", None, None))
+    rows.append(("degrees of freedom", f"{data['degrees_of_freedom']}", None, None))
+    heads: tuple[str, ...] = ("", "measured", "sigma", "truth")
+    if truth:
+        for name, key in ((RAW, "error_rms_raw_um"), (COMPENSATED, "error_rms_compensated_um")):
+            rows.append((f"error of distortion, {name} [µm rms]", f"{truth[key]:.3f}", None, None))
+    else:
+        heads, rows = heads[:3], [row[:3] for row in rows]
     caption = (
-        "f and p with compensated angles, by least squares with a constant, which is the unknown zero of the angles. "
-        "Balanced: the f that leaves the smallest distortion over the points; with a radial term use the joint model."
+        "f and p by least squares with a constant, which is the unknown zero of the angles. Balanced: the f that "
+        "leaves the smallest distortion over the points; with the radial term use the joint model."
     )
-    return Table("distortion-result", "Result", caption, ("", "measured", "sigma", "truth"), rows, (None, 3, 3, 3))
+    return Table("distortion-result", "Result", caption, heads, rows, (None, 3, 4, 3)[: len(heads)])
 
 
-def _curve(run: SimulatedDistortion) -> Section:
-    own = run.compensated
-    ratio = rms(run.error(own) / own.sigma)
-    text = (
-        "D is what is left of the spots' places after a constant, f tan W and p tan² W, measured and true alike. "
-        "Error bars hold the scatter of the sets, the covariance of the turntable's calibration (compensated angles "
-        "only) and what the points scatter about a smooth curve beyond that. With angles as read the long waves of "
-        "the dividing error pass for distortion, and no error bar knows of them.",
-        f"The errors are {ratio:.2f} sigma rms with compensated angles, "
-        f"{rms(run.error(run.raw) / run.raw.sigma):.2f} with angles as read.",
-    )
-    figure = SvgFigure(
-        "distortion-curve",
-        "Distortion over the field",
-        "Above: measured with sigma, and by exact chief rays of the as-built camera. Below: the error.",
-        curve_svg(run),
-    )
-    return Section("Distortion", text, (figure,))
-
-
-def _compensation(run: SimulatedDistortion) -> Section:
-    raw, own = run.raw, run.compensated
-    pairs: tuple[tuple[str, Array, Array], ...] = (
-        ("error of the distortion (needs the truth)", 1e6 * run.error(raw), 1e6 * run.error(own)),
-        ("distance from the smooth curve", 1e6 * raw.smooth.residual, 1e6 * own.smooth.residual),
-        ("RMS of distortion over the sets", 1e6 * raw.rms_over_sets, 1e6 * own.rms_over_sets),
-    )
-    rows: list[tuple[Cell, ...]] = [
-        (name, a, b, 100.0 * (1.0 - b / a), float(np.max(np.abs(first))), float(np.max(np.abs(second))))
-        for name, first, second in pairs
-        for a, b in ((rms(first), rms(second)),)
+def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    text = [
+        "D is what is left of the spots' places after a constant, f tan W and p tan² W. Its sigma holds the scatter of "
+        "the sets, the stated errors of the angles with their covariance, and what the points scatter about a smooth "
+        "curve beyond that. It does not hold what moves every centroid alike at one place of the field, as coma does.",
     ]
+    if run.compensation is not None:
+        text.append(
+            "With angles as read the long waves of the dividing error pass for distortion, and no error bar knows of "
+            "them."
+        )
+    caption = "Means of the sets."
+    if isinstance(run, SimulatedDistortion):
+        with_it, without = (rms(run.error(one) / one.sigma) for one in (run.compensated, run.raw))
+        text.append(
+            f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
+        )
+        caption += " Line: by exact chief rays of the as-built camera."
+    keys = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
+    points = [(*(one[key] for key in keys), one["residual_compensated_um"], one["sets_kept"]) for one in data["points"]]
+    heads = ("point", "reading [deg]", "W [deg]", "L [mm]", "D [µm]", "sigma [µm]", "from smooth [µm]", "sets kept")
+    artefacts: tuple[Artefact, ...] = (
+        SvgFigure("distortion-curve", "Distortion over the field", caption, curve_svg(run)),
+        Table(
+            "distortion-points", "Point by point", "Means of the sets kept.", heads, points, (None, 5, 5, 4, 2, 2, 2)
+        ),
+    )
+    return Section("Distortion", tuple(text), artefacts, folded=1)
+
+
+def _compensation(run: DistortionRun) -> Section:
+    raw, own = run.raw, run.compensated
+    pairs = {
+        "distance from the smooth curve": (raw.smooth.residual, own.smooth.residual),
+        "RMS of distortion over the sets": (raw.rms_over_sets, own.rms_over_sets),
+    }
     text = (
         "How much an RMS falls with compensated angles depends on what else is in it. That of the distortion itself "
         "holds the design's distortion, which a dividing error may even cancel in part, so that it can rise. The "
-        "distance from a smooth curve does not see the long waves of the dividing error. Only the error against the "
-        "truth tells what compensation brings. It differs from table to table: the constant, f and p take up what is "
-        "longer than the field.",
+        "distance from a smooth curve does not see the long waves of the dividing error."
     )
+    if isinstance(run, SimulatedDistortion):
+        pairs["error of the distortion (needs the truth)"] = (run.error(raw), run.error(own))
+        text += (
+            " Only the error against the truth tells what compensation brings. It differs from table to table: the "
+            "constant, f and p take up what is longer than the field."
+        )
+    rows: list[tuple[Cell, ...]] = []
+    for name, values in pairs.items():
+        before, after = (1e6 * rms(one) for one in values)
+        most = [1e6 * float(np.max(np.abs(one))) for one in values]
+        rows.append((name, before, after, 100.0 * (1.0 - after / before) if before else None, *most))
     table = Table(
         "distortion-reduction",
         "What compensation brings",
@@ -278,13 +294,7 @@ def _compensation(run: SimulatedDistortion) -> Section:
         rows,
         (None, 2, 2, 0, 1, 1),
     )
-    figure = SvgFigure(
-        "distortion-points",
-        "Point by point",
-        "Without the design's distortion.",
-        points_svg(run),
-    )
-    return Section("Raw and compensated angles", text, (figure, table))
+    return Section("Raw and compensated angles", (text,), (table,))
 
 
 ESTIMATES = {
@@ -298,7 +308,7 @@ ESTIMATES = {
 """Estimate -> what it is, for readers."""
 
 
-def joint_section(joint: Mapping[str, Any]) -> Section:
+def _joint(joint: Mapping[str, Any]) -> Section:
     """The terms of one model that belong together, as they reproduce the spots and as a payload's file has them.
 
     Args:
@@ -326,7 +336,7 @@ def joint_section(joint: Mapping[str, Any]) -> Section:
         "Joint model",
         text,
         (
-            table("distortion-joint", "Joint model", f"{typeset(joint['model'])}.", joint, "_mm", names),
+            table("distortion-joint", "Joint model", f"{_typeset(joint['model'])}.", joint, "_mm", names),
             table(
                 "distortion-line",
                 "The same as a line of a payload's file",
@@ -340,69 +350,125 @@ def joint_section(joint: Mapping[str, Any]) -> Section:
     )
 
 
-def _estimates(run: SimulatedDistortion) -> Section:
-    mm = 1e3
+def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    keys = ("principal_distance_mm", "principal_distance_mm_sigma", "principal_point_mm", "principal_point_mm_sigma")
+    heads: tuple[str, ...] = ("estimate", "f [mm]", "sigma of f [mm]", "p [mm]", "sigma of p [mm]", "D [µm rms]")
+    digits: tuple[int | None, ...] = (None, 4, 3, 3, 3, 2)
     rows: list[tuple[Cell, ...]] = [
-        (
-            ESTIMATES[name],
-            mm * e.f,
-            None if e.f_sigma is None else mm * e.f_sigma,
-            mm * (e.f - e.f_true),
-            mm * e.p,
-            None if e.p_sigma is None else mm * e.p_sigma,
-            mm * (e.p - e.p_true),
-            1e6 * e.error,
-        )
-        for name, e in run.estimates.items()
+        (ESTIMATES[name], *(one[key] for key in keys), one["distortion_rms_um"])
+        for name, one in data["estimates"].items()
     ]
-    zero = (run.compensated.zero - run.truth.zero) / ARCSEC
-    text = (
+    found = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
-        "direction that is imaged to the line's middle. The middle was put on the pinhole to "
-        f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own. (2) "
-        "turns such an offset into a principal point, (3) leaves it in the distortion of every point. The constant "
-        f"finds it: {run.compensated.zero / ARCSEC:.2f} arcsec, "
-        f"{zero:+.3f} arcsec from the truth.",
-        "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
-        "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
-        "own truth.",
-        typeset(run.compensated.fit.point.statement),
+        f"direction that is imaged to the line's middle. The constant finds it {run.compensated.zero / ARCSEC:.3f} "
+        "arcsec from the zero that was given"
     )
-    estimates = Table(
-        "distortion-estimates",
-        "Equations (1) to (4) and fits with a constant",
-        "All with compensated angles. Errors are against the same estimate from exact chief rays at the true angles.",
+    text, caption = [f"{found}."], "All with compensated angles." if run.compensation is not None else ""
+    if isinstance(run, SimulatedDistortion):
+        off = (run.compensated.zero - run.truth.zero) / ARCSEC
+        text = [
+            f"{found}, {off:+.3f} arcsec from the truth: the middle was put on the pinhole to "
+            f"{run.truth.zero / ARCSEC:.2f} arcsec, and the compensation at that reading has an error of its own. (2) "
+            "turns such an offset into a principal point, (3) leaves it in the distortion of every point.",
+            "With a radial term f is another quantity, the slope in the middle of the field, and not the slope that "
+            "leaves the smallest distortion: the two differ by definition, and the error is counted against each one's "
+            "own truth.",
+        ]
+        caption += " Errors are against the same estimate from exact chief rays at the true angles."
+        heads, digits = (*heads, "error of f [mm]", "error of p [mm]", "error of D [µm rms]"), (*digits, 3, 2, 2)
+        errors = [(1e3 * (e.f - e.f_true), 1e3 * (e.p - e.p_true), 1e6 * e.error) for e in run.estimates.values()]
+        rows = [(*row, *error) for row, error in zip(rows, errors, strict=True)]
+    terms = [name.replace("_", " ") for name in data["covariance_terms"]]
+    covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
+    return Section(
+        "Estimators and what can be observed",
+        (*text, _typeset(run.compensated.fit.point.statement)),
         (
-            *("estimate", "f [mm]", "sigma of f [mm]", "error of f [mm]"),
-            *("p [mm]", "sigma of p [mm]", "error of p [mm]", "error of D [µm rms]"),
+            Table(
+                "distortion-estimates",
+                "Equations (1) to (4) and fits with a constant",
+                caption,
+                heads,
+                rows,
+                digits,
+            ),
+            Table(
+                "distortion-covariance",
+                "Covariance of constant, f and p",
+                "Square millimetres, all noise that is stated and found.",
+                ("", *terms),
+                covariance,
+            ),
         ),
-        rows,
-        (None, 4, 3, 3, 2, 2, 2, 2),
     )
-    return Section("Estimators and what can be observed", text, (estimates,))
 
 
-def _noise(run: SimulatedDistortion, data: Mapping[str, Any]) -> Section:
-    noise, truth = data["noise"], data["truth"]
-    plan = run.setup.turntable.dividing_error
-    about = run.compensated.fit.value("principal_distance")
-    text = (
-        f"One exposure scatters by {noise['exposure_um']:.2f} µm between the sets; the table's repeatability, "
-        f"{format_quantity(plan.repeatability, ANGLE)}, makes {1e6 * about * plan.repeatability:.2f} µm of it and "
-        f"noise of the frames {noise['centroid_um']:.3f} µm. Chauvenet's criterion takes out {noise['rejected']} of "
-        f"{run.record.reading.size} exposures, {noise['rejected_expected_of_good']:.0f} of them expected without any "
-        f"gross error; {truth['gross_errors']} had one.",
-        f"Differences of the line's columns move a spot by {noise['centroid_columns_um']:.3f} µm; every row of a TDI "
-        "line sees the same columns.",
-        f"Beyond this, points scatter by {noise['white_compensated_um']:.2f} µm about a smooth curve "
-        f"({noise['white_raw_um']:.2f} µm with angles as read): the subdivision error, which the calibration's steps "
-        "cannot see.",
-    )
-    figure = SvgFigure(
-        "distortion-spot",
-        "A spot, enlarged",
-        "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
-        "circle its window.",
-        spot_svg(run),
-    )
-    return Section("Spots and noise", text, (figure,))
+def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
+    noise, stated = data["noise"], data["stated_exposure_um"]
+    text = [
+        f"One spot scatters by {noise['exposure_um']:.3f} µm "
+        + ("between the sets" if run.reading.shape[1] > 1 else "by its stated sigmas")
+        + (f"; noise of its place makes {stated:.3f} µm of it" if stated > 0.0 else "")
+        + f". Beyond what is stated, points scatter by {noise['white_compensated_um']:.3f} µm about a smooth curve"
+        + ("." if run.compensation is None else f", {noise['white_raw_um']:.3f} µm with angles as read."),
+    ]
+    if data["across_range_um"] is not None:
+        text.append(f"Across the line the spots range over {data['across_range_um']:.0f} µm.")
+    causes = _shares(run)
+    total = sum(causes.values())
+    rows: list[tuple[Cell, ...]] = [
+        (name, 1e3 * float(np.sqrt(value)), 100.0 * value / total) for name, value in causes.items()
+    ]
+    artefacts: list[Artefact] = [
+        Table(
+            "distortion-causes",
+            "What limits the principal distance",
+            "Standard deviation by cause; their squares add up.",
+            ("cause", "sigma of f [mm]", "share of variance [%]"),
+            rows,
+            (None, 4, 1),
+        )
+    ]
+    if isinstance(run, SimulatedDistortion):
+        own = run.setup.turntable.dividing_error.repeatability
+        text.append(
+            f"The table's repeatability, {format_quantity(own, ANGLE)}, makes "
+            f"{1e6 * run.compensated.fit.value('principal_distance') * own:.2f} µm of the scatter between the sets; "
+            f"{data['truth']['gross_errors']} exposures had a gross error. What points scatter about a smooth curve is "
+            "the subdivision error, which the calibration's steps cannot see."
+        )
+        text.append(
+            f"Differences of the line's columns move a spot by {noise['centroid_columns_um']:.3f} µm; every row of a "
+            "TDI line sees the same columns."
+        )
+        artefacts.append(
+            SvgFigure(
+                "distortion-spot",
+                "A spot, enlarged",
+                "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
+                "circle its window.",
+                spot_svg(run),
+            )
+        )
+    gone = [*data.get("rejected_readings", ()), *data.get("rejected_comparisons", ())]
+    if gone:
+        lines: list[tuple[Cell, ...]] = [
+            (
+                Path(one["file"]).name,
+                one["line"],
+                one["reading_deg"],
+                f"{one['from_mean_um']:+.3f} µm" if "from_mean_um" in one else f"{one['from_mean_arcsec']:+.3f} arcsec",
+            )
+            for one in gone
+        ]
+        artefacts.append(
+            Table(
+                "distortion-rejected",
+                "Readings that Chauvenet's criterion takes out",
+                "Difference from the mean of those that stay.",
+                ("file", "line", "reading [deg]", "from the mean"),
+                lines,
+                (None, None, 6),
+            )
+        )
+    return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded=1 if gone else 0)

@@ -37,7 +37,7 @@ from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
-from scenes.specs.camera_tests import DistortionFiles, MeasuredDistortionSpec
+from scenes.specs.camera_tests import DistortionFiles, DistortionTestSpec, MeasuredDistortionSpec
 from scenes.specs.resolved import DistortionSetup, ExperimentSetup, MeasuredDistortionSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.laboratory.distortion_bench import DistortionBench, DistortionRecord, DistortionTruth
@@ -88,23 +88,32 @@ class Estimate(FoundEstimate):
     error: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class DistortionRun:
-    """One test, measured, whichever bench it comes from.
+    """One test, on a simulated bench or on measured angles and spots.
 
     Attributes:
+        test: what its file says.
         seed: of what was drawn.
+        about: principal distance, about, metres; it serves to see the scatter between sets.
         reading: of the turntable, (N, S), radians.
+        present: which exposures there are, (N, S).
         calibration: of the turntable; None if angles count as read.
         compensation: of its dividing error; None likewise.
         spots: as located.
         means: how sets are reduced.
         common: covariance of the mean angles, the same in all sets, (N, N), rad^2.
         raw, compensated: with angles as read, and freed from the dividing error; without a calibration the same.
+        stated: the smooth model's fit with nothing but the stated noise, for its chi-square.
+        readings: the table of spots as read from files; None for a simulated bench.
+        tables: of the turntable's calibration, as read from files.
     """
 
+    test: DistortionTestSpec | MeasuredDistortionSpec
     seed: int
+    about: float
     reading: Array
+    present: NDArray[np.bool_]
     calibration: CalibrationSeries | None
     compensation: DividingCompensation | None
     spots: Spots
@@ -112,6 +121,14 @@ class DistortionRun:
     common: Array
     raw: Distortion
     compensated: Distortion
+    stated: InteriorOrientation
+    readings: SpotReadings | None = None
+    tables: tuple[Comparisons, ...] = ()
+
+    @property
+    def rejected(self) -> NDArray[np.bool_]:
+        """Exposures that Chauvenet's criterion takes out, (N, S)."""
+        return self.present & ~self.means.keep
 
     @cached_property
     def line(self) -> LineOrientation:
@@ -132,36 +149,9 @@ class DistortionRun:
         return out
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredDistortion(DistortionRun):
-    """A test on measured angles and spots.
-
-    Attributes:
-        spec: of the test.
-        readings: the table of spots as read.
-        tables: of the turntable's calibration, as read.
-        stated: the smooth model's fit with nothing but the stated noise, for its chi-square.
-    """
-
-    spec: MeasuredDistortionSpec
-    readings: SpotReadings
-    tables: tuple[Comparisons, ...]
-    stated: InteriorOrientation
-
-    @property
-    def present(self) -> NDArray[np.bool_]:
-        """Which exposures there are, (N, S)."""
-        return np.ones(self.reading.shape, bool) if self.readings.present is None else self.readings.present
-
-    @property
-    def rejected(self) -> NDArray[np.bool_]:
-        """Those that Chauvenet's criterion takes out, (N, S)."""
-        return self.present & ~self.means.keep
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class SimulatedDistortion(DistortionRun):
-    """A test on the simulated bench.
+    """A test on the simulated bench, which also knows the truth.
 
     Attributes:
         bench: with all that was set up.
@@ -280,24 +270,45 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
     # scatter only
     args = record.reading, spots, setup.turntable.camera_angle, bench.path.model.line_focal_length
     try:
-        means, common, raw, compensated = reduce(*args, compensation)
+        return SimulatedDistortion(
+            test=setup.test,
+            seed=seed,
+            calibration=series,
+            compensation=compensation,
+            bench=bench,
+            record=record,
+            truth=truth,
+            table=table,
+            **_reduced(*args, compensation),
+        )
     except OrientationError as error:
         raise BenchError(str(error), ("points",), f"{len(SMOOTH) + 1} or more, over the whole field") from error
-    return SimulatedDistortion(
-        seed=seed,
-        reading=record.reading,
-        calibration=series,
-        compensation=compensation,
-        spots=spots,
-        means=means,
-        common=common,
-        raw=raw,
-        compensated=compensated,
-        bench=bench,
-        record=record,
-        truth=truth,
-        table=table,
-    )
+
+
+def _reduced(
+    reading: Array,
+    spots: Spots,
+    zero: float,
+    about: float,
+    compensation: DividingCompensation | None,
+    angle_sigma: float = 0.0,
+    reverse: bool = False,
+    present: NDArray[np.bool_] | None = None,
+) -> dict[str, Any]:
+    """What every run has of its readings and spots, as `reduce` and the fit with the stated noise alone make it."""
+    means, common, raw, compensated = reduce(reading, spots, zero, about, compensation, angle_sigma, reverse, present)
+    fit = compensated.fit
+    return {
+        "reading": reading,
+        "spots": spots,
+        "about": about,
+        "present": np.ones(reading.shape, bool) if present is None else present,
+        "means": means,
+        "common": common,
+        "raw": raw,
+        "compensated": compensated,
+        "stated": fit_interior_orientation(fit.position, fit.angle, means.sigma, SMOOTH, angle_covariance=common),
+    }
 
 
 def reduce(
@@ -343,7 +354,7 @@ def reduce(
     return means, common, *measured
 
 
-def measure_files(spec: MeasuredDistortionSpec, seed: int) -> MeasuredDistortion:
+def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     """Read the angles and spots, and do the same with them.
 
     Raises:
@@ -354,44 +365,29 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> MeasuredDistortion
     compensation, series = None, None
     tables: tuple[Comparisons, ...] = ()
     if files.turntable is not None:
-        cal, held = read_turntable(files.turntable)
-        series, tables = cal.series, (cal,) if held is None else (cal, held)
+        tables = read_turntable(files.turntable)
+        cal, *held = tables
+        series = cal.series
         _check_region(files, found, series)
         names, _ = usable_fits(files.turntable, cal, CLOSED_FORMS)
         choice = choose(series, seed, names, files.turntable.folds)
-        compensation = compensate(series, choice, None if held is None else held.series)
+        compensation = compensate(series, choice, held[0].series if held else None)
     _check_angles(files, found)
+    scatter = files.angle_sigma or 0.0, files.reversed, found.present
     try:
-        means, common, raw, compensated = reduce(
-            found.reading,
-            found.spots,
-            files.zero,
-            spec.focal_length,
-            compensation,
-            files.angle_sigma or 0.0,
-            files.reversed,
-            found.present,
-        )
-        fit = compensated.fit
-        stated = fit_interior_orientation(fit.position, fit.angle, means.sigma, SMOOTH, angle_covariance=common)
+        reduced = _reduced(found.reading, found.spots, files.zero, spec.focal_length, compensation, *scatter)
     except OrientationError as error:
         text = str(error).removeprefix("interior orientation: ")
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
         raise files.error(text, ("spots",), allowed=allowed) from error
-    return MeasuredDistortion(
+    return DistortionRun(
+        test=spec,
         seed=seed,
-        reading=found.reading,
         calibration=series,
         compensation=compensation,
-        spots=found.spots,
-        means=means,
-        common=common,
-        raw=raw,
-        compensated=compensated,
-        spec=spec,
         readings=found,
         tables=tables,
-        stated=stated,
+        **reduced,
     )
 
 

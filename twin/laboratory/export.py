@@ -27,7 +27,7 @@ from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
 from twin.laboratory.distortion_run import SimulatedDistortion
 from twin.laboratory.focus_alignment import Alignment, State, recorder_of
-from twin.laboratory.turntable_run import SimulatedTurntable
+from twin.laboratory.turntable_run import TurntableRun
 from twin.run.data_files import FrameFacts, csv_table, tiff
 
 __all__ = ["export_distortion", "export_focus", "export_turntable"]
@@ -38,13 +38,15 @@ COMPARISONS, HELD_OUT, SPOTS = "comparisons.csv", "held_out.csv", "spots.csv"
 """Names of tables."""
 
 
-def export_turntable(run: SimulatedTurntable) -> Files:
-    """Comparisons, held-out comparisons and ``turntable.yaml``."""
+def export_turntable(run: TurntableRun) -> Files:
+    """Comparisons, held-out comparisons of a simulated bench and ``turntable.yaml``."""
     spec = run.spec
+    assert isinstance(spec, TurntableTestSpec)
+    assert run.held_out is not None
     out: dict[str, str | bytes] = {}
     files = _turntable_files(out, spec, run.series, run.held_out)
     test = MeasuredTurntableSpec.model_construct(
-        name="turntable", description=spec.description, measured=files, seed=run.model.seed
+        name="turntable", description=spec.description, measured=files, seed=run.seed
     )
     return {**out, "turntable.yaml": _text(test)}
 

@@ -15,10 +15,12 @@ from analysis.focal_plane.through_focus import QUARTIC, FocusVertex
 from analysis.units import ARCMIN
 from analysis.units import UM_PER_M as UM
 from scenes.yaml.units import LENGTH, format_quantity
+from twin.laboratory.focus_alignment import Alignment
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_plots import FIELD_COLOURS
+from twin.laboratory.focus_report import focus_report
 from twin.laboratory.measured_focus import MeasuredAlignment
-from twin.laboratory.turntable_measured_report import DOUBTFUL
+from twin.laboratory.turntable_report import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import GREY, INK, look, new_figure, plain_axes, to_svg
@@ -30,6 +32,11 @@ MOVED = {
     "focal_plane": "CCD, along the light",
 }
 _COLUMNS, _MOST_PANELS = 5, 10
+
+
+def any_focus_report(run: Alignment | MeasuredAlignment) -> Report:
+    """Report of an alignment on a simulated bench or of a measured one."""
+    return measured_focus_report(run) if isinstance(run, MeasuredAlignment) else focus_report(run)
 
 
 def measured_focus_report(run: MeasuredAlignment) -> Report:

@@ -12,13 +12,11 @@ from analysis.focal_plane.through_focus import FocusVertex
 from analysis.units import ARCMIN, ARCSEC
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
-from scenes.specs.resolved import ExperimentSetup, FocusSetup, resolve_focus_test
 from twin.laboratory.focus_alignment import Alignment, Shimming, State
 from twin.laboratory.focus_scan import VERTEX_ERROR
-from twin.laboratory.measured_focus import MeasuredAlignment, run_focus_test
+from twin.laboratory.measured_focus import MeasuredAlignment
 from twin.laboratory.turntable_numbers import FileNumbers
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 from twin.targets.edge_images import ALONG, TRACK
 
 
@@ -403,8 +401,3 @@ def focus_numbers(alignment: Alignment | MeasuredAlignment) -> dict[str, Any]:
     if isinstance(alignment, MeasuredAlignment):
         return dict(plain_data(MeasuredFocusNumbers.of(alignment)))
     return dict(plain_data(FocusNumbers.of(alignment)))
-
-
-FOCUS = Procedure[ExperimentSetup[Any], Alignment | MeasuredAlignment](
-    "focus", FocusSetup, resolve_focus_test, run_focus_test, focus_numbers
-)

@@ -109,15 +109,15 @@ class SpotReadings:
     head: str
 
 
-def read_turntable(files: TurntableFiles) -> tuple[Comparisons, Comparisons | None]:
-    """The calibration of a turntable, and the series at held-out readings if there is one.
+def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
+    """The calibration of a turntable and, if there is one, the series at held-out readings.
 
     Raises:
         InputError: a table that cannot be used, with file, line and column.
     """
     series = read_comparisons(files.comparisons, files.reference)
     if files.held_out is None:
-        return series, None
+        return (series,)
     held_out = read_comparisons(files.held_out, files.reference, fewest=1)
     first, last = series.series.angle[[0, -1]]
     beyond = (held_out.series.angle < first) | (held_out.series.angle > last)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from analysis.turntable.angle_fits import AngleFit
 from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections
 from analysis.units import ARCSEC
-from scenes.specs.resolved import ExperimentSetup, TurntableSetup, resolve_turntable_test
 from twin.laboratory.measured_readings import Comparisons
-from twin.laboratory.turntable_run import MeasuredTurntable, SimulatedTurntable, TurntableRun, rms, run_turntable_test
-from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
+from twin.laboratory.turntable_bench import TurntableModel
+from twin.laboratory.turntable_run import TurntableRun, rms
+from twin.run.plain_data import WHERE_KNOWN, plain_data
 
 Array = NDArray[np.float64]
 
@@ -103,8 +102,8 @@ class TurntableTruth:
     part_rms_full_circle_arcsec: Mapping[str, float]
 
     @classmethod
-    def of(cls, run: SimulatedTurntable) -> TurntableTruth:
-        """Of a run."""
+    def of(cls, run: TurntableRun, model: TurntableModel) -> TurntableTruth:
+        """Of a run on a simulated table."""
         fits = {}
         for name, fit in run.fits.items():
             left = fit(run.truth_readings) - run.true_error
@@ -112,39 +111,8 @@ class TurntableTruth:
         return cls(
             fits=fits,
             dividing_error_spread_arcsec=float(np.std(run.true_error)) / ARCSEC,
-            part_rms_full_circle_arcsec={name: p.rms / ARCSEC for name, p in run.model.error.parts.items()},
+            part_rms_full_circle_arcsec={name: p.rms / ARCSEC for name, p in model.error.parts.items()},
         )
-
-
-@dataclass(frozen=True)
-class TurntableNumbers:
-    """turntable.json. The four RMS at the top are the largest of any angle."""
-
-    name: str
-    seed: int
-    repeat_rms_arcsec: float
-    chauvenet_rms_arcsec: float
-    averaging_alone_rms_arcsec: float
-    mean_rms_arcsec: float
-    repeatability_arcsec: float
-    rejected: int
-    rejected_expected_of_good: float
-    suspect_angles: int
-    heldout_sigma_arcsec: float | None
-    fits: Mapping[str, FitNumbers]
-    failed: Mapping[str, str | None]
-    chosen: str
-    ranking: Sequence[str]
-    compensation: CompensationNumbers
-    points: tuple[PointNumbers, ...]
-    heldout_points: tuple[PointNumbers, ...]
-
-
-@dataclass(frozen=True)
-class SimulatedTurntableNumbers(TurntableNumbers):
-    """turntable.json of a simulated bench."""
-
-    truth: TurntableTruth
 
 
 @dataclass(frozen=True)
@@ -181,73 +149,76 @@ class RejectedNumbers:
 
 
 @dataclass(frozen=True)
-class MeasuredTurntableNumbers(TurntableNumbers):
-    """turntable.json of measurements. Chi-square of the chosen fit: against the sigmas of the calibrated means; at the
-    held-out readings against all that the compensation states.
+class TurntableNumbers:
+    """turntable.json. The four RMS at the top are the largest of any angle. Chi-square of the chosen fit: against the
+    sigmas of the calibrated means; at the held-out readings against all that the compensation states.
     """
 
+    name: str
+    seed: int
+    repeat_rms_arcsec: float
+    chauvenet_rms_arcsec: float
+    averaging_alone_rms_arcsec: float
+    mean_rms_arcsec: float
+    repeatability_arcsec: float
+    rejected: int
+    rejected_expected_of_good: float
+    suspect_angles: int
+    heldout_sigma_arcsec: float | None
+    fits: Mapping[str, FitNumbers]
+    failed: Mapping[str, str | None]
+    chosen: str
+    ranking: Sequence[str]
+    compensation: CompensationNumbers
+    points: tuple[PointNumbers, ...]
+    heldout_points: tuple[PointNumbers, ...]
     fit_chi_square: float
     fit_degrees_of_freedom: float
     heldout_chi_square: float | None
     heldout_degrees_of_freedom: int | None
-    rejected_readings: tuple[RejectedNumbers, ...]
-    too_few_angles_for: Sequence[str]
-    files: tuple[FileNumbers, ...]
+    rejected_readings: tuple[RejectedNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
+    too_few_angles_for: Sequence[str] | None = field(default=None, metadata=WHERE_KNOWN)
+    files: tuple[FileNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
+    truth: TurntableTruth | None = field(default=None, metadata=WHERE_KNOWN)
 
     @classmethod
-    def of(cls, run: MeasuredTurntable) -> MeasuredTurntableNumbers:
+    def of(cls, run: TurntableRun) -> TurntableNumbers:
         """Of a run."""
+        series, compensation, tables = run.series, run.compensation, run.tables
         square, freedom = run.chi_square
         held, held_freedom = run.held_out_chi_square or (None, None)
-        tables = [table for table in (run.comparisons, run.held_out_comparisons) if table is not None]
         return cls(
-            **_found(run, run.spec.name, run.seed),
+            name=run.spec.name,
+            seed=run.seed,
+            repeat_rms_arcsec=float(np.max(series.rms_before)) / ARCSEC,
+            chauvenet_rms_arcsec=float(np.max(series.rms_after)) / ARCSEC,
+            averaging_alone_rms_arcsec=series.averaging_alone / ARCSEC,
+            mean_rms_arcsec=series.mean_rms / ARCSEC,
+            repeatability_arcsec=series.repeatability / ARCSEC,
+            rejected=series.rejected,
+            rejected_expected_of_good=expected_rejections(series.counts),
+            suspect_angles=int(np.sum(series.suspect)),
+            heldout_sigma_arcsec=None if run.held_out is None else rms(run.held_out.sigma) / ARCSEC,
+            fits={name: FitNumbers.of(run, name) for name in run.fits},
+            failed={trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
+            chosen=run.choice.chosen,
+            ranking=run.ranking,
+            compensation=CompensationNumbers(
+                compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
+            ),
+            points=PointNumbers.of(series, run.fits),
+            heldout_points=() if run.held_out is None else PointNumbers.of(run.held_out, run.fits),
             fit_chi_square=square,
             fit_degrees_of_freedom=freedom,
             heldout_chi_square=held,
             heldout_degrees_of_freedom=held_freedom,
-            rejected_readings=tuple(one for table in tables for one in RejectedNumbers.of(table)),
-            too_few_angles_for=run.too_few,
-            files=tuple(FileNumbers(**asdict(table.file)) for table in tables),
+            rejected_readings=tuple(one for table in tables for one in RejectedNumbers.of(table)) if tables else None,
+            too_few_angles_for=run.too_few if tables else None,
+            files=tuple(FileNumbers(**asdict(table.file)) for table in tables) or None,
+            truth=None if run.model is None else TurntableTruth.of(run, run.model),
         )
-
-
-def _found(run: TurntableRun, name: str, seed: int) -> dict[str, Any]:
-    """Fields of `TurntableNumbers`."""
-    series, compensation = run.series, run.compensation
-    return {
-        "name": name,
-        "seed": seed,
-        "repeat_rms_arcsec": float(np.max(series.rms_before)) / ARCSEC,
-        "chauvenet_rms_arcsec": float(np.max(series.rms_after)) / ARCSEC,
-        "averaging_alone_rms_arcsec": series.averaging_alone / ARCSEC,
-        "mean_rms_arcsec": series.mean_rms / ARCSEC,
-        "repeatability_arcsec": series.repeatability / ARCSEC,
-        "rejected": series.rejected,
-        "rejected_expected_of_good": expected_rejections(series.counts),
-        "suspect_angles": int(np.sum(series.suspect)),
-        "heldout_sigma_arcsec": None if run.held_out is None else rms(run.held_out.sigma) / ARCSEC,
-        "fits": {name: FitNumbers.of(run, name) for name in run.fits},
-        "failed": {trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
-        "chosen": run.choice.chosen,
-        "ranking": run.ranking,
-        "compensation": CompensationNumbers(
-            compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
-        ),
-        "points": PointNumbers.of(series, run.fits),
-        "heldout_points": () if run.held_out is None else PointNumbers.of(run.held_out, run.fits),
-    }
 
 
 def turntable_numbers(run: TurntableRun) -> dict[str, Any]:
     """Contents of turntable.json without its frames."""
-    if isinstance(run, MeasuredTurntable):
-        return dict(plain_data(MeasuredTurntableNumbers.of(run)))
-    assert isinstance(run, SimulatedTurntable)
-    found = _found(run, run.spec.name, run.model.seed)
-    return dict(plain_data(SimulatedTurntableNumbers(**found, truth=TurntableTruth.of(run))))
-
-
-TURNTABLE = Procedure[ExperimentSetup[Any], TurntableRun](
-    "turntable", TurntableSetup, resolve_turntable_test, run_turntable_test, turntable_numbers
-)
+    return dict(plain_data(TurntableNumbers.of(run)))

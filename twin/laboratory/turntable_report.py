@@ -1,17 +1,23 @@
-"""Report of a turntable test: the main table, figures, sections."""
+"""Report of a turntable test: what was found, how well, and what limits it; of a simulated table also beside its
+truth.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from analysis.units import ARCSEC
+from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
+from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_numbers import turntable_numbers
-from twin.laboratory.turntable_run import SimulatedTurntable, TurntableRun
-from twin.run.artefact import SvgFigure, Table
+from twin.laboratory.turntable_run import TurntableRun
+from twin.run.artefact import Artefact, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 
@@ -34,6 +40,8 @@ COLOURS = {
     "fourier": GREEN,
     "network": VERMILION,
 }
+DOUBTFUL = 1e-3
+"""Chance below which a chi-square is told as a warning."""
 _CURVE_POINTS = 801
 
 
@@ -70,8 +78,8 @@ def curve_figure(run: TurntableRun) -> Figure:
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     figure = new_figure(3.6)
     axes = figure.subplots()
-    if isinstance(run, SimulatedTurntable):
-        axes.plot(np.degrees(at), _slow_truth(run, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
+    if run.model is not None:
+        axes.plot(np.degrees(at), _slow_truth(run.model, at) / ARCSEC, color=INK, lw=2.4, alpha=0.35, label="truth")
     fitted = run.fits[chosen](at) / ARCSEC
     axes.plot(np.degrees(at), fitted, color=COLOURS[chosen], lw=1.1, label=f"chosen fit: {FIT_NAMES[chosen]}")
     for points, mark, colour, label in ((series, "o", INK, "calibrated"), (held, "s", VERMILION, "held out")):
@@ -101,7 +109,7 @@ def residual_figure(run: TurntableRun) -> Figure:
     at = np.linspace(*run.compensation.region, _CURVE_POINTS)
     held = run.held_out
     assert held is not None
-    truth = _slow_truth(run, at) if isinstance(run, SimulatedTurntable) else None
+    truth = None if run.model is None else _slow_truth(run.model, at)
     most = 1.15 * max(float(np.max(np.abs(run.held_out_residual(name)))) for name in run.ranking) / ARCSEC
     figure = new_figure(1.35 * len(run.ranking) + 0.5)
     panels = np.atleast_1d(figure.subplots(len(run.ranking), 1, sharex=True, sharey=True))
@@ -138,9 +146,9 @@ def figure_svg(name: str, run: TurntableRun) -> str:
         return to_svg(draw(run))
 
 
-def _slow_truth(run: SimulatedTurntable, at: np.ndarray) -> np.ndarray:
+def _slow_truth(model: TurntableModel, at: np.ndarray) -> np.ndarray:
     """True dividing error without the subdivision error, whose period is far below what a figure can show."""
-    error = run.model.error
+    error = model.error
     return error(at) - error.parts["subdivision"](at)
 
 
@@ -150,24 +158,23 @@ def _finish(*panels: Axes) -> None:
         plain_axes(axes)
 
 
-def sections(run: SimulatedTurntable, result: Mapping[str, Any]) -> tuple[Section, ...]:
-    """Comparison, and fits; result: the run's numbers."""
-    return comparison_section(run, result, _steps(run)), _fits(run, result)
-
-
-def _steps(run: SimulatedTurntable) -> str:
+def _readings(run: TurntableRun) -> str:
     """Which readings were compared."""
-    plan = run.spec.calibration
-    region = f"{format_quantity(plan.first, ANGLE)} to {format_quantity(plan.last, ANGLE)}"
-    return f"{region} in steps of {format_quantity(plan.step, ANGLE)}: {plan.count} readings, {plan.repeats} repeats"
+    series = run.series
+    first, last = np.degrees(run.compensation.region)
+    least, most = int(np.min(series.counts)), int(np.max(series.counts))
+    repeats = f"{most}" if least == most else f"{least} to {most}"
+    return (
+        f"{first:.6g} deg to {last:.6g} deg, {np.degrees(series.step):.4g} deg apart in the median: "
+        f"{len(series.angle)} readings, {repeats} repeats"
+    )
 
 
-def comparison_section(run: TurntableRun, result: Mapping[str, Any], readings: str) -> Section:
-    """The comparisons; readings: which were compared, in words."""
+def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     series = run.series
     text = [
         f"The dividing error is the table's reading minus its true angle. It is compared with a polygon and an "
-        f"autocollimator from {readings}.",
+        f"autocollimator from {_readings(run)}.",
         f"Chauvenet's criterion rejects {series.rejected} of {np.sum(series.taken)} comparisons. It would reject "
         f"{result['rejected_expected_of_good']:.0f} on average if all were good: it trims normal noise, and the RMS "
         f"that remains is that of trimmed readings. All angles together, corrected for this, one comparison has "
@@ -203,115 +210,193 @@ def comparison_section(run: TurntableRun, result: Mapping[str, Any], readings: s
     return Section("Regional comparison of the turntable", tuple(text), (figure, table))
 
 
-def _fits(run: SimulatedTurntable, result: Mapping[str, Any]) -> Section:
-    fits, truth = result["fits"], result["truth"]["fits"]
-    chosen, best = result["chosen"], result["ranking"][0]
-    held = fits[chosen]["heldout_rms_arcsec"]
-    subdivision = run.spec.dividing_error.subdivision
-    periods = run.spec.calibration.step / subdivision.period
+def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
+    fits, chosen, held, model = result["fits"], result["chosen"], run.held_out, run.model
+    best = result["ranking"][0]
+    judged = (
+        "ranked by cross-validation: there are no held-out readings, so that an error with a period below the step "
+        "stays unseen"
+        if held is None
+        else f"ranked at {len(held.angle)} held-out readings, measured in a series of their own with "
+        f"σ = {result['heldout_sigma_arcsec']:.4f} arcsec each"
+    )
+    misses = (
+        "" if held is None else f"; it has {fits[chosen]['heldout_rms_arcsec']:.4f} arcsec at the held-out readings"
+    )
     text = [
-        f"Five fits of the means, ranked at {len(run.held_out.angle)} held-out readings in the middle of the steps, "
-        f"measured in a series of their own with σ = {result['heldout_sigma_arcsec']:.4f} arcsec each. "
-        f"Cross-validation on the calibration points alone chooses the {FIT_NAMES[chosen]}; it has {held:.4f} arcsec "
-        "at the held-out readings." + ("" if best == chosen else f" There the {FIT_NAMES[best]} is the best.")
+        f"Fits of the means, {judged}. Cross-validation on the calibration points alone chooses the "
+        f"{FIT_NAMES[chosen]}{misses}."
+        + ("" if held is None or best == chosen else f" There the {FIT_NAMES[best]} is the best."),
+        "A compensated angle keeps an error, the same whenever its reading comes back: the noise of the calibration "
+        "that the fit passes on, and three misfits beyond it. The repeatability of a reading in use comes "
+        "on top and averages out.",
     ]
-    if abs(periods - round(periods)) < 1e-6:
-        text.append(
-            f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
-            f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and cannot "
-            "see the subdivision error. The held-out readings lie at all phases, as the readings in use do: what no "
-            "fit can follow is in their residuals."
+    if model is not None:
+        subdivision = model.spec.dividing_error.subdivision
+        periods = model.spec.calibration.step / subdivision.period
+        if abs(periods - round(periods)) < 1e-6:
+            text.append(
+                f"A step of the calibration is {round(periods)} whole periods of the grating's signal "
+                f"({subdivision.period / ARCSEC:.4g} arcsec), so that all calibration points lie at one phase and "
+                "cannot see the subdivision error. The held-out readings lie at all phases, as the readings in use do: "
+                "what no fit can follow is in their residuals."
+            )
+    text += [f"The {FIT_NAMES[name]} failed: {failure}." for name, failure in result["failed"].items()]
+    drawn = "the chosen fit" if model is None else "the chosen fit and the true curve without its subdivision error"
+    artefacts: list[Artefact] = [
+        SvgFigure(
+            "turntable-curve",
+            "Dividing error",
+            f"Means with their sigmas (the scatter of the repeats and the reference), {drawn}.",
+            figure_svg("curve", run),
+        ),
+    ]
+    if held is not None:
+        note = "Squares: held-out readings minus the fit, with the sigma of the measurement."
+        note += "" if model is None else " Lines: true curve without subdivision error minus the fit."
+        artefacts.append(SvgFigure("turntable-residuals", "What the fits miss", note, figure_svg("residuals", run)))
+    artefacts += [_ranking(result), _left(run, result), _chi_square(run, result)]
+    gone = result.get("rejected_readings")
+    if gone:
+        lines = [(Path(one["file"]).name, one["line"], one["reading_deg"], one["from_mean_arcsec"]) for one in gone]
+        artefacts.append(
+            Table(
+                "turntable-rejected",
+                "Comparisons that Chauvenet's criterion takes out",
+                "Difference from the mean of those that stay.",
+                ("file", "line", "reading [deg]", "from the mean [arcsec]"),
+                lines,
+                (None, None, 6, 3),
+            )
         )
-    for name, failure in result["failed"].items():
-        text.append(f"The {FIT_NAMES[name]} failed: {failure}.")
+    return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
+
+
+def _ranking(result: Mapping[str, Any]) -> Table:
+    """All fits, the best first; of a simulated table also against the truth."""
+    fits, truth = result["fits"], result.get("truth")
+    keys = ("heldout_rms_arcsec", "train_rms_arcsec", "cross_validation_rms_arcsec", "effective_parameters")
+    heads: tuple[str, ...] = ("rank", "fit", "held out", "training points", "cross-validation", "effective parameters")
     rows = [
-        (
-            rank,
-            FIT_NAMES[name],
-            fits[name]["heldout_rms_arcsec"],
-            fits[name]["train_rms_arcsec"],
-            fits[name]["cross_validation_rms_arcsec"],
-            fits[name]["effective_parameters"],
-            truth[name]["true_rms_arcsec"],
-            truth[name]["true_spread_arcsec"],
-        )
-        for rank, name in enumerate(result["ranking"], 1)
+        (rank, FIT_NAMES[name], *(fits[name][key] for key in keys)) for rank, name in enumerate(result["ranking"], 1)
     ]
-    heads = ("rank", "fit", "held out", "training points", "cross-validation", "effective parameters")
-    table = Table(
-        "turntable-fits",
-        "The five fits, ranked at the held-out readings",
-        "RMS, arcsec. The last two columns use the true curve, which no test in a laboratory has: over the whole "
-        "region and all phases of the signal, and the same without a constant, which differences of angles do not see.",
-        (*heads, "truth", "truth, no constant"),
+    note = "RMS, arcsec."
+    digits: tuple[int | None, ...] = (None, None, 4, 4, 4, 1)
+    if truth is not None:
+        note += (
+            " The last two columns use the true curve, which no test in a laboratory has: over the whole region and "
+            "all phases of the signal, and the same without a constant, which differences of angles do not see."
+        )
+        heads, digits = (*heads, "truth", "truth, no constant"), (*digits, 4, 4)
+        own = [truth["fits"][name] for name in result["ranking"]]
+        rows = [(*row, one["true_rms_arcsec"], one["true_spread_arcsec"]) for row, one in zip(rows, own, strict=True)]
+    return Table("turntable-fits", "The fits", note, heads, rows, digits)
+
+
+def _noise(run: TurntableRun) -> float:
+    """Sigma that noise of the calibration leaves in a compensated angle, mean over its readings, arcsec."""
+    return float(np.sqrt(np.mean(np.diag(run.compensation.fit.covariance(run.series.angle))))) / ARCSEC
+
+
+def _left(run: TurntableRun, result: Mapping[str, Any]) -> Table:
+    parts = result["compensation"]
+    return Table(
+        "turntable-sigma",
+        "What is left of a compensated angle, σ",
+        "Noise: of the calibration, mean over its readings. Common: a constant, which no difference sees. "
+        "Smooth: along the curve over one step. White: new from reading to reading, as the subdivision error is.",
+        ("part", "arcsec"),
+        (
+            ("noise of the calibration", _noise(run)),
+            ("common", parts["common_arcsec"]),
+            ("smooth", parts["smooth_arcsec"]),
+            ("white", parts["white_arcsec"]),
+            ("repeatability of one comparison, not in it", result["repeatability_arcsec"]),
+        ),
+        (None, 4),
+    )
+
+
+def _chi_square(run: TurntableRun, result: Mapping[str, Any]) -> Table:
+    calibrated = f"chosen fit at {len(run.series.angle)} calibrated readings, sigmas of the means"
+    rows = [(calibrated, result["fit_chi_square"], result["fit_degrees_of_freedom"])]
+    if run.held_out is not None:
+        held = f"at {len(run.held_out.angle)} held-out readings, all that the compensation states"
+        rows.append((held, result["heldout_chi_square"], result["heldout_degrees_of_freedom"]))
+    return Table(
+        "turntable-chi-square",
+        "Chi-square",
+        "Far above the degrees of freedom, the fit misses more than noise; the misfits stand for it.",
+        ("of", "chi-square", "degrees of freedom"),
         rows,
-        (None, None, 4, 4, 4, 1, 4, 4),
+        (None, 1, 1),
     )
-    curve = SvgFigure(
-        "turntable-curve",
-        "Dividing error",
-        "Means with their sigmas (the scatter of the repeats and the reference), the chosen fit and the true curve "
-        "without its subdivision error.",
-        figure_svg("curve", run),
-    )
-    residuals = SvgFigure(
-        "turntable-residuals",
-        "What the fits miss",
-        "Squares: held-out readings minus the fit, with the sigma of the measurement. Lines: true curve without "
-        "subdivision error minus the fit.",
-        figure_svg("residuals", run),
-    )
-    return Section("Fits of the dividing error", tuple(text), (curve, residuals, table))
 
 
-def turntable_report(run: SimulatedTurntable) -> Report:
-    """Report of a simulated turntable test."""
-    data = turntable_numbers(run)
-    plan = run.spec.calibration
-    chosen = data["chosen"]
-    held = data["fits"][chosen]["heldout_rms_arcsec"]
-    best = data["ranking"][0]
-    also = "" if best == chosen else f"there the {FIT_NAMES[best]} is the best of the five"
+def turntable_report(run: TurntableRun) -> Report:
+    """Report of a turntable test."""
+    data, spec = turntable_numbers(run), run.spec
+    chosen, parts, truth = data["chosen"], data["compensation"], data.get("truth")
+    sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
+    names = {"common": "an offset common to all readings", "smooth": "what the fit misses between its points"}
+    names["white"] = "what changes from reading to reading"
+    size = {part: parts[f"{part}_arcsec"] for part in names}
+    worst = max(size, key=lambda part: size[part])
+    limit = names[worst] if size[worst] > _noise(run) else "the noise of the calibration"
+    span = float(np.ptp(run.series.mean)) / ARCSEC
+    missed = data["fits"][chosen]["heldout_rms_arcsec"]
+    judged = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
+    judged += "" if truth is None else f" and the truth by {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec"
     verdict = one_sentence(
-        f"Cross-validation chooses the {FIT_NAMES[chosen]}, which misses held-out angles by {held:.3f} arcsec RMS",
-        also,
-        f"repeats scatter by {data['repeat_rms_arcsec']:.3f} arcsec RMS at worst, {data['chauvenet_rms_arcsec']:.3f} "
-        "arcsec after Chauvenet's criterion, see what the fits miss",
+        f"The dividing error spans {span:.2f} arcsec; the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec"
+        f"{judged}, limited by {limit}",
+        f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec, {data['rejected']} of "
+        f"{int(np.sum(run.series.taken))} comparisons rejected where "
+        f"{data['rejected_expected_of_good']:.0f} are expected of good ones, see what is left of a compensated angle",
     )
     rows = [
-        ("repeats, largest RMS of an angle", _text(data["repeat_rms_arcsec"])),
-        ("the same after Chauvenet's criterion", _text(data["chauvenet_rms_arcsec"])),
-        ("what averaging alone gives", _text(data["averaging_alone_rms_arcsec"])),
+        ("repeats, largest RMS of an angle", fixed(data["repeat_rms_arcsec"], 3)),
+        ("the same after Chauvenet's criterion", fixed(data["chauvenet_rms_arcsec"], 3)),
+        ("what averaging alone gives", fixed(data["averaging_alone_rms_arcsec"], 3)),
+        ("one comparison, σ of all angles together", fixed(data["repeatability_arcsec"], 3)),
+        ("compensated angle, σ, mean over the readings", fixed(sigma, 3)),
     ]
+    key = "cross_validation_rms_arcsec" if run.held_out is None else "heldout_rms_arcsec"
+    by = "by cross-validation" if run.held_out is None else "on held-out angles"
     rows += [
-        (
-            f"{FIT_NAMES[name]} on held-out angles{', chosen' if name == chosen else ''}",
-            _text(data["fits"][name]["heldout_rms_arcsec"]),
-        )
+        (f"{FIT_NAMES[name]} {by}{', chosen' if name == chosen else ''}", fixed(data["fits"][name][key], 3))
         for name in data["ranking"]
     ]
+    certified = spec.measured.reference if isinstance(spec, MeasuredTurntableSpec) else spec.reference.calibration
     return Report(
         "Dividing error of the turntable",
         verdict,
         (),
         (
-            (
-                "Calibration",
-                f"{format_quantity(plan.first, ANGLE)} to {format_quantity(plan.last, ANGLE)} every "
-                f"{format_quantity(plan.step, ANGLE)}, {plan.repeats} repeats",
-            ),
-            ("Description", run.spec.description),
+            ("Calibration", _readings(run)),
+            ("Reference", f"its certificate: {format_quantity(certified, ANGLE)} at each position"),
+            *(("File", f"{one['file']}, {one['rows']} rows") for one in data.get("files", ())),
+            ("Description", spec.description),
         ),
-        Table(
-            "dividing-error",
-            "Result",
-            "Fits in the order of their RMS on held-out angles.",
-            ("RMS", "arcsec"),
-            rows,
-        ),
-        sections(run, data),
+        Table("dividing-error", "Result", f"Fits in the order of their RMS {by}.", ("RMS", "arcsec"), rows),
+        (_comparison(run, data), _fits(run, data)),
+        warnings=_warnings(run, data),
     )
 
 
-def _text(arcsec: float) -> str:
-    return f"{arcsec:.3f}"
+def _warnings(run: TurntableRun, data: Mapping[str, Any]) -> tuple[str, ...]:
+    warnings = []
+    if run.too_few:
+        warnings.append(f"too few angles for: {', '.join(FIT_NAMES[name] for name in run.too_few)}")
+    if run.held_out is None:
+        warnings.append(
+            "no held-out readings: an error with a period below the step, as the subdivision error, is in no sigma here"
+        )
+    elif (tail := float(chi2.sf(data["heldout_chi_square"], data["heldout_degrees_of_freedom"]))) < DOUBTFUL:
+        warnings.append(
+            f"held-out readings scatter more than the compensation states: chi-square {data['heldout_chi_square']:.0f} "
+            f"for {data['heldout_degrees_of_freedom']} degrees of freedom, by chance once in {1.0 / tail:.0f}"
+        )
+    if data["suspect_angles"]:
+        warnings.append(f"angles whose kept repeats scatter more than their number allows: {data['suspect_angles']}")
+    return tuple(warnings)

@@ -19,7 +19,7 @@ from analysis.turntable.angle_fits import FITS, AngleFit, angles_left, fewest
 from analysis.turntable.dividing_error import CalibrationSeries, Choice, DividingCompensation, choose, compensate
 from optics.numerics.backend import Backend
 from optics.numerics.threads import one_blas_thread
-from scenes.specs.resolved import ExperimentSetup, MeasuredTurntableSetup
+from scenes.specs.resolved import ExperimentSetup
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from twin.laboratory.measured_readings import Comparisons, read_turntable
 from twin.laboratory.turntable_bench import TurntableModel
@@ -33,19 +33,29 @@ _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 @dataclass(frozen=True, eq=False)
 class TurntableRun:
-    """One turntable test, whichever bench it comes from.
+    """One turntable test, on a simulated bench or on measured readings.
 
     Attributes:
+        spec: of the test.
+        seed: of all that is drawn: the simulated bench, and the network's starts.
         series: comparisons at the calibrated readings.
         held_out: comparisons at readings that no fit has seen; None if there are none.
         choice: fits and their cross-validation.
         compensation: of the chosen fit.
+        model: the simulated table and reference, which hold the truth; None for measurements.
+        tables: the series as read from files; empty for a simulated bench.
+        too_few: fits that need more angles than there are.
     """
 
+    spec: TurntableTestSpec | MeasuredTurntableSpec
+    seed: int
     series: CalibrationSeries
     held_out: CalibrationSeries | None
     choice: Choice
     compensation: DividingCompensation
+    model: TurntableModel | None = None
+    tables: tuple[Comparisons, ...] = ()
+    too_few: tuple[str, ...] = ()
 
     @property
     def fits(self) -> dict[str, AngleFit]:
@@ -72,23 +82,22 @@ class TurntableRun:
 
         return tuple(sorted(self.fits, key=judged))
 
+    @cached_property
+    def chi_square(self) -> tuple[float, float]:
+        """Chi-square of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
+        fit, series = self.compensation.fit, self.series
+        square = float(np.sum(((series.mean - fit(series.angle)) / series.sigma) ** 2))
+        return square, len(series.angle) - fit.effective_parameters
 
-@dataclass(frozen=True, eq=False)
-class SimulatedTurntable(TurntableRun):
-    """A test on the simulated bench.
-
-    Attributes:
-        model: the table and the reference; holds the truth.
-        held_out: comparisons at readings that no fit has seen.
-    """
-
-    held_out: CalibrationSeries
-    model: TurntableModel
-
-    @property
-    def spec(self) -> TurntableTestSpec:
-        """Of the test."""
-        return self.model.spec
+    @cached_property
+    def held_out_chi_square(self) -> tuple[float, int] | None:
+        """Chi-square at the held-out readings, against all that the compensation states, and its degrees of freedom."""
+        if self.held_out is None:
+            return None
+        held, fit = self.held_out, self.compensation
+        rest = held.mean - fit.error(held.angle)
+        spread = np.diag(held.sigma**2) + fit.covariance(held.angle)
+        return float(rest @ np.linalg.solve(spread, rest)), len(rest)
 
     @cached_property
     def truth_readings(self) -> Array:
@@ -99,87 +108,53 @@ class SimulatedTurntable(TurntableRun):
 
     @cached_property
     def true_error(self) -> Array:
-        """True dividing error at `truth_readings`, radians."""
+        """True dividing error of a simulated table at `truth_readings`, radians."""
+        assert self.model is not None
         return self.model.error(self.truth_readings)
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredTurntable(TurntableRun):
-    """A test on measured readings.
-
-    Attributes:
-        spec: of the test.
-        seed: of the network's starts.
-        comparisons, held_out_comparisons: the tables as read.
-        too_few: fits that need more angles than there are.
-    """
-
-    spec: MeasuredTurntableSpec
-    seed: int
-    comparisons: Comparisons
-    held_out_comparisons: Comparisons | None
-    too_few: tuple[str, ...]
-
-    @cached_property
-    def chi_square(self) -> tuple[float, float]:
-        """Of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
-        fit, series = self.compensation.fit, self.series
-        square = float(np.sum(((series.mean - fit(series.angle)) / series.sigma) ** 2))
-        return square, len(series.angle) - fit.effective_parameters
-
-    @cached_property
-    def held_out_chi_square(self) -> tuple[float, int] | None:
-        """The same at the held-out readings, against all that the compensation states of them."""
-        if self.held_out is None:
-            return None
-        held, fit = self.held_out, self.compensation
-        rest = held.mean - fit.error(held.angle)
-        spread = np.diag(held.sigma**2) + fit.covariance(held.angle)
-        return float(rest @ np.linalg.solve(spread, rest)), len(rest)
-
-
-def analyse(
-    series: CalibrationSeries,
-    held_out: CalibrationSeries | None,
-    seed: int,
-    names: Sequence[str],
-    folds: int,
-    say: Callable[[str], None] = lambda text: None,
-) -> tuple[Choice, DividingCompensation]:
-    """Fit the comparisons, choose a fit, and make the compensation of it.
-
-    Args:
-        series: the calibration.
-        held_out: the series at other readings, if there is one.
-        seed: of the network's starts.
-        names: of the fits.
-        folds: of the cross-validation.
-        say: told what is being done.
-    """
-    # the network's matrices are small
-    with one_blas_thread():
-        choice = choose(series, seed, names, folds, say)
-        return choice, compensate(series, choice, held_out)
-
-
 def run_turntable(
-    spec: TurntableTestSpec,
+    spec: TurntableTestSpec | MeasuredTurntableSpec,
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
     names: Sequence[str] = tuple(FITS),
-) -> SimulatedTurntable:
-    """Simulate the comparison, clean it, fit it, choose.
+) -> TurntableRun:
+    """Simulate or read the comparisons, clean them, fit them, choose a fit and make the compensation of it.
 
     Args:
         spec: of the test.
-        seed: of the table, the reference, the noise and the network's starts; with the spec it determines everything.
+        seed: of all that is drawn; with the spec it determines everything.
         progress: told what is being done.
         names: of the fits; the network takes nearly all of the time.
 
     Raises:
-        InputError: fewer angles than a fit and its cross-validation need.
+        InputError: a table cannot be used, or there are fewer angles than a fit and its cross-validation need.
     """
     say = progress or (lambda text: None)
+    model: TurntableModel | None = None
+    tables: tuple[Comparisons, ...] = ()
+    held_out: CalibrationSeries | None = None
+    too_few: tuple[str, ...] = ()
+    if isinstance(spec, MeasuredTurntableSpec):
+        say("read the comparisons")
+        tables, folds = read_turntable(spec.measured), spec.measured.folds
+        names, too_few = usable_fits(spec.measured, tables[0], names)
+        series, held_out = tables[0].series, tables[1].series if len(tables) > 1 else None
+    else:
+        folds = spec.calibration.folds
+        _check_count(spec, names)
+        say("compare the table with the reference")
+        model = TurntableModel(spec, seed)
+        series, held_out = model.calibrate(), model.held_out()
+    # the network's matrices are small
+    with one_blas_thread():
+        choice = choose(series, seed, names, folds, say)
+        compensation = compensate(series, choice, held_out)
+    return TurntableRun(spec, seed, series, held_out, choice, compensation, model, tables, too_few)
+
+
+def _check_count(spec: TurntableTestSpec, names: Sequence[str]) -> None:
+    """InputError unless the simulated calibration has angles enough for every fit."""
     plan = spec.calibration
     left = angles_left(plan.count, plan.folds)
     short = [name for name in names if left < fewest(name)]
@@ -190,42 +165,6 @@ def run_turntable(
             found=f"{plan.count} angles, {left} of them without a fold of the cross-validation",
             allowed=f"steps that leave {fewest(short[0])} or more",
         )
-    say("compare the table with the reference")
-    model = TurntableModel(spec, seed)
-    series, held_out = model.calibrate(), model.held_out()
-    choice, compensation = analyse(series, held_out, seed, names, plan.folds, say)
-    return SimulatedTurntable(series=series, held_out=held_out, choice=choice, compensation=compensation, model=model)
-
-
-def run_measured(
-    spec: MeasuredTurntableSpec, seed: int, say: Callable[[str], None] = lambda text: None
-) -> MeasuredTurntable:
-    """Read the comparisons and do the same with them.
-
-    Args:
-        spec: of the test.
-        seed: of the network's starts.
-        say: told what is being done.
-
-    Raises:
-        InputError: a table cannot be used.
-    """
-    say("read the comparisons")
-    found, held = read_turntable(spec.measured)
-    names, too_few = usable_fits(spec.measured, found, tuple(FITS))
-    held_out = None if held is None else held.series
-    choice, compensation = analyse(found.series, held_out, seed, names, spec.measured.folds, say)
-    return MeasuredTurntable(
-        series=found.series,
-        held_out=held_out,
-        choice=choice,
-        compensation=compensation,
-        spec=spec,
-        seed=seed,
-        comparisons=found,
-        held_out_comparisons=held,
-        too_few=too_few,
-    )
 
 
 def usable_fits(
@@ -255,10 +194,4 @@ def run_turntable_test(
     setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
 ) -> TurntableRun:
     """``python -m twin.lab turntable``; nothing is traced, so that the backend is not used. Raises InputError."""
-
-    def say(part: str) -> None:
-        advance(part, 0, 1)
-
-    if isinstance(setup, MeasuredTurntableSetup):
-        return run_measured(setup.test, seed, say)
-    return run_turntable(setup.test, seed, say)
+    return run_turntable(setup.test, seed, lambda part: advance(part, 0, 1))

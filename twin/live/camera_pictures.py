@@ -16,7 +16,7 @@ from twin.camera.camera_view import CameraView
 from twin.camera.view_plots import draw_mtf, draw_spot, draw_wavefront, field_text
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.random_streams import stream
-from twin.run.svg import AFTER, BEFORE, GREY, INK, look, to_svg
+from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.edge_images import DIRECTIONS
 from twin.targets.target_images import TargetCamera
@@ -89,7 +89,7 @@ class CameraPictures:
         for axes, (mean, reading), name, colour in zip(
             images, shots, ("before", "after"), (BEFORE, AFTER), strict=False
         ):
-            axes.imshow(mean, cmap="gray", vmin=0.0, vmax=top, interpolation="nearest")
+            axes.imshow(mean, cmap=GRAY, vmin=0.0, vmax=top, interpolation="nearest")
             axes.set_xticks([])
             axes.set_yticks([])
             axes.set_title(f"knife edge {name}")
@@ -177,7 +177,7 @@ def _focus(figure: Figure, both: list[CameraView], field: float) -> None:
         colour = np.array([one.model.spec.wavelength])
         frequency = one.nyquist * np.eye(2)
         values = np.abs(polychromatic_transfer(pupil, frequency, colour, np.ones(1), shift))
-        for column, ink, way in ((0, "#0072B2", "along the line"), (1, "#D55E00", "along the track")):
+        for column, ink, way in ((0, BLUE, "along the line"), (1, VERMILION, "along the track")):
             axes.plot(1e6 * shift, values[:, column], color=ink, ls=style, label=f"{name}, {way}")
     axes.axvline(0.0, color=INK, lw=0.6)
     axes.set_xlabel(f"the line CCD moved downstream by [{UM}]")

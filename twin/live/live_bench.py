@@ -15,14 +15,10 @@ import numpy as np
 
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
-from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import DEFAULT_PIVOT, moment
 from scenes.specs.job import check_nodes
-from scenes.yaml.errors import InputError
 from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState, Course
 from twin.main_job.assumptions import contradiction, doubted
@@ -36,11 +32,12 @@ from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
 from twin.sensors.grey_steps import coarse_warnings
+from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
 """Random stream of what is hidden, beside those of the monitor and of targets."""
-LOST = (AimError, BeamMissedError, TemperatureError, SpotError, InputError, ArithmeticError, ValueError)
-"""What says that a state cannot be. All errors of the analysis are ValueErrors."""
+LOST = (*PHYSICS, ArithmeticError, ValueError)
+"""What says that a state cannot be."""
 
 
 class LiveBench:
@@ -69,13 +66,8 @@ class LiveBench:
 
     @cached_property
     def _crosstalk(self) -> Any:
-        return crosstalk(self.twin.experiment, self._noise)
-
-    @property
-    def _noise(self) -> dict[str, np.ndarray]:
-        """Any covariance will do: only what motions do to spots is used of the table."""
-        instrument = self.twin.experiment.instrument
-        return {name: np.eye(len(instrument.coordinates_of(name))) for name in instrument.cameras}
+        # any covariance will do: only what motions do to spots is used of the table
+        return crosstalk(self.twin.experiment, np.eye(2 * len(self.twin.experiment.path.channels)))
 
     @cached_property
     def at_rest(self) -> AskedState:
@@ -282,7 +274,9 @@ class LiveBench:
         state = hidden or self.states(asked)
         of_course = asked.time is not None and self.twin.resolved.job.course is not None
         found = self._reader(asked.frames, asked.seed).read(state, asked.noise, asked.time or 0, of_course)
-        after = self._shown(found.frames, found.photons)
+        photons = found.light.photons[0]
+        frames = found.after[0] if asked.noise else None
+        after = self._shown(frames, photons)
         run = RenderRun(
             resolved=self.twin.resolved,
             experiment=experiment,
@@ -291,14 +285,14 @@ class LiveBench:
             seed=self.seed_of(asked.seed),
             truth=found.truth,
             photons_before=experiment.nominal_photons,
-            photons_after=found.photons,
+            photons_after=photons,
             before=self.before(asked)[:, None],
-            after=after[:, None] if found.frames is None else found.frames,
+            after=after[:, None] if frames is None else frames,
             recovery=found.recovery,
             crosstalk=self._crosstalk,
             warnings=(),
         )
-        return run, after, found.placed
+        return run, after, found.light.placed
 
     def _told(self, run: RenderRun, asked: AskedState, placed: PlacedBodies) -> dict[str, Any]:
         experiment = self.twin.experiment
@@ -323,7 +317,7 @@ class LiveBench:
             made = self._reader(asked.frames, asked.seed).read(self.states(asked), noise=False)
         except LOST as error:
             return {"problem": str(error)}
-        return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.photons)}
+        return {"spots": made.recovery.after[0].tolist(), "image": self._shown(None, made.light.photons[0])}
 
     def _warnings(self, run: RenderRun, light: np.ndarray) -> list[str]:
         detector, channels = self.twin.experiment.detector, self.twin.experiment.path.channels

@@ -7,6 +7,7 @@ import contextlib
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable
 from importlib.resources import files
+from pathlib import Path
 
 import uvicorn
 from starlette.applications import Starlette
@@ -32,7 +33,7 @@ _TYPES = {
     "svg": "image/svg+xml",
     "glb": "model/gltf-binary",
 }
-_PAGE = files("twin.live") / "page"
+_PAGE = files(__package__) / "page"
 PARTS = {
     "index.html": _PAGE / "index.html",
     "icon.svg": _PAGE / "icon.svg",
@@ -42,7 +43,7 @@ PARTS = {
     "spots.js": _PAGE / "spots.js",
     "readings.js": _PAGE / "readings.js",
     "scene.js": _PAGE / "scene.js",
-    "three.min.js": files("twin.pictures") / "viewer" / "three.min.js",
+    "three.min.js": Path(__file__).parents[1] / "pictures" / "viewer" / "three.min.js",
 }
 """Everything that can be asked for by name; no path of a request is ever one of the file system."""
 

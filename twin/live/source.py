@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from scenes.kinds.file_kinds import FileKind, kind_of, read_for
+from scenes.kinds.file_kinds import kind_of, read_for
 from scenes.specs.job import JobSpec
 from scenes.specs.load import INSTRUMENTS, library_names
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from scenes.specs.procedures import FileKind
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate

@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 
 from analysis.units import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
-from twin.main_job.deformation_results import faces_of
+from twin.main_job.job_tables import faces_of
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import Cell, SvgFigure, Table, plain
 from twin.run.report import Section
-from twin.run.svg import look, new_figure, to_svg
+from twin.run.svg import look, new_figure, signed_map, to_svg
 
 NAMED = 1e-10
 """Terms smaller than this, metres rms, are left out of the report's table."""
@@ -128,9 +128,7 @@ def _maps(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
     ):
         shown = np.where(distance <= 2.0 * face.spacing, 1e9 * values[inside][nearest], np.nan)
         most = max(float(np.nanmax(np.abs(shown))), 1e-6)
-        picture = one.imshow(
-            shown, cmap="RdBu_r", vmin=-most, vmax=most, extent=ends, origin="lower", interpolation="nearest"
-        )
+        picture = signed_map(one, shown, most, extent=ends, origin="lower", interpolation="nearest")
         one.set_title(
             f"{title}\n{1e9 * face.rms(values):.3g} nm rms, {1e9 * face.range(values):.3g} nm PV", fontsize=8.5
         )

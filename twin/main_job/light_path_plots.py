@@ -17,6 +17,7 @@ from scenes.specs.instrument import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Cha
 from twin.pictures.light_paths import RIM, Beam, LightPaths
 from twin.run.svg import (
     BLUE,
+    BROWN,
     GREEN,
     GREY,
     INK,
@@ -26,14 +27,14 @@ from twin.run.svg import (
     SKY,
     VERMILION,
     YELLOW,
+    gridded,
     look,
     new_figure,
-    plain_axes,
     to_svg,
 )
 
 FIELD_COLOURS = {"left edge": SKY, "centre": BLUE, "right edge": PURPLE}
-CHANNEL_COLOURS = (VERMILION, ORANGE, "#7a4a12", GREY, YELLOW, INK)
+CHANNEL_COLOURS = (VERMILION, ORANGE, BROWN, GREY, YELLOW, INK)
 """Of a camera's monitor beams, in the order of its channels; they begin again where there are more."""
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
@@ -55,9 +56,7 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
         _prisms(axes, instrument, paths)
         axes.set(xlabel="base X, flight direction [m]", ylabel="base Z, toward the scene [m]", aspect="equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        axes.grid(color=LIGHT, lw=0.5)
-        axes.set_axisbelow(True)
-        plain_axes(axes)
+        gridded(axes)
         colours = _colours(instrument)
         kinds = {_fill(solid) for solid in instrument.solids}
         handles = [

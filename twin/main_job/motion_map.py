@@ -9,10 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 
 from twin.main_job.render_results import RenderRun
-from twin.main_job.spot_plots import DIVERGING
 from twin.monitor.crosstalk import CameraCrosstalk
 from twin.run.artefact import SAME, shown_unit, significant
-from twin.run.svg import INK, look, new_figure, to_svg
+from twin.run.svg import DIVERGING, INK, look, new_figure, to_svg
 
 ROW = 0.168
 """Height of a row, inches."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 from xml.sax.saxutils import escape
@@ -12,6 +11,7 @@ from optics.geometry.tree import State
 from scenes.models.instrument_model import Instrument
 from twin.main_job.render_results import RenderRun
 from twin.pictures.light_paths import LightPaths
+from twin.run.artefact import Undrawn
 
 __all__ = ["APART", "FILES", "IRRADIANCE", "SCENE", "SUMMARY", "drawings", "load_drawing", "without_failed"]
 
@@ -50,26 +50,15 @@ def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any
     if run.quality is not None and run.quality.obstruction:
         out["pupils"] = partial(_pupils, run)
     out[SCENE] = partial(_scene, experiment.instrument, run.state, paths)
-    return {name: partial(_tried, draw) for name, draw in out.items()}
+    return {name: partial(_tried, name, draw) for name, draw in out.items()}
 
 
-@dataclass(frozen=True)
-class Undrawn:
-    """A drawing that could not be made.
-
-    Attributes:
-        why: the error.
-    """
-
-    why: str
-
-
-def _tried(draw: Callable[[], Any]) -> Any:
+def _tried(name: str, draw: Callable[[], Any]) -> Any:
     """A drawing, or Undrawn: what cannot be drawn must not cost what was computed."""
     try:
         return draw()
     except Exception as error:
-        return Undrawn(f"{type(error).__name__}: {' '.join(str(error).split())}")
+        return Undrawn("undrawn", name, "", f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str, ...]]:
@@ -79,8 +68,8 @@ def without_failed(drawn: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[str,
     out, missing = dict(drawn), []
     for name, made in drawn.items():
         if isinstance(made, Undrawn):
-            what = f"the file {FILES[name]}" if name in APART else f"the figure {name!r}"
-            missing.append(f"{what} could not be drawn: {made.why}")
+            apart = f"the file {FILES[name]} could not be drawn: {made.why}" if name in APART else ""
+            missing.append(apart or made.note)
             del out[name]
             if name not in APART:
                 out[name] = (
@@ -119,11 +108,9 @@ def _spots(run: RenderRun, camera: str) -> str:
 
 
 def _residuals(run: RenderRun) -> str:
-    from twin.main_job.report_content import residual_panels, results
     from twin.main_job.spot_plots import residuals_svg
 
-    titles = {name: estimator.title for name, estimator in run.estimators.items()}
-    return residuals_svg(residual_panels(results(run)), titles)
+    return residuals_svg(run)
 
 
 def _side(instrument: Instrument, paths: LightPaths) -> str:

@@ -10,9 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scenes.specs.instrument import Channel
-from twin.main_job.deformation_results import deformation_numbers, faces_of
 from twin.main_job.heat_section import heat_numbers, heated_of
-from twin.main_job.job_tables import config_text, finish_names, finish_tables, table_names
+from twin.main_job.job_tables import (
+    config_text,
+    deformation_numbers,
+    faces_of,
+    finish_names,
+    finish_tables,
+    table_names,
+)
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
-from analysis.monitor.recovery import Recovery, recover
+from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import find_obstructions
 from scenes.models.scenery import measured_finishes
 from scenes.specs.instrument import PRISM_180, prism_of
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
-from twin.main_job.deformation_results import deformation_warnings
+from twin.main_job.job_tables import deformation_warnings
 from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
 from twin.monitor.monitor_rays import SpotFocus
+from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import ghost_warnings, stray_light
 from twin.path_tracing.stray_rays import NominalPathLost
@@ -112,43 +111,42 @@ def render_job(
     stage.begin(2)
     try:
         focus = experiment.nominal_focus
-    except (AimError, BeamMissedError) as error:
+    except LOST as error:
         raise _no_spots(resolved, str(error)) from error
+    which = np.array([shown])
     try:
-        truth = experiment.sight.truth([state])
         stage.begin(3)
-        calibration = experiment.calibration
+        experiment.calibration  # noqa: B018 - before the long parts
         stage.begin(4)
         nominal = experiment.nominal_photons
-        photons = experiment.path.photons_of(state)[None] if course is None else None
-    except (AimError, BeamMissedError) as error:
+        light = light_of(experiment, [state], which, single=False) if course is None else None
+    except LOST as error:
         raise _too_large(resolved, str(error)) from error
     series = None
-    if photons is None:
+    if light is None:
         series = run_series(experiment, resolved, states, lambda done: advance(COURSE, done, len(states)))
         # a course is rendered in single precision; the run shows the frames that it measured
-        photons = series.shown_photons[None]
+        light = light_of(experiment, [state], which, photons=series.shown_photons[None])
     stray = None
     if resolved.job.render.stray is not None:
         stray = _stray(experiment, resolved, state, number, advance)
-        nominal, photons = nominal + stray.before.photons, photons + stray.after.photons
+        nominal, light = nominal + stray.before.photons, replace(light, photons=light.photons + stray.after.photons)
     stage.begin(5)
     before = experiment.frames_before(count, number, 0.0 if stray is None else stray.before.photons)
-    after = experiment.frames_after(photons, count, number, shown)
-    stage.begin(6)
+
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        after = experiment.frames_after(photons, count, number, numbers)
+        stage.begin(6)
+        return before, after
+
     try:
-        recovery = recover(
-            before,
-            after,
-            calibration,
-            resolved.job.analysis.centroid,
-            disturbances=experiment.disturbances,
-            motions=experiment.motion_models,
-        )
+        found = read(experiment, light, Observing(record, resolved.job.analysis.centroid))
     except SpotError as error:
         raise _unmeasured(experiment, before, error, focus) from error
+    assert found is not None
+    photons, after, recovery = light.photons, found.after, found.recovery
     stage.begin(7)
-    tables = crosstalk(experiment, _covariances(experiment.instrument, recovery))
+    tables = crosstalk(experiment, recovery.shift_covariance[0])
     stage.end()
     targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
     instrument = experiment.instrument
@@ -166,7 +164,7 @@ def render_job(
         state=state,
         frames=count,
         seed=number,
-        truth=truth,
+        truth=light.truth,
         photons_before=nominal,
         photons_after=photons[0],
         before=before,
@@ -264,12 +262,6 @@ def _in_the_way(stray: StrayPair) -> tuple[str, ...]:
 
 def _second_half(advance: Advance, first: int, done: int, _: int) -> None:
     advance(STRAY, first + done, 2 * first)
-
-
-def _covariances(instrument: Instrument, recovery: Recovery) -> dict[str, np.ndarray]:
-    spread = recovery.shift_covariance[0]
-    parts = {name: instrument.coordinates_of(name) for name in recovery.parameters}
-    return {name: spread[np.ix_(own, own)] for name, own in parts.items()}
 
 
 def _too_large(resolved: ResolvedJob, reason: str) -> InputError:

@@ -22,9 +22,10 @@ from twin.run.svg import (
     PURPLE,
     SKY,
     VERMILION,
+    gridded,
     look,
     new_figure,
-    plain_axes,
+    shared_legend,
     to_svg,
 )
 
@@ -133,8 +134,7 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
             axes.set_ylabel("Δθ [arcsec]")
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(label)
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
         return to_svg(figure)
 
@@ -193,8 +193,7 @@ def smoothed_svg(series: TimeSeries) -> str:
             error = at_ground.error_m[:, 2] - series.true_ground[:, 2]
             panel(axes, "[m]", at_ground.sigma_m[:, 2], between_ground.sigma_m[:, 2], error, rows - 1)
             axes.set_title("Height on the ground", loc="left", fontweight="bold")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
         return to_svg(figure)
 
@@ -229,9 +228,7 @@ def _panel(
 def _frame(axes: Axes, series: TimeSeries, time: np.ndarray) -> None:
     axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
     axes.axvline(time[series.shown], color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
-    plain_axes(axes)
-    axes.grid(axis="y", color=LIGHT, lw=0.5)
-    axes.set_axisbelow(True)
+    gridded(axes, "y")
     axes.yaxis.set_major_formatter(_number_text)
 
 

@@ -14,28 +14,33 @@ from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
-from twin.run.artefact import FAR, tick_text
+from twin.main_job.result_sections import part_title
+from twin.main_job.verdict import state_readings
+from twin.run.artefact import FAR, residual, tick_text
 from twin.run.svg import (
     AFTER,
     BEFORE,
     BLUE,
+    GRAY,
     GREEN,
     GREY,
     INK,
     LIGHT,
     ORANGE,
     PURPLE,
+    SHADE,
     SKY,
     VERMILION,
     look,
     new_figure,
     plain_axes,
+    shared_legend,
+    signed_map,
     to_svg,
 )
 
 STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
-GRAY, DIVERGING = "gray", "RdBu_r"
 LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
 LEAST_CORE = 7.0
 """Half-width of the core's window, pixels, when the spot moves less."""
@@ -111,7 +116,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
         row[2].xaxis.set_major_locator(MaxNLocator(5, integer=True))
         row[2].yaxis.set_major_locator(MaxNLocator(5, integer=True))
         row[2].set(xlim=(x - half, x + half), ylim=(y + half, y - half))
-        map_of = row[3].imshow(difference[i], cmap=DIVERGING, vmin=-largest, vmax=largest, interpolation="none")
+        map_of = signed_map(row[3], difference[i], largest, interpolation="none")
         side = run.experiment.path.channels[i].side
         row[0].set_ylabel(f"{side} channel\nrow [px]")
         title = f"moved {moved[0]:+.3f} px in row, {moved[1]:+.3f} px in column".replace("-", "\N{MINUS SIGN}")
@@ -168,13 +173,13 @@ def marks(names: Iterable[str]) -> dict[str, tuple[str, str]]:
     return {name: every[name] for name in names}
 
 
-def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: dict[str, str]) -> str:
-    """Residuals in sigma.
-
-    Args:
-        panels: panel title -> row label -> estimator -> residual in sigma (None without noise).
-        names: estimator -> its name for readers.
-    """
+def residuals_svg(run: RenderRun) -> str:
+    """Residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
+    names = {name: estimator.title for name, estimator in run.estimators.items()}
+    panels: dict[str, dict[str, dict[str, float | None]]] = {}
+    for same in zip(*(state_readings(run, name) for name in names), strict=True):
+        panel = panels.setdefault(part_title(run, same[0]), {})
+        panel[same[0].parameter.symbol] = {one.estimator: residual(one.error, one.sigma) for one in same}
     with look("residuals"):
         rows = [len(panel) for panel in panels.values()]
         figure = new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))
@@ -196,13 +201,12 @@ def residuals_svg(panels: dict[str, dict[str, dict[str, float | None]]], names: 
             axes.set_axisbelow(True)
         label = "(recovered \N{MINUS SIGN} true) / sigma        linear inside the band, logarithmic outside"
         all_axes[-1].set_xlabel(label)
-        handles, labels = all_axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        shared_legend(figure, all_axes[0])
         return to_svg(figure)
 
 
 def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], names: dict[str, str]) -> None:
-    axes.axvspan(-FAR, FAR, color="#eef3f8", lw=0)
+    axes.axvspan(-FAR, FAR, color=SHADE, lw=0)
     axes.axvline(0.0, color=GREY, lw=0.8)
     place = {label: k for k, label in enumerate(panel)}
     found = marks(names)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from twin.main_job.assumptions import assumed
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_content import results
-from twin.main_job.spot_plots import GRAY, airy_radius, core_window, cross, mean_images, stretch
+from twin.main_job.result_sections import result_tables
+from twin.main_job.spot_plots import airy_radius, core_window, cross, mean_images, stretch
 from twin.main_job.verdict import limited
-from twin.run.artefact import FAR
-from twin.run.svg import AFTER, BEFORE, BLUE, GREY, INK, LIGHT, VERMILION, look, to_png
+from twin.run.artefact import FAR, Marked, Table
+from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, LIGHT, VERMILION, look, to_png
 
 WIDTH, DPI = 14.0, 100
 """Inches and dots per inch: 1400 px wide."""
@@ -32,8 +30,8 @@ def summary_png(run: RenderRun) -> bytes:
 def _draw(run: RenderRun) -> Figure:
     channels = run.experiment.path.channels
     columns = max(len(channels), 1)
-    tables = results(run)
-    lines = 1 + sum(1 + len(table["rows"]) for table in tables)
+    table = result_tables(run)[-1]
+    lines = 1 + len(table.bands) + len(table.rows)
     picture = WIDTH / columns
     heights = (2.0 * picture + 0.5, 0.27 * lines + 0.73)
     figure = Figure(figsize=(WIDTH, sum(heights)), facecolor="white")
@@ -61,7 +59,7 @@ def _draw(run: RenderRun) -> Figure:
                 # many pictures are narrow
                 text = "{} camera, {} spot" if columns <= 4 else "{}, {}"
                 axes.set_title(text.format(channel.camera, channel.side), fontsize=13 if columns <= 4 else 10, pad=7)
-    _table(figure, tables, 1.0 - top - 0.1 / sum(heights), run)
+    _table(figure, table, 1.0 - top - 0.1 / sum(heights), run)
     return figure
 
 
@@ -73,11 +71,11 @@ def _scale_bar(axes: Axes, run: RenderRun, column: float, row: float, half: floa
     axes.text(x, y - 0.05 * half, text, color="white", ha="right", va="bottom", fontsize=10)
 
 
-def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: RenderRun) -> None:
+def _table(figure: Figure, table: Table, top: float, run: RenderRun) -> None:
     """Recovered against true, drawn as text on a grid of lines."""
     axes = figure.add_axes((0.0, 0.0, 1.0, top), xlim=(0.0, 1.0))
     axes.set_axis_off()
-    count = 1 + sum(1 + len(table["rows"]) for table in tables)
+    count = 1 + len(table.bands) + len(table.rows)
     axes.set_ylim(count + 2.05, 0.0)
     estimators = list(run.estimators.values())
     # columns share the width that is left by the names and the truth
@@ -88,19 +86,19 @@ def _table(figure: Figure, tables: list[dict[str, Any]], top: float, run: Render
     axes.text(0.01, y, f"{run.resolved.instrument.name}, {run.frames} frames", fontsize=12.5, va="center", color=GREY)
     for x, head in zip(edges, heads, strict=True):
         axes.text(x, y, head, fontsize=12.5, fontweight="bold", ha="right", va="center")
-    for table in tables:
-        y += 1.0
-        axes.axhline(y - 0.5, color=LIGHT, lw=1)
-        axes.text(0.01, y, table["title"], fontsize=12.5, fontweight="bold", va="center")
-        for row in table["rows"]:
+    for k, (name, true, *cells) in enumerate(table.rows):
+        if k in table.bands:
             y += 1.0
-            axes.text(0.02, y, f"{row['symbol']} [{row['unit']}]", fontsize=12.5, va="center")
-            axes.text(edges[0], y, row["true"], fontsize=12.5, ha="right", va="center", fontweight="bold")
-            for x, cell in zip(edges[1:], row["cells"], strict=True):
-                text = f"{cell['value']} ± {cell['sigma']}"
-                axes.text(x - 0.013, y, text, fontsize=12.5, ha="right", va="center", color=INK)
-                mark, colour = ("▲", VERMILION) if cell["far"] else ("●", BLUE)
-                axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
+            axes.axhline(y - 0.5, color=LIGHT, lw=1)
+            axes.text(0.01, y, table.bands[k], fontsize=12.5, fontweight="bold", va="center")
+        y += 1.0
+        axes.text(0.02, y, str(name), fontsize=12.5, va="center")
+        axes.text(edges[0], y, str(true), fontsize=12.5, ha="right", va="center", fontweight="bold")
+        for x, cell in zip(edges[1:], cells, strict=False):
+            assert isinstance(cell, Marked)
+            axes.text(x - 0.013, y, cell, fontsize=12.5, ha="right", va="center", color=INK)
+            mark, colour = ("▲", VERMILION) if cell.look == "far" else ("●", BLUE)
+            axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
     y = count + 0.7
     limit = f" {limited(run)}." if limited(run) else ""
     for line in (f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):

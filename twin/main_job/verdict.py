@@ -35,6 +35,7 @@ __all__ = [
     "readings",
     "recovered_numbers",
     "sharpness_lost",
+    "state_readings",
 ]
 
 FALSE_ALARM = 1e-3
@@ -113,7 +114,12 @@ def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
     """All readings of an estimator: four of each camera, then the angle and the errors on the ground; over a course
     root mean squares.
     """
-    return tuple(_series_readings(run.series, estimator) if run.series else _state_readings(run, estimator))
+    return tuple(_series_readings(run.series, estimator)) if run.series else state_readings(run, estimator)
+
+
+def state_readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
+    """All readings of an estimator of the one state that a run shows in full."""
+    return tuple(_state_readings(run, estimator))
 
 
 def _state_readings(run: RenderRun, estimator: str) -> Iterator[Reading]:

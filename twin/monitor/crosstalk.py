@@ -143,12 +143,12 @@ def estimator_gains(
     return {name: one.gain(shifts)[0] for name, one in applicable(cameras, stated).items()}
 
 
-def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray]) -> dict[str, CameraCrosstalk]:
+def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str, CameraCrosstalk]:
     """Work out the table for every camera; readings are those of spots without noise, the same for every measurement.
 
     Args:
         experiment: the instrument.
-        covariance: camera -> (2 n, 2 n) px^2 of its n spots' shifts, by which is told what they can separate.
+        covariance: (2 C, 2 C) px^2 of the shifts of all spots, by which is told what they can separate.
     """
     instrument = experiment.instrument
     sets = {name: (*line_family(name), *other_motions(instrument, name)) for name in instrument.cameras}
@@ -177,7 +177,9 @@ def crosstalk(experiment: MonitorExperiment, covariance: Mapping[str, np.ndarray
             if e in readings
         )
         labels = [f"{m.label} [{m.unit}]" for m in motions]
-        report = model_fit.observability(labels, spots, truth, size, covariance[name], family=(0, 1, 2, 3))
+        seen = instrument.coordinates_of(name)
+        spread = covariance[np.ix_(seen, seen)]
+        report = model_fit.observability(labels, spots, truth, size, spread, family=(0, 1, 2, 3))
         channels = experiment.cameras[name].channels
         out[name] = CameraCrosstalk(motions, spots * size, true, readings, factors, report, channels)
     return out

@@ -51,29 +51,22 @@ class Information:
     brightest: np.ndarray
 
     @cached_property
-    def fisher(self) -> np.ndarray:
-        """(M, M) information of the spots on the motions, per standard deviation squared."""
-        spots = self.disturbances.spots
-        return np.asarray(spots.T @ np.linalg.solve(self.noise, spots))
-
-    @cached_property
     def gain(self) -> np.ndarray:
         """(4 K, D) of the estimate with the least variance, rad and m per pixel."""
         return self.disturbances.best_gain(self.noise)
 
     @cached_property
-    def posterior(self) -> np.ndarray:
-        """(4 K, 4 K) covariance of the parameters that is left, rad and m."""
-        return np.asarray(self.disturbances.misfit(self.gain) + self.gain @ self.noise @ self.gain.T)
-
-    @property
-    def prior(self) -> np.ndarray:
-        """(4 K, 4 K) before any measurement."""
-        return self.disturbances.parameter_covariance
+    def splits(self) -> Mapping[str, Split]:
+        """Quantity -> its variances by motions, SI."""
+        return {name: split(rows, self.disturbances, self.noise, self.gain) for name, rows in self.quantities.items()}
 
     def sigma(self, name: str) -> float:
         """What is left of a quantity, SI."""
-        return _spread(self.quantities[name], self.posterior)
+        return float(np.sqrt(np.mean(self.splits[name].sigma ** 2)))
+
+    def sigma_before(self, name: str) -> float:
+        """The same without any measurement."""
+        return float(np.sqrt(np.mean(self.splits[name].sigma_before ** 2)))
 
     def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of a quantity's sigma by A, (D, M), and by the noise R, (D, D); SI per pixel and per px^2.
@@ -87,10 +80,6 @@ class Information:
         scale = 2.0 * self.sigma(name) * len(rows)
         return 2.0 * weights.T @ left / scale, weights.T @ weights / scale
 
-    def sigma_before(self, name: str) -> float:
-        """The same without any measurement."""
-        return _spread(self.quantities[name], self.prior)
-
     def shares(self, name: str, measured: bool = True) -> dict[str, float]:
         """Variance of a quantity by cause, SI; causes are independent of one another, so that shares add up.
 
@@ -98,9 +87,8 @@ class Information:
             name: of the quantity.
             measured: what is left of it, with the noise; else before any measurement.
         """
-        rows, stated = self.quantities[name], self.disturbances
-        found = split(rows, stated, self.noise, self.gain)
-        shares = Split.by(found.after if measured else found.before, stated.causes)
+        found = self.splits[name]
+        shares = Split.by(found.after if measured else found.before, self.disturbances.causes)
         out = {cause: float(np.mean(share)) for cause, share in shares.items()}
         return {**out, NOISE: float(np.mean(found.noise))} if measured else out
 
@@ -108,10 +96,6 @@ class Information:
     def spot_sigma(self) -> np.ndarray:
         """(D,) standard deviations of the spots' places, px."""
         return np.sqrt(np.diag(self.disturbances.spot_covariance))
-
-
-def _spread(rows: np.ndarray, covariance: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.einsum("ni,ij,nj->n", rows, covariance, rows))))
 
 
 def information_of(
@@ -139,7 +123,7 @@ def information_of(
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
     path, thermal = MonitorPath(instrument, backend), ThermalModel(instrument)
-    noise, brightest = _noise_of_spots(path, detector, alike, single)
+    noise, brightest = spot_noise(path, detector, alike, single)
     rows = quantity_rows(instrument, ground)
     return [
         Information(
@@ -181,25 +165,22 @@ def ground_of(instrument: Instrument) -> GroundGeometry | None:
     return ground_geometry(instrument, {name: model.line_focal_length for name, model in instrument.cameras.items()})
 
 
-def spot_noise(path: MonitorPath, detector: EmvaDetector, alike: bool = False) -> np.ndarray:
+def spot_noise(
+    path: MonitorPath, detector: EmvaDetector, alike: bool = False, single: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of all shifts by the noise of images before and after, (D, D) px^2: of each spot twice the bound that
-    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames.
+    no unbiased fit of its image can beat, with the light of its channel and the instrument's number of frames. And the
+    share of what a pixel can hold that every spot's brightest one gets, (C,).
 
     Args:
         path: the monitor's light.
         detector: of the area CCDs.
         alike: spots of one camera and one beam width are taken to have one shape; their light is their own.
+        single: pictures of the spots in single precision.
 
     Raises:
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
-    return _noise_of_spots(path, detector, alike, single=True)[0]
-
-
-def _noise_of_spots(
-    path: MonitorPath, detector: EmvaDetector, alike: bool, single: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """What ``spot_noise`` gives, and the share of what a pixel can hold that every spot's brightest one gets, (C,)."""
     channels, spec = path.channels, path.instrument.spec
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
     shown = tuple(c for c in channels if c in groups.values())

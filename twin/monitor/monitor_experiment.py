@@ -4,7 +4,7 @@ it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from functools import cached_property
@@ -16,7 +16,6 @@ from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
-from analysis.monitor.recovery import Recovery, recover
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
@@ -311,7 +310,7 @@ class MonitorExperiment:
         photons = self.nominal_photons + stray
         return self.detector.expose(photons, self.pattern(seed), frames, self.exposure, stream(seed, 1))
 
-    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int = 0) -> np.ndarray:
+    def frames_after(self, photons: np.ndarray, frames: int, seed: int, first: int | np.ndarray = 0) -> np.ndarray:
         """Frames of perturbed states, uint16 (S, C, frames, rows, columns).
 
         Args:
@@ -319,13 +318,14 @@ class MonitorExperiment:
             frames: per state.
             seed: as for ``frames_before``; state number first + s draws from a stream of its own, so that the frames of
                 a state do not depend on how a series is cut into pieces.
-            first: number of the first state.
+            first: number of the first state, or of each, (S,).
         """
         pattern = self.pattern(seed)
         out = np.empty((*photons.shape[:2], frames, *photons.shape[2:]), np.uint16)
+        numbers = first if isinstance(first, np.ndarray) else first + np.arange(len(photons))
 
         def expose(s: int) -> None:
-            own = stream(seed, 2, first + s)
+            own = stream(seed, 2, int(numbers[s]))
             out[s] = self.detector.expose(photons[s], pattern, frames, self.exposure, own, threads=1)
 
         if len(photons) == 1:
@@ -335,27 +335,6 @@ class MonitorExperiment:
         with ThreadPoolExecutor(min(cores(), 8)) as pool:
             list(pool.map(expose, range(len(photons))))
         return out
-
-    def measure(
-        self,
-        states: Sequence[State],
-        frames: int,
-        seed: int,
-        centroid: str = "ml",
-        chunk: int = 40,
-        disturbances: Disturbances | None = None,
-    ) -> Iterator[tuple[slice, Recovery]]:
-        """Render, expose and recover many states against one nominal measurement, piece by piece to bound memory.
-
-        Yields:
-            The slice of ``states`` and what their images say.
-        """
-        before = self.frames_before(frames, seed)
-        for piece, photons in self.path.iterate_photons(states, chunk=chunk):
-            after = self.frames_after(photons, frames, seed, piece.start)
-            with one_blas_thread():
-                recovered = recover(before, after, self.calibration, centroid, cores(), disturbances)
-            yield piece, recovered
 
     def expected_frames(self, photons: np.ndarray) -> np.ndarray:
         """Noise-free, unrounded grey values of a uniform detector, same shape as ``photons``."""

@@ -7,7 +7,7 @@ of the pupil grow with the square of the CCD's diagonal.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from optics.numerics.threads import cores
@@ -35,8 +35,22 @@ def largest_piece(each: int) -> int:
     return max(1, min(CHUNK, LARGEST_FRAMES // each))
 
 
-STARTED = 220e6
-"""Of a job of any size until its spots are measured, beside the imported program: kernels and their compiler; bytes."""
+def pieces(count: int, each: int) -> Iterator[slice]:
+    """States of a series whose frames are worked on at once.
+
+    Args:
+        count: states.
+        each: pixels of all frames of one.
+    """
+    size = largest_piece(each)
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+STARTED = 290e6
+"""Memory of a job of any size until its spots are measured, beside the imported program: kernels, their compiler, and
+what the heap keeps of arrays that are freed; bytes.
+"""
 DRAWN = 410e6
 """The same when it is drawn and written, the most of a small one; bytes."""
 PIXEL = 380.0

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.monitor.monitoring import coefficients
-from analysis.monitor.recovery import Recovery, measure_spots, recover
+from analysis.monitor.recovery import Recovery, measure_spots
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
@@ -24,6 +24,8 @@ from scenes.models.disturbances import state_of
 from scenes.specs.instrument import BASE, ErrorBudgetSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
+from twin.monitor.truth import Truth
 
 CENTROID = "centroid"
 """The line that nothing causes but the noise of the image."""
@@ -251,23 +253,24 @@ class ErrorBudget:
         """All causes at once, through noisy images and every estimator, each measurement the mean of ``frames``."""
         progress(0.0, "all causes: states")
         states = self.states(self.causes, self.spec.all_together, len(self.lines))
-        calibration = self.experiment.calibration
-        before = self.experiment.frames_before(self.spec.frames, self.seed)
-        truth = self.experiment.sight.truth(states).cameras
-        pieces: list[Recovery] = []
-        for piece, photons in self.experiment.path.iterate_photons(states, chunk=25):
-            progress(0.1 + 0.9 * piece.start / len(states), "all causes: render and measure")
-            after = self.experiment.frames_after(photons, self.spec.frames, self.seed, piece.start)
-            with one_blas_thread():
-                pieces.append(recover(before, after, calibration, "energy", cores()))
-        angle = self.radians_per_pixel * np.concatenate([p.after - p.before for p in pieces])
+        record = one_detector(self.experiment, self.spec.frames, self.seed)
+        pieces: list[tuple[Truth, Recovery]] = []
+        for found in observe(self.experiment, states, Observing(record, "energy", 25, stated=False)):
+            pieces.append((found.truth, found.recovery))
+            progress(0.1 + 0.9 * (found.numbers[-1] + 1) / len(states), "all causes: render and measure")
+        angle = self.radians_per_pixel * np.concatenate([p.after - p.before for _, p in pieces])
         parameters: dict[str, dict[str, tuple[float, float]]] = {}
-        for estimator in next(iter(pieces[0].parameters.values())):
+        for estimator in next(iter(pieces[0][1].parameters.values())):
             parameters[estimator] = {}
             for name in PARAMETER_FIELDS:
                 values = [
-                    np.concatenate([np.asarray(getattr(p.parameters[c][estimator], name)) for p in pieces])
-                    - getattr(truth[c], name.rpartition("_")[0])
+                    np.concatenate(
+                        [
+                            np.asarray(getattr(p.parameters[c][estimator], name))
+                            - getattr(true.cameras[c], name.rpartition("_")[0])
+                            for true, p in pieces
+                        ]
+                    )
                     for c in self.experiment.instrument.cameras
                 ]
                 parameters[estimator][name] = _three_sigma(np.stack(values, axis=-1))
@@ -277,15 +280,12 @@ class ErrorBudget:
 def _shifts(experiment: MonitorExperiment, states: Sequence[State]) -> np.ndarray:
     """Measured displacement of every spot in noise-free images, px, (S, C, 2): row, column."""
     before = experiment.expected_frames(experiment.nominal_photons)
-    calibration = experiment.calibration
-    start = measure_spots(before, 1, calibration).position
-    out = np.empty((len(states), len(before), 2))
-    for piece, photons in experiment.path.iterate_photons(states):
-        frames = experiment.expected_frames(photons)
-        with one_blas_thread():
-            spots = measure_spots(frames.reshape(-1, *frames.shape[-2:]), 1, calibration, "ml", cores())
-        out[piece] = spots.position.reshape(-1, len(before), 2) - start
-    return out
+
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return before, experiment.expected_frames(photons)
+
+    seen = observe(experiment, states, Observing(record, chunk=32, stated=False, frames=1))
+    return np.concatenate([found.recovery.after - found.recovery.before for found in seen])
 
 
 def _three_sigma(values: np.ndarray) -> tuple[float, float]:

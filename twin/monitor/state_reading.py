@@ -6,41 +6,15 @@ The numbers are those of ``python -m twin.render`` for the same state, frames an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from analysis.monitor.recovery import Recovery, judged_spots, recovery_of
-from analysis.monitor.spot_evidence import SpotEvidence
+from analysis.monitor.recovery import MeasuredSpots, judged_spots
 from analysis.spots.centroid import mean_frames
-from analysis.spots.fit_state import FitStates
-from analysis.spots.spot_positions import SpotPositions, difference_covariance
-from optics.geometry.tree import PlacedBodies, State
-from optics.numerics.threads import one_blas_thread
+from optics.geometry.tree import State
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.truth import Truth
-
-__all__ = ["StateReader", "StateReading"]
-
-
-@dataclass(frozen=True, eq=False)
-class StateReading:
-    """What one state does and what its images say.
-
-    Attributes:
-        placed: bodies of this one state.
-        truth: of it.
-        photons: expected photons per pixel and frame, (C, rows, columns).
-        frames: uint16 (C, frames, rows, columns); None without noise.
-        recovery: of this one state; without noise its sigmas are those that the noise of the frames would give.
-    """
-
-    placed: PlacedBodies
-    truth: Truth
-    photons: np.ndarray
-    frames: np.ndarray | None
-    recovery: Recovery
+from twin.monitor.observation import Observation, Observing, observe
 
 
 class StateReader:
@@ -62,19 +36,21 @@ class StateReader:
         return self.experiment.frames_before(self.frames, self.seed)
 
     @cached_property
-    def _spots_before(self) -> tuple[SpotPositions, FitStates]:
-        return self._spots(mean_frames(self.before))
+    def _before(self) -> MeasuredSpots:
+        return judged_spots(mean_frames(self.before), self.frames, self.experiment.calibration, self.centroid)
 
     @cached_property
-    def _clean_before(self) -> tuple[SpotPositions, FitStates]:
-        return self._spots(self.experiment.expected_frames(self.experiment.nominal_photons))
+    def _clean_before(self) -> MeasuredSpots:
+        clean = self.experiment.expected_frames(self.experiment.nominal_photons)
+        return judged_spots(clean, self.frames, self.experiment.calibration, self.centroid)
 
-    def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> StateReading:
+    def read(self, state: State, noise: bool = True, number: int = 0, single: bool = False) -> Observation:
         """Trace, render and recover a state.
 
         Args:
             state: body -> motion, as of ``MonitorExperiment.state``.
-            noise: expose frames; else the expected images are measured.
+            noise: expose frames; else the expected images, (1, C, rows, columns), are measured, and sigmas are those
+                that the noise of the frames would give.
             number: of the state, each of which has a random stream of its own; of a course that of the time.
             single: render in single precision, as all times of a course are.
 
@@ -83,21 +59,11 @@ class StateReader:
             SpotError: a spot cannot be measured.
         """
         experiment = self.experiment
-        with one_blas_thread():
-            placed = experiment.instrument.assembly.place([state])
-            truth = experiment.sight.truth([state], placed)
-            photons = experiment.path.photons_of(state, placed, single)[None]
-            frames = experiment.frames_after(photons, self.frames, self.seed, number)[0] if noise else None
-            mean = experiment.expected_frames(photons[0]) if frames is None else mean_frames(frames)
-            first, fits = self._clean_before if frames is None else self._spots_before
-            second, more = self._spots(mean)
-            calibration, stated = experiment.calibration, experiment.disturbances
-            spread = difference_covariance(first, second, calibration.noise)
-            evidence = SpotEvidence(fits, more)
-            again = experiment.motion_models
-            recovery = recovery_of(first, second, spread, calibration, stated, evidence=evidence, motions=again)
-        return StateReading(placed, truth, photons[0], frames, recovery)
 
-    def _spots(self, mean: np.ndarray) -> tuple[SpotPositions, FitStates]:
-        """Of mean frames or expected images (C, rows, columns), grey values."""
-        return judged_spots(mean, self.frames, self.experiment.calibration, self.centroid)
+        def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
+            if not noise:
+                return self._clean_before, experiment.expected_frames(photons)
+            return self._before, experiment.frames_after(photons, self.frames, self.seed, numbers)
+
+        how = Observing(record, self.centroid, single=single, frames=None if noise else self.frames)
+        return next(observe(experiment, [state], how, [number]))

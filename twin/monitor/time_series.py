@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -12,14 +12,11 @@ from analysis.monitor.curvature import Curvature
 from analysis.monitor.ground_error import AXES, GroundError
 from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
-from analysis.monitor.recovery import Estimates, Recovery, recover
+from analysis.monitor.recovery import Estimates, Recovery
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.spot_positions import SpotError
 from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
-from optics.numerics.threads import cores, one_blas_thread
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
@@ -28,7 +25,8 @@ from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.monitor_memory import CHUNK, largest_piece
+from twin.monitor.monitor_memory import largest_piece
+from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.monitor.truth import Truth
 
@@ -96,12 +94,9 @@ class TimeSeries:
             spots: their names.
         """
         out = []
-        bad = int(np.count_nonzero(~self.evidence.holds))
-        if bad:
-            worst = self.evidence.worst
-            told = self.evidence.doubt(worst, spots)
-            assert told is not None
-            out.append(f"course at {moment(float(self.times[worst]))}, the worst of {bad} times: {told.text}")
+        told = self.evidence.course_doubt([moment(time) for time in self.times.tolist()], spots)
+        if told is not None:
+            out.append(f"course {told}")
         for name, found in self.curvature.items():
             lost = np.flatnonzero(~found.holds)
             again = np.flatnonzero(found.beyond & found.holds)
@@ -222,7 +217,6 @@ def run_series(
             allowed=f"at most {LARGEST_SERIES // each} with area CCDs of {shape[0]} x {shape[1]} pixels",
         )
     advance(0)
-    before = experiment.frames_before(frames, seed)
     photons = np.empty((len(states), len(channels), *shape), np.float32)
     first = np.empty(photons.shape, np.uint16)
     saturated = np.zeros(photons.shape[:2], bool)
@@ -231,39 +225,29 @@ def run_series(
     truths: list[Truth] = []
     recoveries: list[Recovery] = []
     together = CourseSmoother(experiment.disturbances, experiment.cameras, experiment.ground, course.times)
-    for piece in pieces(len(states), each * frames):
-        some = states[piece]
-        try:
-            truths.append(experiment.sight.truth(some))
-            expected = experiment.path.expected_photons(some, chunk=CHUNK)
-        except (AimError, BeamMissedError) as error:
-            raise _lost(experiment, job, some, piece.start, error) from error
-        after = experiment.frames_after(expected, frames, seed, piece.start)
-        try:
-            with one_blas_thread():
-                recoveries.append(
-                    recover(
-                        before,
-                        after,
-                        experiment.calibration,
-                        job.analysis.centroid,
-                        cores(),
-                        experiment.disturbances,
-                        keep_parts=experiment.disturbances is not None,
-                        motions=experiment.motion_models,
-                    )
-                )
-        except SpotError as error:
-            k, spot = divmod(error.indices[0], len(channels))
-            reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
-            raise too_large(job, piece.start + k, reason) from error
-        recoveries[-1] = together.add(recoveries[-1])
-        photons[piece], first[piece] = expected, after[:, :, 0]
-        if piece.start <= course.shown < piece.stop:
-            shown_photons[:] = expected[course.shown - piece.start]
-        saturated[piece] = experiment.detector.saturated(after).pixels > 0
-        share[piece] = expected.sum(axis=(2, 3)) / experiment.nominal_photons.sum(axis=(1, 2))
-        advance(piece.stop)
+    record, size, done = one_detector(experiment, frames, seed), largest_piece(each * frames), 0
+    how = Observing(record, job.analysis.centroid, size, keep_parts=experiment.disturbances is not None)
+    try:
+        for found in observe(experiment, states, how):
+            piece, expected = slice(done, done + len(found.numbers)), found.light.photons
+            truths.append(found.truth)
+            recoveries.append(together.add(found.recovery))
+            photons[piece], first[piece] = expected, found.after[:, :, 0]
+            if piece.start <= course.shown < piece.stop:
+                shown_photons[:] = expected[course.shown - piece.start]
+            saturated[piece] = experiment.detector.saturated(found.after).pixels > 0
+            share[piece] = expected.sum(axis=(2, 3)) / experiment.nominal_photons.sum(axis=(1, 2))
+            done = piece.stop
+            advance(done)
+    except LOST as error:
+        for k in range(done, min(done + size, len(states))):
+            if why := why_lost(experiment, states[k]):
+                raise too_large(job, k, why) from error
+        raise
+    except SpotError as error:
+        k, spot = divmod(error.indices[0], len(channels))
+        reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
+        raise too_large(job, done + k, reason) from error
     names = list(experiment.instrument.cameras)
     moves = [motions_of(job, k) for k in range(len(states))]
     changes = {name: [t.cameras[name] for t in truths] for name in names}
@@ -316,31 +300,6 @@ def _course(job: JobSpec) -> CourseSpec:
     if job.course is None:
         raise ValueError("the job has no course")
     return job.course
-
-
-def pieces(count: int, each: int) -> Iterator[slice]:
-    """Times of a series whose frames are worked on at once: `CHUNK`, or fewer where they are large.
-
-    Args:
-        count: times.
-        each: pixels of all frames of one.
-    """
-    size = largest_piece(each)
-    for start in range(0, count, size):
-        yield slice(start, min(start + size, count))
-
-
-def _lost(
-    experiment: MonitorExperiment, job: JobSpec, states: Sequence[State], first: int, error: Exception
-) -> Exception:
-    """The error of the first of some states in which light is lost, found by trying each alone."""
-    for k, state in enumerate(states):
-        try:
-            experiment.sight.truth([state])
-            experiment.path.rays([state])
-        except (AimError, BeamMissedError) as reason:
-            return too_large(job, first + k, str(reason))
-    return error
 
 
 def _joined(parts: Sequence[CameraParameters]) -> CameraParameters:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,6 +43,20 @@ class Truth:
     angle: float
     angle_change: np.ndarray
     lines: np.ndarray
+
+    def at(self, states: slice | np.ndarray) -> Truth:
+        """The truth of some of the states.
+
+        Args:
+            states: which.
+        """
+        each = [field.name for field in fields(LineChange) if field.name != "nominal_distance"]
+        cameras = {
+            name: replace(change, **{key: getattr(change, key)[states] for key in each})
+            for name, change in self.cameras.items()
+        }
+        lines = np.concatenate([self.lines[:, :1], self.lines[:, 1:][:, states]], axis=1)
+        return replace(self, cameras=cameras, angle_change=self.angle_change[states], lines=lines)
 
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
         """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.

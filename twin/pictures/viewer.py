@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 LIBRARY = "three.min.js"
 """What of three.js (MIT, see LICENSE.three.txt beside it) the viewer uses, made as viewer/three_parts.js says."""
-_HERE = files("twin.pictures") / "viewer"
+_HERE = files(__package__) / "viewer"
 
 
 def viewer_markup(moved: str) -> Markup:

@@ -15,7 +15,8 @@ import typer
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.measured.monitor_frames import MeasurementSetup, resolve_measurement
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
-from twin.run.command import Result, Session, print_report, run_command
+from twin.run.command import Result, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 PROGRAM = "twin.recover"

@@ -12,10 +12,25 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.main_job.series_plots import time_unit
-from twin.main_job.spot_plots import DIVERGING, GRAY, cross, stretch
+from twin.main_job.spot_plots import cross, stretch
 from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
-from twin.run.svg import AFTER, BEFORE, BLUE, INK, LIGHT, ORANGE, SKY, look, new_figure, plain_axes, to_svg
+from twin.run.svg import (
+    AFTER,
+    BEFORE,
+    BLUE,
+    DIVERGING,
+    GRAY,
+    INK,
+    LIGHT,
+    ORANGE,
+    SKY,
+    gridded,
+    look,
+    new_figure,
+    shared_legend,
+    to_svg,
+)
 
 LIMIT = 5.0
 """Of the colour scale of residuals, sigmas."""
@@ -150,8 +165,7 @@ def changes_svg(lines: Sequence[Line]) -> str:
             axes.set_ylabel(line.name)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(f"time [{unit}]")
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+        shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
         return to_svg(figure)
 
@@ -169,6 +183,4 @@ def _change(axes: Axes, line: Line, size: float) -> None:
     axes.errorbar(
         time / size, value, sigma, fmt="o", color=INK, ms=3.0, elinewidth=0.8, capsize=2, label="each time by itself"
     )
-    plain_axes(axes)
-    axes.grid(axis="y", color=LIGHT, lw=0.5)
-    axes.set_axisbelow(True)
+    gridded(axes, "y")

@@ -28,8 +28,8 @@ from scenes.yaml.errors import InputError, Issue
 from twin.main_job.monitor_reading import MonitorReading
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_memory import pieces
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
-from twin.monitor.time_series import pieces
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
 from twin.recover.frame_origin import order_warnings, repeated_frames
 from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_measurement
@@ -106,9 +106,7 @@ class _Bench:
     def crosstalk(self, recovery: Recovery) -> Mapping[str, CameraCrosstalk]:
         if self.experiment is None or self.disturbances is None:
             return {}
-        spread, instrument = recovery.shift_covariance[0], self.experiment.instrument
-        own = {name: instrument.coordinates_of(name) for name in self.cameras}
-        return crosstalk(self.experiment, {name: spread[np.ix_(k, k)] for name, k in own.items()})
+        return crosstalk(self.experiment, recovery.shift_covariance[0])
 
 
 def run_recover(

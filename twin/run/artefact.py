@@ -6,10 +6,13 @@ import base64
 import json
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+from markupsafe import Markup
+
+from optics.numerics.frozen_map import FrozenMap
 from twin.run.data_files import csv_table
 
 MINUS = "\N{MINUS SIGN}"
@@ -104,19 +107,51 @@ class OwnDecimals(float):
     decimals: int
 
 
+class Marked(str):
+    """A text of a table's cell that says more than itself.
+
+    Attributes:
+        below: a second, smaller line.
+        look: how it is set off, a class of the style sheet: ``truth``, ``near``, ``far``, ``wrong``, a verdict.
+        key: name by which programs find the cell in a page.
+        hint: shown to who points at the cell.
+    """
+
+    def __new__(cls, text: str, below: str = "", look: str = "", key: str = "", hint: str = "") -> Marked:
+        """The text ``text`` with what else the cell says."""
+        made = super().__new__(cls, text)
+        made.below, made.look, made.key, made.hint = below, look, key, hint
+        return made
+
+    below: str
+    look: str
+    key: str
+    hint: str
+
+
+def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
+    """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR."""
+    far = ratio is not None and abs(ratio) > FAR
+    return Marked(text, f"{'▲' if far else '●'} {residual_text(ratio)} σ", "far" if far else "near", key, hint)
+
+
 @dataclass(frozen=True, eq=False)
 class Artefact:
     """Something to show beside the checks.
 
     Attributes:
         name: of its file, without ending: small letters, digits, - and _; unique in its group.
-        title: heading in the report.
-        caption: what it shows, in sentences.
+        title: heading in the report; empty for none.
+        caption: what it shows, in sentences; words between backticks are shown as code.
+        within: file of the run folder that holds it; None for a file of its own, empty if only the page shows it.
+        full: table with all digits that a reader can take away from the page.
     """
 
     name: str
     title: str
     caption: str
+    within: str | None = field(default=None, kw_only=True)
+    full: Table | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         """Refuse names that are no file names."""
@@ -128,6 +163,21 @@ class Artefact:
     def kind(self) -> str:
         """``svg``, ``png``, ``csv`` or ``json``; also the ending of the file."""
         raise NotImplementedError
+
+    @property
+    def file(self) -> str:
+        """Path of its file in the run folder, empty if it has none."""
+        return f"artefacts/{self.name}.{self.kind}" if self.within is None else self.within
+
+    @property
+    def handed(self) -> Table | None:
+        """What a reader can take away from the page with all digits."""
+        return self.full
+
+    @property
+    def said(self) -> str:
+        """The caption, or what stands in its place."""
+        return self.caption
 
     def content(self) -> bytes:
         """What the file holds."""
@@ -144,6 +194,11 @@ class SvgFigure(Artefact):
     def kind(self) -> str:
         """Ending of the file."""
         return "svg"
+
+    @property
+    def drawing(self) -> Markup:
+        """The drawing for a page: made by this program, not by a user."""
+        return Markup(self.svg)
 
     def content(self) -> bytes:
         """The drawing as a file of its own."""
@@ -182,13 +237,23 @@ class Table(Artefact):
     """A table for the report, and as CSV; heads carry the units.
 
     ``decimals`` are those that the report shows of a column's numbers, None for so many significant ``digits``; the CSV
-    holds all digits.
+    holds all digits. ``over``: heads above the heads, each with the number of columns that it spans. ``bands``: row ->
+    title of the rows from there on, of a table in parts.
     """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     decimals: Sequence[int | None] = ()
     digits: int = 6
+    over: Sequence[tuple[str, int]] = ()
+    bands: Mapping[int, str] = field(default_factory=FrozenMap)
+
+    @property
+    def handed(self) -> Table | None:
+        """``full``, or itself if its cells are plain numbers and texts."""
+        if self.full is not None or any(isinstance(cell, Marked) for row in self.rows for cell in row):
+            return self.full
+        return self
 
     def shown(self) -> list[list[Cell]]:
         """The rows as the report shows them."""
@@ -200,6 +265,17 @@ class Table(Artefact):
             ]
             for row in self.rows
         ]
+
+    @property
+    def cells(self) -> list[list[Marked]]:
+        """The rows for a page."""
+        return [[cell if isinstance(cell, Marked) else Marked(cell_text(cell)) for cell in row] for row in self.shown()]
+
+    @property
+    def words(self) -> list[bool]:
+        """Whether a column holds words, which begin at its left, or numbers."""
+        columns = [[row[k] for row in self.rows] for k in range(len(self.heads))]
+        return [all(isinstance(cell, str) and _is_word(cell) for cell in column) for column in columns]
 
     def _text(self, value: float, place: int | None) -> str:
         if isinstance(value, OwnDecimals):
@@ -224,6 +300,19 @@ class Table(Artefact):
         return "data:text/csv;charset=utf-8;base64," + base64.b64encode(self.content()).decode("ascii")
 
 
+def cell_text(value: Cell) -> str:
+    """A cell of a table, with at most six digits."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
+
+
+def _is_word(cell: str) -> bool:
+    return not isinstance(cell, Marked) or not cell.look or cell.look.startswith(("text", "verdict"))
+
+
 @dataclass(frozen=True, eq=False)
 class Data(Artefact):
     """Plain data, kept as JSON and named in the report."""
@@ -238,6 +327,38 @@ class Data(Artefact):
     def content(self) -> bytes:
         """The data; NaN and infinities are refused."""
         return (json.dumps(self.data, indent=2, allow_nan=False) + "\n").encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Text(Artefact):
+    """Words of a report beside its figures and tables: ``caption`` is a paragraph, ``points`` are a list below it."""
+
+    points: Sequence[str] = ()
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "txt"
+
+    def content(self) -> bytes:
+        """The words."""
+        return "\n".join([self.caption, *self.points, ""]).encode()
+
+
+@dataclass(frozen=True, eq=False)
+class Piece(Artefact):
+    """A part of a page that this program wrote, with all texts of users escaped in it."""
+
+    markup: Markup
+
+    @property
+    def kind(self) -> str:
+        """Ending of the file."""
+        return "html"
+
+    def content(self) -> bytes:
+        """The part."""
+        return self.markup.encode()
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,6 +384,11 @@ class Undrawn(Artefact):
     def note(self) -> str:
         """What is missing, and why."""
         return f"the figure {self.title!r} could not be drawn: {self.why}"
+
+    @property
+    def said(self) -> str:
+        """The note as a sentence."""
+        return f"{self.note[0].upper()}{self.note[1:]}."
 
 
 @dataclass(frozen=True, eq=False)

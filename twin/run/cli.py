@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import signal
 import threading
 import time
@@ -31,11 +29,6 @@ from optics.numerics.llvm import LibraryMissing
 from scenes.yaml.errors import InputError
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.run.run_folder import RunFolderError
-
-# Python looks through all objects again and again for some that only refer to themselves. The imports of a command make
-# hundreds of thousands that stay, and at its end all that is left ends with the process
-gc.set_threshold(50_000)
-atexit.register(gc.freeze)
 
 BAD_INPUT, INTERRUPTED = 2, 128 + signal.SIGINT
 LARGEST_SEED = 2**63 - 1

@@ -6,16 +6,18 @@ import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from inspect import Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import Progress, TaskID
 
-from optics.numerics.backend import Backend, load_backend
+from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
+from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run.cli import (
     AsJson,
@@ -38,40 +40,13 @@ from twin.run.cli import (
     result_table,
 )
 from twin.run.ending_signals import exit_on_terminate
-from twin.run.procedure import Advance, Procedure, Run
+from twin.run.procedure import Advance, Session, performed
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 from twin.run.versions import program_digest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
-
-WRITE = "write the run folder"
-"""Name of the work in the progress display."""
-
-
-@dataclass(frozen=True)
-class Session:
-    """A command at work.
-
-    Attributes:
-        folder: its run folder, open.
-        backend: where to trace.
-        advance: shows the user how far it is.
-        started: seconds since the epoch.
-        clock: reading of the monotonic clock then.
-    """
-
-    folder: RunFolder
-    backend: Backend
-    advance: Advance
-    started: float
-    clock: float
-
-    @property
-    def seconds(self) -> float:
-        """Since the start."""
-        return time.monotonic() - self.clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +67,6 @@ class Result:
 
 
 Given = TypeVar("Given")
-
-Test: TypeAlias = "tuple[Procedure[Any, Run], Callable[[Run], Report]]"
-"""A test, and what makes the report of its run. A command imports them when it has read the file: its help and what is
-wrong with a file wait for neither.
-"""
 
 
 def run_command(
@@ -157,76 +127,53 @@ def _advance(bar: Progress, standing: Standing) -> Advance:
     return advance
 
 
-def add_test(
-    app: typer.Typer,
-    program: str,
-    command: str,
-    resolve: Callable[[Path], Any],
-    load: Callable[[], Test[Run]],
-    about: str,
-    export: Callable[[Run], Mapping[str, str | bytes]] | None = None,
-) -> None:
+def add_tests(app: typer.Typer, program: str) -> None:
+    """Add to a program all its tests of `PROCEDURES`: ``lab focus`` to ``lab``, as ``twin.lab focus``."""
+    for name, procedure in PROCEDURES.items():
+        of, command = name.split()
+        if of == program:
+            add_test(app, f"twin.{program}", command, procedure)
+
+
+def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure) -> None:
     """Add a test to a program as a subcommand with the options that all tests have.
 
     Args:
         app: of the program.
         program: as the user calls it, ``twin.lab``.
         command: the subcommand, ``focus``.
-        resolve: reads the test's file, as its procedure does.
-        load: imports the test and its report.
-        about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
-        export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
+        procedure: the test; one that exports has an option ``--export``.
     """
-    if export is not None:
 
-        @app.command(command, help=about)
-        def exporting_test(
-            file: File,
-            out: Out = None,
-            seed: Seed = None,
-            export_to: Export = None,
-            backend: BackendName = "llvm",
-            force: Force = False,
-            as_json: AsJson = False,
-            quiet: Quiet = False,
-        ) -> None:
-            options = Options(out, seed, backend, force, as_json, quiet, export_to)
-            run_test(program, command, file, resolve, load, options, export)
-
-        return
-
-    @app.command(command, help=about)
     def test(
         file: File,
         out: Out = None,
         seed: Seed = None,
+        export_to: Export = None,
         backend: BackendName = "llvm",
         force: Force = False,
         as_json: AsJson = False,
         quiet: Quiet = False,
     ) -> None:
-        run_test(program, command, file, resolve, load, Options(out, seed, backend, force, as_json, quiet))
+        run_test(program, command, procedure, file, Options(out, seed, backend, force, as_json, quiet, export_to))
+
+    if procedure.export is None:
+        # Typer makes the options from the signature
+        kept = [one for name, one in signature(test, eval_str=True).parameters.items() if name != "export_to"]
+        test.__signature__ = Signature(kept)  # type: ignore[attr-defined]
+        del test.__annotations__["export_to"]
+    app.command(command, help=procedure.about)(test)
 
 
-def run_test(
-    program: str,
-    command: str,
-    file: Path,
-    resolve: Callable[[Path], Any],
-    load: Callable[[], Test[Run]],
-    options: Options,
-    export: Callable[[Run], Mapping[str, str | bytes]] | None = None,
-) -> None:
+def run_test(program: str, command: str, procedure: Procedure, file: Path, options: Options) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
     Args:
         program: as the user calls it, ``twin.lab``.
         command: its subcommand, ``focus``.
+        procedure: the test; ``test`` of its set-up has a ``seed``.
         file: of the test.
-        resolve: reads it, as the test's procedure does; ``test`` of the set-up has a ``seed``.
-        load: imports the test and its report.
         options: what the user chose.
-        export: run -> path and contents of files with what was measured, where the test has any.
 
     Raises:
         typer.Exit: with the exit code of a failure, which has been told.
@@ -236,19 +183,18 @@ def run_test(
         from twin.run.page import RunFacts, write_test
         from twin.run.report import numbers_only, with_warnings
 
-        procedure, report = load()
         # a folder that cannot be made is told before the run
         folder = None if options.export is None else _export_folder(setup, options.export, options.force)
         number = setup.test.seed if options.seed is None else options.seed
-        run, given = procedure.performed(setup, session.backend, number, session.advance)
-        if folder is not None and export is not None:
+        run, given = performed(procedure, setup, session.backend, number, session.advance)
+        if folder is not None:
             with folder:
-                for name, content in export(run).items():
+                for name, content in procedure.export(run).items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
                 write_manifest(folder, program, session.started, session.seconds, **said)
         try:
-            made, problem = report(run), ""
+            made, problem = procedure.report(run), ""
         except Exception as error:  # minutes or hours of computing are not thrown away for a figure
             problem = "the report could not be made"
             made = numbers_only(f"{program} {command}", f"{procedure.kind}.json", error)
@@ -263,7 +209,7 @@ def run_test(
         told = described(procedure.kind, numbers)
         return Result(told, lambda console: print_report(shown, console), problem, shown.code)
 
-    run_command(file.stem, options, lambda: read_for(" ".join([program, command]).strip(), file, resolve), work)
+    run_command(file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work)
 
 
 def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
@@ -284,7 +230,7 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
 
 def print_report(report: Report, console: Console) -> None:
     """The verdict, the main table of a report, and what else was found."""
-    from twin.run.page import cell_text
+    from twin.run.artefact import cell_text
 
     print_verdict(console, report.verdict)
     summary = report.summary

@@ -1,47 +1,115 @@
-"""The command ``twin``: ``twin render JOB`` is ``python -m twin.render JOB``, from whatever folder it is started.
+"""The command ``camtwin``: every program under one name, from whatever folder it is started.
 
-Unlike ``python -m`` it never looks for modules where it is started, not even for one that is named ``twin.py``.
+``camtwin render JOB`` is ``python -m twin.render JOB``, but it never looks for modules where it is started, not even
+for one that is named ``twin.py``. Names and lines of the programs stand here, so that help and completion of the
+first word import none of them.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 import runpy
 import sys
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import typer
 
 PROGRAMS = {
-    "render": "twin.render",
-    "recover": "twin.recover",
-    "lab": "twin.lab",
-    "orbit": "twin.orbit",
-    "study": "twin.study",
-    "design": "twin.design",
-    "mtf": "analysis.mtf",
-    "lens": "scenes.lens",
-    "schema": "scenes.schema",
-    "camera": "twin.camera",
-    "compare": "twin.compare",
-    "doctor": "twin.doctor",
-    "export": "twin.export",
-    "live": "twin.live",
-    "uncertainty": "twin.uncertainty",
-    "validate": "twin.validate",
-    "verify": "twin.verify",
+    "render": ("twin.render", "perturb an instrument, render its images, recover the changes"),
+    "recover": ("twin.recover", "recover the same from measured frames"),
+    "live": ("twin.live", "the twin in a browser: turn a knob, the spots move"),
+    "lab": ("twin.lab", "laboratory tests: focus, distortion, turntable"),
+    "orbit": ("twin.orbit", "angle, calibrate, check, export, match, monitor, simulate"),
+    "study": ("twin.study", "vary any key of a job; statistics, sensitivities, gradients"),
+    "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
+    "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
+    "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
+    "mtf": ("analysis.mtf", "MTF from a slanted edge or bars in any image"),
+    "uncertainty": ("twin.uncertainty", "what limits a monitor, and whether its sigmas hold"),
+    "compare": ("twin.compare", "what differs between run folders"),
+    "verify": ("twin.verify", "is a run folder intact, does its run come out the same again"),
+    "export": ("twin.export", "frames and tables of a run folder for other programs"),
+    "validate": ("twin.validate", "the papers' equations and tables, printed beside measured"),
+    "schema": ("scenes.schema", "JSON Schemas of the YAML files, for editors"),
+    "doctor": ("twin.doctor", "can this machine run the twin"),
 }
-"""First word -> the module that is run."""
+"""First word -> the module that is run, and one line of what it does."""
+COMPLETE = "_CAMTWIN_COMPLETE"
+"""Variable by which a shell asks for completions."""
+_BEFORE = __name__.removesuffix("twin.run.console")
+"""What stands before the modules' names where the packages were installed within another one; else nothing."""
+
+
+@cache
+def parser(program: str) -> Any:
+    """The command of a program, with its parser; of a program with subcommands the group.
+
+    Raises:
+        LookupError: neither a Typer application ``app`` nor a function ``main``.
+    """
+    import typer
+
+    module = importlib.import_module(_BEFORE + program)
+    if hasattr(module, "__path__"):
+        module = importlib.import_module(f"{_BEFORE}{program}.__main__")
+    app = getattr(module, "app", None)
+    if app is None:
+        if not hasattr(module, "main"):
+            raise LookupError(f"{program}: neither app nor main")
+        app = typer.Typer(add_completion=False)
+        app.command()(module.main)
+    return typer.main.get_command(app)
+
+
+def _application() -> typer.Typer:
+    """Help, version, completion and what is wrong with the first word; the programs themselves only by their lines."""
+    import typer
+    from typer.core import TyperCommand, TyperGroup
+
+    class Programs(TyperGroup):
+        def __init__(self, **attrs: Any) -> None:
+            lines = {name: TyperCommand(name, short_help=line) for name, (_, line) in PROGRAMS.items()}
+            super().__init__(**{**attrs, "commands": lines})
+
+        def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+            """With the program's own parser: only completion comes here."""
+            name, command, rest = super().resolve_command(ctx, args)
+            return name, parser(PROGRAMS[args[0]][0]) if command else command, rest
+
+    app = typer.Typer(cls=Programs, rich_markup_mode=None, pretty_exceptions_enable=False, no_args_is_help=True)
+
+    def told(asked: bool) -> None:
+        if asked:
+            from importlib.metadata import version
+
+            place = Path(__file__).resolve().parents[2]
+            sys.stdout.write(f"camtwin {version('space-camera-twin')} from {place}\n")
+            raise typer.Exit
+
+    @app.callback()
+    def every(
+        version: bool = typer.Option(
+            False, "--version", callback=told, is_eager=True, help="Show the version and exit."
+        ),
+    ) -> None:
+        """A digital twin of space mapping cameras and of their on-board autocollimation monitor.
+
+        camtwin PROGRAM --help says more.
+        """
+
+    return app
 
 
 def main() -> None:
     """Run the program that the first word names, with the words after it."""
     # for processes that are started from here
     os.environ["PYTHONSAFEPATH"] = "1"
-    name, *words = sys.argv[1:] or [""]
-    if name in ("", "-h", "--help"):
-        listed = "\n".join(f"  twin {name:12} python -m {module}" for name, module in PROGRAMS.items())
-        sys.stdout.write(f"Usage: twin PROGRAM ...\n\n{listed}\n\ntwin PROGRAM --help says more.\n")
-        sys.exit(0 if name else 2)
-    if name not in PROGRAMS:
-        sys.stderr.write(f"unknown program {name!r}; choose {', '.join(PROGRAMS)}\n")
-        sys.exit(2)
-    sys.argv[1:] = words
-    runpy.run_module(PROGRAMS[name], run_name="__main__", alter_sys=True)
+    if sys.argv[1:2] and sys.argv[1] in PROGRAMS and COMPLETE not in os.environ:
+        module, _ = PROGRAMS[sys.argv.pop(1)]
+        runpy.run_module(_BEFORE + module, run_name="__main__", alter_sys=True)
+    else:
+        _application()(prog_name="camtwin")

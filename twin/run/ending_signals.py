@@ -16,20 +16,32 @@ def ending_signals() -> tuple[signal.Signals, ...]:
 
 @contextmanager
 def exit_on_terminate() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the program as an exception, so that a half-written run folder is removed."""
+    """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a half-written run folder is
+    removed. The exception that leaves the block is the signal's whatever became of it on its way: compiled modules turn
+    one that comes while they are imported or call back into their own, and clearing up may fail after it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     got: list[int] = []
 
     def leave(number: int, frame: object) -> None:
-        if not got:  # a second one must not break off the clearing up
-            got.append(number)
+        got.append(number)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if len(got) == 1:  # a second one must not break off the clearing up
             raise SystemExit(128 + number)
 
-    before = {number: signal.signal(number, leave) for number in ending_signals()}
+    asked = ending_signals()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        asked = (*asked, signal.SIGINT)
+    before = {number: signal.signal(number, leave) for number in asked}
     try:
         yield
+    except BaseException as error:
+        if got:
+            raise (KeyboardInterrupt() if got[0] == signal.SIGINT else SystemExit(128 + got[0])) from error
+        raise
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -7,6 +7,8 @@ does not know (pixels, waves, grey values) is a count: its ``units`` are 1, and 
 from __future__ import annotations
 
 import importlib.metadata
+import io
+import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +40,25 @@ def netcdf(data: xr.Dataset) -> bytes:
     if isinstance(view, memoryview):
         view.release()
     return content
+
+
+def read_netcdf(content: bytes) -> xr.Dataset:
+    """The data set in the bytes of a netCDF file, loaded whole; units of time stay as they are written.
+
+    Raises:
+        Exception: the file is damaged, in whatever way the libraries stumble over it; also where they would only warn.
+    """
+    import h5py
+    import xarray as xr
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # where HDF5 cannot open it, h5netcdf would leave half an object that prints an error of its own later
+        with h5py.File(io.BytesIO(content)):
+            pass
+        # read from memory, since of a damaged file the library leaves the file open
+        with xr.open_dataset(io.BytesIO(content), engine="h5netcdf", decode_timedelta=False) as data:
+            return data.load()
 
 
 def follow_cf(data: xr.Dataset) -> xr.Dataset:

@@ -1,83 +1,49 @@
-"""Templates of the reports, artefacts as they want them, and the run folder of a test."""
+"""The page of a report, and the run folder of a test."""
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from markupsafe import Markup, escape
 
-from twin.run.artefact import Artefact, Cell, Data, PngFigure, SvgFigure, Table, Undrawn, plain, significant
+from twin.run.artefact import Artefact
 from twin.run.data_files import FrameFacts, frame_files
 from twin.run.further_sections import further_sections
 from twin.run.page_policy import page_policy
 from twin.run.provenance import SelfCheck, checks_in, inputs_in
 from twin.run.reference_frames import described
-from twin.run.report import Report, Section
+from twin.run.report import Report
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.versions import versions
 
-SHARED = "twin.run"
-"""Package of the style sheet and of the macros."""
+
+def inline(text: str) -> Markup:
+    """A text for a page, escaped; what stands between backticks is code."""
+    return text if isinstance(text, Markup) else Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
 
 
-def environment(package: str) -> Environment:
-    """Environment that finds the templates of ``package`` and the shared ones."""
-    loader = FileSystemLoader([str(files(package)), str(files(SHARED))])
-    out = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    out.globals["page_policy"] = page_policy
-    return out
+_CODE = re.compile("`([^`]+)`")
+
+
+@cache
+def _template() -> Template:
+    loader = FileSystemLoader(str(files(__package__)))
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.globals["page_policy"], made.filters["inline"] = page_policy, inline
+    return made.get_template("page.html.j2")
 
 
 def reproduce(words: Sequence[str]) -> str:
     """The command line of a program, its subcommand and options that makes a run again, as one types it."""
     return f"python -m {shlex.join(words)} --out again"
-
-
-def artefact_content(artefact: Artefact, file: str | None) -> dict[str, Any]:
-    """An artefact, and the file that holds it, for the macro ``show``."""
-    out: dict[str, Any] = {
-        "name": artefact.name,
-        "title": artefact.title,
-        "caption": artefact.caption,
-        "file": file,
-        "svg": None,
-        "image": None,
-        "table": None,
-        "csv": None,
-    }
-    if isinstance(artefact, SvgFigure):
-        # drawn by this program, not by a user
-        out["svg"] = Markup(artefact.svg)
-    elif isinstance(artefact, PngFigure):
-        out["image"] = artefact.address
-    elif isinstance(artefact, Table):
-        rows = [[cell_text(value) for value in row] for row in artefact.shown()]
-        texts = [all(isinstance(row[k], str) for row in artefact.rows) for k in range(len(artefact.heads))]
-        out["table"] = {"heads": artefact.heads, "rows": rows, "texts": texts}
-        out["csv"] = artefact.address
-    elif isinstance(artefact, Undrawn):
-        out["caption"] = f"{artefact.note[0].upper()}{artefact.note[1:]}."
-    elif not isinstance(artefact, Data):
-        raise TypeError(f"the report cannot show {type(artefact).__name__}")
-    return out
-
-
-def cell_text(value: Cell) -> str:
-    """A cell of a table, with at most six digits."""
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        return value
-    return plain(value) if isinstance(value, int) else significant(value, 6, floor=0.0)
-
-
-TEMPLATE = "test.html.j2"
 
 
 @dataclass(frozen=True)
@@ -133,48 +99,57 @@ class RunFacts:
         return {"again": list(self.words), **place, "inputs": inputs_in(self.named, self.given), "checks": checks}
 
 
-def place(artefact: Artefact) -> str:
-    """File of an artefact in the run folder."""
-    return f"artefacts/{artefact.name}.{artefact.kind}"
-
-
 def write_artefacts(artefacts: Iterable[Artefact], folder: RunFolder) -> None:
-    """Write artefacts to their places in an open run folder."""
+    """Write artefacts that have files of their own into an open run folder."""
     for artefact in artefacts:
-        folder.write_bytes(place(artefact), artefact.content())
+        if artefact.within is None:
+            folder.write_bytes(artefact.file, artefact.content())
 
 
-def section_contents(sections: Sequence[Section]) -> list[dict[str, Any]]:
-    """Sections as the templates want them."""
-    return [
-        {
-            "title": section.title,
-            "folded": section.folded,
-            "text": section.text,
-            "artefacts": [artefact_content(a, place(a)) for a in section.artefacts],
-        }
-        for section in sections
-    ]
+def links(names: Iterable[str]) -> Markup:
+    """Files of the run folder, for the last table of a page."""
+    return Markup(", ").join(Markup('<a href="{0}">{0}</a>').format(name) for name in names)
+
+
+def report_page(
+    report: Report,
+    words: Sequence[str],
+    rows: Sequence[tuple[str, str]] = (),
+    config: str = "",
+    programs: Sequence[str] = (),
+    scripts: str = "",
+) -> str:
+    """A report as one page that needs no other file.
+
+    Args:
+        report: what it says.
+        words: of the command that makes the run again, program first.
+        rows: of its last table, (label, text), before the versions.
+        config: all that was resolved, for readers; empty if the page does not show it.
+        programs: scripts of its own that the page may run, as the policy wants them.
+        scripts: the elements that hold them, written by this program.
+    """
+    return _template().render(
+        report=report,
+        command=reproduce(words),
+        rows=rows,
+        versions=", ".join(f"{name} {version}" for name, version in versions().items()),
+        config=config,
+        programs=programs,
+        scripts=Markup(scripts),
+    )
 
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
-    """``report.html`` as text; its numbers are in KIND.json."""
-    return (
-        environment(__package__)
-        .get_template(TEMPLATE)
-        .render(
-            kind=kind,
-            title=report.title,
-            verdict=report.verdict,
-            warnings=report.warnings,
-            report=report,
-            summary=artefact_content(report.summary, place(report.summary)),
-            sections=section_contents(report.sections),
-            facts=facts,
-            command=reproduce(facts.words),
-            versions=versions(),
-        )
-    )
+    """``report.html`` of a test as text; its numbers are in KIND.json."""
+    rows: list[tuple[str, str]] = [("Numbers", links((f"{kind}.json", "config.yaml")))]
+    if report.images:
+        images = (Markup('<a href="images/{0}.tiff">{0}.tiff</a>').format(name) for name in report.images)
+        rows.append(("Images", Markup(", ").join(images)))
+    if facts.backend:
+        seed = "" if facts.seed is None else f"{facts.seed}, "
+        rows.append(("Seed, backend" if seed else "Backend", f"{seed}{facts.backend}, float64; {facts.seconds:.1f} s"))
+    return report_page(report, facts.words, rows)
 
 
 def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: RunFacts, folder: RunFolder) -> None:
@@ -190,7 +165,7 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
     folder.write_json(f"{kind}.json", described(kind, numbers))
-    write_artefacts((report.summary, *(a for section in report.sections for a in section.artefacts)), folder)
+    write_artefacts(report.artefacts, folder)
     for name, frames in report.images.items():
         for file, content in frame_files(name, frames, report.image_facts.get(name, FrameFacts()), stretch=None):
             folder.write_bytes(file, content)

@@ -8,14 +8,21 @@ from typing import Any
 
 import numpy as np
 
+from optics.numerics.frozen_map import FrozenMap
+
+WHERE_KNOWN: Mapping[str, Any] = FrozenMap({"where known": True})
+"""Metadata of a dataclass's field that a file has only where it is known: None leaves its key out. Measurements have no
+truth, for example, and a simulation no files that were read.
+"""
+
 
 def plain_data(value: Any) -> Any:
     """What JSON can hold of a value.
 
     Args:
         value: None, a string, a truth value, a number, an array, a sequence, a mapping with strings as keys, or a
-            dataclass, whose fields are written in their order; all of them may be nested. Units are the business of
-            whoever makes the dataclass: nothing is converted here.
+            dataclass, whose fields are written in their order, without those of `WHERE_KNOWN` that are None; all of
+            them may be nested. Units are the business of whoever makes the dataclass: nothing is converted here.
 
     Returns:
         dict, list, str, int, float, bool or None.
@@ -30,7 +37,9 @@ def plain_data(value: Any) -> Any:
     if isinstance(value, float | np.floating):
         return float(value)
     if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain_data(getattr(value, field.name)) for field in fields(value)}
+        own = {one.name: getattr(value, one.name) for one in fields(value)}
+        gone = {one.name for one in fields(value) if one.metadata == WHERE_KNOWN and own[one.name] is None}
+        return {name: plain_data(item) for name, item in own.items() if name not in gone}
     if isinstance(value, Mapping):
         if other := [key for key in value if not isinstance(key, str)]:
             raise TypeError(f"a key that is no text: {other[0]!r}")

@@ -1,19 +1,27 @@
-"""What a test is to whatever runs it: reading its file, running it, its numbers as plain data; and how it fails."""
+"""A test being run: how far it is, and how it fails."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
+from scenes.specs.procedures import Procedure
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, KeyPath
 
+if TYPE_CHECKING:
+    from twin.run.run_folder import RunFolder
+
 Advance = Callable[[str, int, int], None]
 """Told what is being done, and how many of how many parts of it are."""
+
+
+WRITE = "write the run folder"
+"""Name of the last part of a command's work."""
 
 
 def silent(part: str, done: int, total: int) -> None:
@@ -34,53 +42,59 @@ class BenchError(PhysicalError):
         self.remedy = remedy
 
 
-Setup = TypeVar("Setup", bound=ExperimentSetup[Any])
-Run = TypeVar("Run")
+def performed(
+    procedure: Procedure, setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
+) -> tuple[Any, tuple[str, ...]]:
+    """Run a test.
+
+    Args:
+        procedure: the test.
+        setup: what its file says.
+        backend: where to trace.
+        seed: of all that is drawn.
+        advance: told of the progress.
+
+    Returns:
+        Everything that was computed, and what the user should know of what the test was given.
+
+    Raises:
+        InputError: also for what fails on the bench, at the key that can change it; with what is wrong with what
+            the test was given, which may be the reason.
+    """
+    given: tuple[str, ...] = ()
+    if procedure.judged:
+        # a command is told of a bad file before this is imported
+        from scenes.models.camera_sharpness import blur_warnings
+
+        given = blur_warnings(setup, backend)
+    try:
+        return procedure.run(setup, backend, seed, advance), given
+    except BenchError as error:
+        told = setup.test.error(str(error), error.key, allowed=error.remedy)
+        raise InputError(*told.issues, *(Issue(text) for text in given)) from error
+    except InputError as error:
+        raise InputError(*error.issues, *(Issue(text) for text in given)) from error
 
 
 @dataclass(frozen=True)
-class Procedure(Generic[Setup, Run]):
-    """A test, of whose run a command makes a report and a study takes the numbers.
-
-    No module that a procedure needs draws anything or fills a template.
+class Session:
+    """A command at work.
 
     Attributes:
-        kind: of `twin.run.reference_frames.FRAMES`, for example ``focus``; KIND.json begins with them.
-        setup: class of the test with all it refers to; has ``test``, ``with_seed`` and ``to_yaml``.
-        resolve: file, or the name of one in the library -> set-up. Raises InputError.
-        run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
-        numbers: run -> what KIND.json holds, plain data; keys end in their unit.
-        judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
-        seeded: whether anything is drawn at random; the command then has an option --seed.
+        folder: its run folder, open.
+        backend: where to trace.
+        advance: shows the user how far it is.
+        started: seconds since the epoch.
+        clock: reading of the monotonic clock then.
     """
 
-    kind: str
-    setup: type[Setup]
-    resolve: Callable[[Path | str], Setup]
-    run: Callable[[Setup, Backend, int, Advance], Run]
-    numbers: Callable[[Run], Mapping[str, Any]]
-    judged: bool = True
-    seeded: bool = True
+    folder: RunFolder
+    backend: Backend
+    advance: Advance
+    started: float
+    clock: float
 
-    def performed(
-        self, setup: Setup, backend: Backend, seed: int, advance: Advance = silent
-    ) -> tuple[Run, tuple[str, ...]]:
-        """Run it, and what the user should know of what it was given.
-
-        Raises:
-            InputError: also for what fails on the bench, at the key that can change it; with what is wrong with what
-                the test was given, which may be the reason.
-        """
-        given: tuple[str, ...] = ()
-        if self.judged:
-            # a command is told of a bad file before this is imported
-            from scenes.models.camera_sharpness import blur_warnings
-
-            given = blur_warnings(setup, backend)
-        try:
-            return self.run(setup, backend, seed, advance), given
-        except BenchError as error:
-            told = setup.test.error(str(error), error.key, allowed=error.remedy)
-            raise InputError(*told.issues, *(Issue(text) for text in given)) from error
-        except InputError as error:
-            raise InputError(*error.issues, *(Issue(text) for text in given)) from error
+    @property
+    def seconds(self) -> float:
+        """Since the start."""
+        return time.monotonic() - self.clock

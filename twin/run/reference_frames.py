@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.procedures import PROCEDURES
 
 __all__ = ["FRAMES", "described", "frames_text", "schema"]
 
@@ -195,9 +196,10 @@ def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """The data of a file with its schema and its frames before them.
 
     Raises:
-        KeyError: a kind without an entry in `FRAMES`.
+        KeyError: a kind without an entry in `FRAMES` or a test's `frames` of its own.
     """
-    return {"schema": schema(kind), "reference_frames": dict(FRAMES[kind]), **data}
+    own = {procedure.kind: procedure.frames for procedure in PROCEDURES.values()}
+    return {"schema": schema(kind), "reference_frames": dict(FRAMES[kind] if kind in FRAMES else own[kind]), **data}
 
 
 def frames_text(kind: str) -> str:

@@ -22,12 +22,16 @@ class Section:
         text: paragraphs, plain text.
         artefacts: figures, tables and data in the order in which they are shown; their names are unique in a report.
         folded: number of the last of them that a reader has to ask for.
+        name: by which the head of the page leads to it; empty for a section that is not listed there.
+        closed: a reader has to ask for all of it.
     """
 
     title: str
     text: tuple[str, ...] = ()
     artefacts: tuple[Artefact, ...] = ()
     folded: int = 0
+    name: str = ""
+    closed: bool = False
 
 
 def one_sentence(*parts: str) -> str:
@@ -53,6 +57,7 @@ class Report:
         warnings: what the user should know before using the numbers.
         image_facts: name of images -> what is known of these frames; of some or all.
         code: exit code of the command, of a test whose answer it is.
+        conclusions: what follows from the numbers, sentence by sentence, before all tables.
     """
 
     title: str
@@ -65,13 +70,18 @@ class Report:
     warnings: tuple[str, ...] = ()
     image_facts: Mapping[str, FrameFacts] = field(default_factory=FrozenMap)
     code: int = 0
+    conclusions: tuple[str, ...] = ()
+
+    @property
+    def artefacts(self) -> tuple[Artefact, ...]:
+        """All that it shows, the main table first."""
+        return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
 
     def __post_init__(self) -> None:
         """Refuse a verdict that is not one sentence, and two artefacts of one name: they would be one file."""
         if not self.verdict.endswith(".") or re.search(r"[.!?]\s+[A-Z]", self.verdict):
             raise ValueError(f"not one sentence: {self.verdict!r}")
-        names = [artefact.name for section in self.sections for artefact in section.artefacts]
-        names.append(self.summary.name)
+        names = [artefact.name for artefact in self.artefacts if artefact.within is None]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"more than one artefact is called {', '.join(twice)}")

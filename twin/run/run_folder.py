@@ -159,7 +159,15 @@ class RunFolder:
 
     def _publish(self) -> None:
         assert self._unfinished is not None
+        # the manifest vouches for the rest, and has its name once that is on the disk
+        manifest, waiting = self.path / MANIFEST, self.path / f".{MANIFEST}{PARTIAL}"
+        vouched = manifest.exists()
+        if vouched:
+            os.rename(manifest, waiting)
         sync_tree(self.path)
+        if vouched:
+            os.rename(waiting, manifest)
+            sync_folder(self.path)
         with ending_later():
             if self.force and self.target.exists():
                 old = self._unfinished.path(OLD)

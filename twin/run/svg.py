@@ -6,11 +6,14 @@ import re
 from contextlib import AbstractContextManager
 from functools import cache
 from io import BytesIO, StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 if TYPE_CHECKING:  # who only names colours does not wait for what draws
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 # Okabe and Ito's palette: told apart with any colour vision.
 BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
@@ -22,9 +25,12 @@ BLUE, ORANGE, GREEN, VERMILION, SKY, PURPLE, YELLOW = (
     "#CC79A7",
     "#F0E442",
 )
-INK, GREY, LIGHT = "#1b1f24", "#6b7280", "#d9dde3"
+BROWN = "#7a4a12"
+INK, GREY, LIGHT, SHADE = "#1b1f24", "#6b7280", "#d9dde3", "#eef3f8"
 BEFORE, AFTER = SKY, VERMILION
 """Centroid marks."""
+GRAY, DIVERGING = "gray", "RdBu_r"
+"""Colour maps of images and of what has a sign."""
 
 STYLE: dict[str, Any] = {
     "font.size": 9.0,
@@ -111,3 +117,32 @@ def to_png(figure: Figure, dpi: int) -> bytes:
 def plain_axes(axes: Axes) -> None:
     """Only the left and the bottom axis line."""
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
+    """Light lines behind what is drawn, and only the left and the bottom axis line."""
+    axes.grid(axis=which, color=LIGHT, lw=0.5)
+    axes.set_axisbelow(True)
+    plain_axes(axes)
+
+
+def shared_legend(
+    figure: Figure, axes: Axes, place: str = "upper center", columns: int | None = None, **how: Any
+) -> None:
+    """A legend beside all panels, of what one of them shows; in one row unless ``columns`` are given."""
+    handles, labels = axes.get_legend_handles_labels()
+    outside: Any = f"outside {place}"
+    figure.legend(handles, labels, loc=outside, ncols=columns or max(len(labels), 1), **how)
+
+
+def signed_map(axes: Axes, values: np.ndarray, most: float | None = None, **how: Any) -> AxesImage:
+    """An image of (rows, columns) numbers with a sign, white at zero.
+
+    Args:
+        axes: where.
+        values: the numbers; NaN is left out.
+        most: size of the deepest colours; None for the largest number's.
+        how: more for ``imshow``.
+    """
+    most = (float(np.nanmax(np.abs(values))) or 1.0) if most is None else most
+    return axes.imshow(values, cmap=DIVERGING, vmin=-most, vmax=most, **how)

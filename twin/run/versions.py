@@ -60,6 +60,10 @@ def _version(package: str) -> str | None:
 
 
 ROOT = Path(__file__).resolve().parents[2]
+BEFORE = __name__.removesuffix("twin.run.versions")
+"""What stands before the names of modules: nothing in a source tree, in a wheel the one package that holds all others
+(docs/wheel).
+"""
 SOURCES = ("analysis", "optics", "scenes", "twin")
 NOT_IN_RUNS = ("twin/validation/",)
 """No run of a study needs these."""
@@ -77,8 +81,14 @@ def sources() -> dict[str, str]:
         for path in sorted((ROOT / package).rglob("*.py")):
             name = path.relative_to(ROOT).as_posix()
             if not name.startswith(NOT_IN_RUNS):
-                out[name] = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+                out[name] = _checksum(path)[:16]
     return out
+
+
+def _checksum(path: Path) -> str:
+    """Of a file as the source tree has it."""
+    text = path.read_bytes()
+    return hashlib.sha256(text.replace(BEFORE.encode(), b"") if BEFORE and path.suffix == ".py" else text).hexdigest()
 
 
 def source_digest() -> str:
@@ -99,5 +109,5 @@ def program_digest() -> str:
     for package in SOURCES:
         for path in sorted((ROOT / package).rglob("*")):
             if path.suffix in ENDINGS and path.is_file():
-                every[path.relative_to(ROOT).as_posix()] = hashlib.sha256(path.read_bytes()).hexdigest()
+                every[path.relative_to(ROOT).as_posix()] = _checksum(path)
     return hashlib.sha256(json.dumps(every, sort_keys=True).encode()).hexdigest()

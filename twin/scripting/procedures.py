@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -12,14 +12,14 @@ from typing import Any
 import pandas as pd
 
 from optics.numerics.backend import load_backend
+from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
 from scenes.yaml.spec import Source, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.laboratory.laboratory_tests import LABORATORY_TESTS
-from twin.orbit.orbit_tests import ORBIT_TESTS
-from twin.run.command import Test
-from twin.run.page import RunFacts, cell_text, write_test
+from twin.run.artefact import cell_text
+from twin.run.page import RunFacts, write_test
+from twin.run.procedure import performed
 from twin.run.report import Report, with_warnings
 from twin.run.run_folder import RunFolder
 
@@ -88,26 +88,25 @@ def perform(
     Raises:
         InputError: no such test, file or key; or the test failed on its bench, with the key to be changed.
     """
-    if name not in TESTS:
-        raise InputError(
-            Issue("no such test", found=repr(name), allowed=names_text(TESTS), suggestion=nearest(name, TESTS))
-        )
-    procedure, report = TESTS[name]()
+    if name not in PROCEDURES:
+        meant = nearest(name, PROCEDURES)
+        raise InputError(Issue("no such test", found=repr(name), allowed=names_text(PROCEDURES), suggestion=meant))
+    procedure = PROCEDURES[name]
     setup = procedure.resolve(file)
     if changes:
         tree = setup.plain()
         tree["test"] = _merged(tree["test"], changes)
         source = setup.test.source
-        setup = validate(procedure.setup, YamlFile("", tree, {}))
+        setup = validate(procedure.model, YamlFile("", tree, {}))
         setup = setup.model_copy(update={"test": setup.test.with_source(Source(source.file))})
     number = setup.test.seed if seed is None else seed
     started, clock = time.time(), time.monotonic()
-    run, given = procedure.performed(setup, load_backend(backend), number)
+    run, given = performed(procedure, setup, load_backend(backend), number)
     program, command = name.split()
     seeded, seconds = setup.with_seed(number), time.monotonic() - clock
     told = (seeded.to_yaml(), str(file), backend, number, started, seconds, f"twin.{program}", command)
     facts = RunFacts(*told, named=seeded.plain())
-    shown = with_warnings(report(run), given)
+    shown = with_warnings(procedure.report(run), given)
     numbers = {**procedure.numbers(run), "verdict": shown.verdict}
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
@@ -119,10 +118,3 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
         both = isinstance(value, Mapping) and isinstance(inner, Mapping)
         out[key] = _merged(inner, value) if both and isinstance(inner, Mapping) else value
     return out
-
-
-TESTS: dict[str, Callable[[], Test[Any]]] = {
-    **{f"lab {name}": load for name, load in LABORATORY_TESTS.items()},
-    **{f"orbit {name}": load for name, load in ORBIT_TESTS.items()},
-}
-"""As the commands are called -> what runs a test and what shows it."""

@@ -22,8 +22,7 @@ from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import RenderRun
 from twin.main_job.verdict import judge
-from twin.run.command import Session
-from twin.run.procedure import silent
+from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_result import PlaceTargets
@@ -69,7 +68,7 @@ class Shot:
             RunFolderError: it is there already, or cannot be written.
         """
         # what draws waits until it is asked for
-        from twin.main_job.render_command import write_run
+        from twin.main_job.render_folder import write_run
 
         with RunFolder(Path(folder), force) as target:
             clock = time.monotonic() - self._seconds

@@ -202,7 +202,7 @@ class _Display:
 
 
 def _print_result(run: StudyRun) -> None:
-    from twin.run.page import cell_text
+    from twin.run.artefact import cell_text
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"

@@ -11,7 +11,8 @@ from rich.console import Console
 from scenes.kinds.file_kinds import read_for
 from scenes.models.camera_sharpness import blur_warnings
 from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
-from twin.run.command import WRITE, Result, Session, print_warnings, run_command
+from twin.run.command import Result, print_warnings, run_command
+from twin.run.procedure import WRITE, Session
 from twin.run.provenance import inputs_in
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest

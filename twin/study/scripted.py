@@ -100,7 +100,7 @@ def study(
         file, target = place / "config.yaml", place / "study" if out is None else Path(out)
         file.write_text(config, "utf-8")
         # A process of its own: workers started from here would run the caller's script once more, each of them.
-        command = [sys.executable, "-m", "twin.study", str(file), "--out", str(target), "--yes", "--json"]
+        command = [sys.executable, "-m", str(__package__), str(file), "--out", str(target), "--yes", "--json"]
         command += [] if workers is None else ["--workers", str(workers)]
         done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE if quiet else None, text=True)
         if done.returncode:

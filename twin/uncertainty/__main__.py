@@ -14,7 +14,8 @@ import typer
 
 from scenes.specs.resolved import ResolvedJob, resolve_with
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
-from twin.run.command import Result, Session, print_report, run_command
+from twin.run.command import Result, print_report, run_command
+from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"

@@ -15,12 +15,12 @@ from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Quantity
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import Recovery, recover
-from analysis.spots.spot_positions import SpotError
+from analysis.monitor.recovery import Recovery
 from analysis.units import ARCSEC
-from optics.numerics.threads import cores, one_blas_thread
+from optics.numerics.threads import cores
 from scenes.models.disturbances import state_of
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe
 from twin.monitor.truth import Truth
 from twin.run.procedure import Advance, silent
 from twin.run.random_streams import stream
@@ -31,7 +31,7 @@ HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in L
 """The same in standard deviations of a normal error."""
 FALSE = 1e-2
 """Chance that any of all counts falls out of its limits though every sigma is right."""
-CHUNK = 40
+CHUNK = 32
 """States that are rendered at once; the numbers do not depend on it."""
 STATES = "random states"
 _DRAWN, _DETECTOR, _BEFORE, _AFTER = 9, 10, 11, 12
@@ -156,33 +156,31 @@ def run_states(
     chances: dict[str, list[np.ndarray]] = {}
     squares: list[float] = []
     alarms = doubted = 0
+
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return _exposed(experiment, photons, frames, seed, numbers)
+
+    # what cannot be measured is left out, and counted by the difference to what is drawn
+    how = Observing(record, experiment.resolved.job.analysis.centroid, CHUNK, leave=lambda number, why: None)
     for first in range(0, count, CHUNK):
         advance(STATES, first, count)
         states = [state_of(row, stated.components, experiment.thermal) for row in amounts[first : first + CHUNK]]
         place = experiment.path.coarse_trace(states).place
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
-        if not len(kept):
-            continue
-        some = [states[k] for k in kept]
-        photons = experiment.path.expected_photons(some)
         # streams of its own for each state, whichever others were lost
-        before, after = _exposed(experiment, photons, frames, seed, first + kept)
-        found, good = _recovered(experiment, before, after)
-        if found is None:
-            continue
-        some = [some[k] for k in good]
-        true.append(_true(experiment.sight.truth(some), experiment, quantities))
-        for name, values, sigmas in _read(found, quantities):
-            read.setdefault(name, []).append(values)
-            sigma.setdefault(name, []).append(sigmas)
-        for name, chance in _chances(found, experiment, quantities).items():
-            chances.setdefault(name, []).append(chance)
-        for k in range(len(some)):
-            told = found.consistency(disturbances, k)
-            squares.append(told.chi_square)
-            alarms += not told.agrees
-            fits = found.evidence is None or bool(found.evidence.holds[k])
-            doubted += not (fits and all(curvature.holds[k] for curvature in found.curvature.values()))
+        for found in observe(experiment, [states[k] for k in kept], how, first + kept):
+            true.append(_true(found.truth, experiment, quantities))
+            for name, values, sigmas in _read(found.recovery, quantities):
+                read.setdefault(name, []).append(values)
+                sigma.setdefault(name, []).append(sigmas)
+            for name, chance in _chances(found.recovery, experiment, quantities).items():
+                chances.setdefault(name, []).append(chance)
+            for k in range(len(found.numbers)):
+                told = found.recovery.consistency(disturbances, k)
+                squares.append(told.chi_square)
+                alarms += not told.agrees
+                fits = found.recovery.evidence is None or bool(found.recovery.evidence.holds[k])
+                doubted += not (fits and all(curvature.holds[k] for curvature in found.recovery.curvature.values()))
     advance(STATES, count, count)
     truth = np.concatenate(true) if true else np.empty((0, len(quantities)))
     readings = {name: np.concatenate(parts) for name, parts in read.items()}
@@ -201,31 +199,6 @@ def run_states(
         alarms=alarms,
         doubted=doubted,
     )
-
-
-def _recovered(
-    experiment: MonitorExperiment, before: np.ndarray, after: np.ndarray
-) -> tuple[Recovery | None, list[int]]:
-    """What the images say, and of which states: those of whose spots enough is on the CCDs. None if there are none."""
-    good, spots = list(range(len(after))), after.shape[1]
-    centroid = experiment.resolved.job.analysis.centroid
-    while good:
-        try:
-            with one_blas_thread():
-                found = recover(
-                    before[good],
-                    after[good],
-                    experiment.calibration,
-                    centroid,
-                    cores(),
-                    experiment.disturbances,
-                    motions=experiment.motion_models,
-                )
-            return found, good
-        except SpotError as error:
-            lost = {index // spots for index in error.indices}
-            good = [state for k, state in enumerate(good) if k not in lost]
-    return None, good
 
 
 def _exposed(

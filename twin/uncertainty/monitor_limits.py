@@ -10,18 +10,17 @@ import numpy as np
 
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails
-from analysis.monitor.recovery import joint, judged_spots
+from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.units import ARCSEC
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from scenes.models.disturbances import state_of
 from scenes.models.instrument_model import MisplacedError
 from scenes.yaml.errors import InputError
+from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import LOST, Observing, observe
 from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import half_fields
 
@@ -149,23 +148,22 @@ def expected_covariance(experiment: MonitorExperiment, frames: int) -> np.ndarra
     """
     centroid, calibration = experiment.resolved.job.analysis.centroid, experiment.calibration
     nominal = experiment.expected_frames(experiment.nominal_photons)
-    before, _ = judged_spots(nominal, frames, calibration, centroid)
+    before = judged_spots(nominal, frames, calibration, centroid)
     if experiment.stated is None:
-        spread = difference_covariance(before, before, calibration.noise)
-    else:
-        amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
-        states = [state_of(row, experiment.stated.components, experiment.thermal) for row in amounts]
-        together, parts = max(1, _PIXELS // nominal.size), []
-        for start in range(0, _STATES, together):
-            try:
-                photons = experiment.path.expected_photons(states[start : start + together])
-                moved = experiment.expected_frames(photons).reshape(-1, *experiment.path.shape)
-                after, _ = judged_spots(moved, frames, calibration, centroid)
-            except (AimError, BeamMissedError, SpotError):
-                return np.asarray(joint(2.0 * before.covariance[None])[0])
-            parts.append(difference_covariance(before, after, calibration.noise))
-        spread = np.concatenate(parts)
-    return np.asarray(joint(spread.reshape(-1, calibration.spots, 2, 2)).mean(axis=0))
+        spread = difference_covariance(before[0], before[0], calibration.noise)
+        return np.asarray(joint(spread[None])[0])
+
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
+        return before, experiment.expected_frames(photons)
+
+    amounts = experiment.stated.draw(np.random.default_rng(1), _STATES)
+    states = [state_of(row, experiment.stated.components, experiment.thermal) for row in amounts]
+    how = Observing(record, centroid, max(1, _PIXELS // nominal.size), stated=False, frames=frames)
+    try:
+        seen = [found.recovery.shift_covariance for found in observe(experiment, states, how)]
+    except (*LOST, SpotError):
+        return np.asarray(joint(2.0 * before[0].covariance[None])[0])
+    return np.asarray(np.concatenate(seen).mean(axis=0))
 
 
 def find_limits(
@@ -192,12 +190,8 @@ def find_limits(
     if not found:
         return None
     rows = np.stack([quantity.row for quantity in found])
-    still = np.zeros((1, len(experiment.path.channels), 2))
-    shifts = Shifts(still, still, noise[None], cameras, stated)
-    splits = {
-        name: limits.split(rows, stated, noise, estimator.gain(shifts)[0])
-        for name, estimator in applicable(cameras, stated).items()
-    }
+    gains = estimator_gains(cameras, stated, noise)
+    splits = {name: limits.split(rows, stated, noise, gain) for name, gain in gains.items()}
     remedies = [
         Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
         Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
@@ -221,7 +215,7 @@ def find_limits(
                     _left(rows, more, np.kron(np.eye(2), noise)),
                 )
             )
-        except (InputError, MisplacedError, AimError, BeamMissedError) as error:
+        except (InputError, MisplacedError, *LOST) as error:
             why = str(error)
     seen = tuple(limits.least_seen(row, stated, noise) for row in rows)
     outside = _outside(experiment, stated, noise)

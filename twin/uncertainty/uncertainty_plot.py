@@ -22,6 +22,7 @@ from twin.run.svg import (
     look,
     new_figure,
     plain_axes,
+    shared_legend,
     to_svg,
 )
 from twin.uncertainty.monitor_limits import BEST, MonitorLimits
@@ -61,10 +62,8 @@ def _figure(limits: MonitorLimits) -> Figure:
     right.tick_params(left=False)
     left.set_title("How much the measurement takes away")
     right.set_title("Whose motions make up the rest")
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower left", ncols=3, columnspacing=1.2)
-    handles, labels = right.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower right", ncols=4, columnspacing=1.2)
+    shared_legend(figure, left, "lower left", 3, columnspacing=1.2)
+    shared_legend(figure, right, "lower right", 4, columnspacing=1.2)
     return figure
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import replace
 
-from twin.run.artefact import PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
-from twin.run.page import artefact_content, environment, reproduce
-from twin.run.report import one_sentence
+from markupsafe import Markup
+
+from twin.run.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
+from twin.run.page import links, report_page, reproduce
+from twin.run.report import Report, Section, one_sentence
 from twin.run.run_folder import RunFolder, write_manifest
-from twin.run.versions import versions
 from twin.validation.checks.check import (
     AGREED,
     CONFIRMED,
@@ -143,7 +144,6 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-TEMPLATE = "validation.html.j2"
 MARKS: dict[Verdict, tuple[str, str]] = {
     CONFIRMED: ("=", "confirmed"),
     REPRODUCED: ("⊜", "reproduced"),
@@ -159,41 +159,38 @@ MARKS: dict[Verdict, tuple[str, str]] = {
 
 def render_report(validation: Validation) -> str:
     """The page as text."""
-    template = environment(__package__).get_template(TEMPLATE)
-    results = validation.results
-    papers = [
-        {
-            "number": number,
-            "title": title,
-            "rows": [_row(r) for r in results if r.paper == number],
-            "csv": artefact_content(_paper_table(number, [r for r in results if r.paper == number]), None),
-        }
-        for number, title in PAPERS.items()
-    ]
-    groups = [_group(run) for run in validation.runs if run.artefacts or run.files]
-    count = len(results)
-    page = template.render(
-        title=f"Validation of the source papers: {count} check{'' if count == 1 else 's'}",
-        verdict=verdict(validation),
-        warnings=(),
-        counted=artefact_content(_count_table(validation), None),
-        papers=[paper for paper in papers if paper["rows"]],
-        groups=groups,
-        counts=[
-            {"verdict": v, "mark": MARKS[v][0], "kind": MARKS[v][1], "count": validation.counts[v], "meaning": meaning}
-            for v, meaning in VERDICTS.items()
-        ],
-        total=len(results),
-        unexpected=[{"id": r.id, "verdict": r.verdict, "expected": expected} for r, expected in validation.unexpected],
-        fast=validation.fast,
-        sigmas=f"{SIGMAS:g}",
-        command=command(validation),
-        backend=validation.backend,
-        duration=duration_text(validation.seconds),
-        seed=validation.seed,
-        versions=versions(),
+    count = len(validation.results)
+    checks = f"{count} check{'' if count == 1 else 's'}"
+    lead = (
+        f"What the papers print, beside what the simulation gives: {checks}, {duration_text(validation.seconds)}"
+        f"{', fast' if validation.fast else ''}."
     )
-    return _angles(page)
+    strange = Markup("; ").join(
+        Markup('<a href="#{0}">{0}</a> is {1} where earlier work found {2}').format(r.id, r.verdict, e)
+        for r, e in validation.unexpected
+    )
+    expected = Markup("Not as expected: {}.").format(strange) if strange else ""
+    report = Report(
+        f"Validation of the source papers: {checks}",
+        verdict(validation),
+        tuple(filter(None, (lead, expected))),
+        (("Verdicts", VERDICTS_TEXT),),
+        _count_table(validation),
+        (*_papers(validation), *(_group(run) for run in validation.runs if run.artefacts or run.files)),
+    )
+    made_with = f"{validation.seed}, {validation.backend}, float64"
+    rows = [("Numbers", links(("validation.json",))), ("Seed, backend", made_with)]
+    return _angles(report_page(report, _words(validation), rows))
+
+
+VERDICTS_TEXT = (
+    "A verdict is the outcome of a comparison, never an opinion: the tolerance and its reason are fixed before "
+    f"anything is computed, {SIGMAS:g} standard deviations of the measured value are allowed on top, and both stand in "
+    "the last line of each finding; together they are the smallest error of the statement that the row would have "
+    "found, half the time. A row that could not tell the nearest other statement confirms nothing. In brackets: "
+    "implied, not printed. Under a claim stands on which sides of it a measurement can disagree; at most and at least "
+    "agree however far below or above it lies. ± is one standard deviation."
+)
 
 
 def verdict(validation: Validation) -> str:
@@ -206,22 +203,38 @@ def verdict(validation: Validation) -> str:
     return one_sentence(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
 
 
+def _papers(validation: Validation) -> Iterator[Section]:
+    """A section with all rows of each paper."""
+    for number, title in PAPERS.items():
+        results = [result for result in validation.results if result.paper == number]
+        if results:
+            yield Section(f"Paper {number}", (title,), (_paper_table(number, results),), name=f"paper-{number}")
+
+
 def _paper_table(paper: str, results: Sequence[CheckResult]) -> Table:
-    """The rows of a paper with all digits."""
+    """The rows of a paper; with all digits where they are taken away."""
     heads = ("id", "equation", "statement", "printed", "sides", "measured", "sigma", "unit", "verdict", "finds", "how")
-    rows = [
+    full = [
         (
             *(r.id, r.equation, r.statement, r.printed, comparison_text(r)),
             *(r.measured, r.sigma, r.unit, str(r.verdict), r.power, r.how),
         )
         for r in results
     ]
-    return Table(f"paper-{paper}", f"Paper {paper}", "", heads, rows)
+    shown = ("Printed, and what is compared", "claim", "measured", "Verdict", "How, and what was found")
+    name, title = f"paper-{paper}", f"Paper {paper}"
+    return Table(name, "", "", shown, [_row(r) for r in results], within="", full=Table(name, title, "", heads, full))
 
 
 def _count_table(validation: Validation) -> Table:
-    rows = [(str(v), validation.counts[v], meaning) for v, meaning in VERDICTS.items()]
-    return Table("verdicts", "Verdicts", "", ("verdict", "checks", "meaning"), rows)
+    heads = ("verdict", "checks", "meaning")
+    full = [(str(verdict), validation.counts[verdict], meaning) for verdict, meaning in VERDICTS.items()]
+    rows = [
+        (Marked(f"{mark} {row[0]}", "", f"verdict {look}"), *row[1:])
+        for row, (mark, look) in zip(full, (MARKS[verdict] for verdict in VERDICTS), strict=True)
+    ]
+    digits = Table("verdicts", "Verdicts", "", heads, full)
+    return Table("verdicts", "Verdicts", "", heads, rows, within="", full=digits)
 
 
 def duration_text(seconds: float) -> str:
@@ -281,27 +294,23 @@ def power_text(result: CheckResult) -> str:
     return f"{text}{unit}{share}"
 
 
-def _row(result: CheckResult) -> dict[str, Any]:
-    mark, kind = MARKS[result.verdict]
-    return {
-        "id": result.id,
-        "equation": result.equation,
-        "statement": result.statement,
-        "also": list(result.also),
-        "theory": result.theory,
-        "printed": claim_text(result),
-        "comparison": comparison_text(result),
-        "power": power_text(result),
-        "tells": "" if result.tells is None or result.power is None else significant(result.tells, 3, floor=0.0),
-        "against": result.against,
-        "measured": measured_text(result),
-        "sigma": sigma_text(result),
-        "unit": "" if result.unit == "1" else result.unit,
-        "verdict": result.verdict,
-        "mark": mark,
-        "kind": kind,
-        "how": [_typeset(line) for line in result.how.splitlines()],
-    }
+def _row(result: CheckResult) -> tuple[Marked, ...]:
+    names = Markup(" = ").join(Markup('<code id="{0}">{0}</code>').format(name) for name in (result.id, *result.also))
+    theory = f" · theory: {result.theory}" if result.theory else ""
+    about = Markup("{} · {}{}").format(result.equation, names, theory)
+    unit = "" if result.unit == "1" else f" {result.unit}"
+    claim, measured = (text + unit * (text != "\N{EM DASH}") for text in (claim_text(result), measured_text(result)))
+    mark, look = MARKS[result.verdict]
+    finds = "" if result.tells is None or result.power is None else f"finds {power_text(result)}"
+    sigma = f"± {sigma_text(result)}" if sigma_text(result) else ""
+    how, *last = _typeset(result.how).rsplit("\n", 1)
+    return (
+        Marked(result.statement, about, "text"),
+        Marked(claim, comparison_text(result), "number"),
+        Marked(measured, sigma, "number"),
+        Marked(f"{mark} {result.verdict}", finds, f"verdict {look}"),
+        Marked(how, "".join(last), "text how"),
+    )
 
 
 def _typeset(text: str) -> str:
@@ -316,13 +325,10 @@ def _angles(page: str) -> str:
     return re.sub(r"(?<=[\d)])\N{PRIME}", " arcmin", page)
 
 
-def _group(run: GroupRun) -> dict[str, Any]:
-    return {
-        "prefix": run.group.prefix,
-        "title": run.group.title,
-        "artefacts": [artefact_content(a, run.place(a)) for a in run.artefacts],
-        "files": list(run.files),
-    }
+def _group(run: GroupRun) -> Section:
+    shown = tuple(replace(artefact, within=run.place(artefact)) for artefact in run.artefacts)
+    files = tuple(Data(f"file-{k}", "", "", None, within=file) for k, file in enumerate(run.files))
+    return Section(f"{run.group.title} ({run.group.prefix})", (), (*shown, *files), name=f"group-{run.group.prefix}")
 
 
 def write_validation(validation: Validation, folder: RunFolder) -> None:

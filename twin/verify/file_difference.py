@@ -12,6 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,13 @@ from typing import Any
 import cv2
 import numpy as np
 import tifffile
-import xarray as xr
 
+from scenes.kinds.file_kinds import kind_of
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import parse_yaml
 from twin.compare.run_differences import TOLD, Leaf, is_sigma, leaves, sigma_of
+from twin.run.netcdf_file import read_netcdf
 
 SAME, ROUNDED, DIFFERENT, LEFT_OUT = "same", "rounding", "different", "left out"
 REDRAWN = "drawn otherwise"
@@ -203,6 +208,16 @@ def _json(content: bytes) -> Content:
     return _plain(json.loads(content))
 
 
+def _yaml(content: bytes) -> Content:
+    """What a YAML file says. Comments, layout and the choice of units are the user's, and not the run's."""
+    file = parse_yaml(content.decode("utf-8"))
+    kind = kind_of(file.data)
+    if kind is not None:
+        with suppress(InputError):  # a config.yaml holds such a file under a key
+            return _plain(validate(kind.model, file).plain())
+    return _plain(file.data)
+
+
 def _csv(content: bytes) -> Content:
     rows = list(csv.reader(io.StringIO(content.decode("utf-8"))))
     heads = rows[0] if rows else []
@@ -226,9 +241,9 @@ def _cell(text: str) -> Leaf:
 
 
 def _netcdf(content: bytes) -> Content:
-    with xr.open_dataset(io.BytesIO(content), engine="h5netcdf") as data:
-        arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
-        numbers = {f"attribute {name}": value for name, value in data.attrs.items() if isinstance(value, str | float)}
+    data = read_netcdf(content)
+    arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
+    numbers = {f"attribute {name}": value for name, value in data.attrs.items() if isinstance(value, str | float)}
     numbers.pop("attribute fingerprint", None)
     return Content(numbers, arrays, {})
 
@@ -300,6 +315,7 @@ def _scene(content: bytes) -> Content:
 
 READERS: dict[str, Callable[[bytes], Content]] = {
     "json": _json,
+    "yaml": _yaml,
     "csv": _csv,
     "nc": _netcdf,
     "tiff": _tiff,

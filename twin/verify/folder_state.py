@@ -78,7 +78,7 @@ def folder_state(folder: Path) -> FolderState:
         changed += [name for name in chunks.damaged if name not in gone]
         missing += sorted(gone)
         known |= {name for name in every_file(folder) if name.startswith(f"{FOLDER}/")} - set(chunks.unlisted)
-        if not chunks.damaged and chunks.runs != manifest.runs:
+        if not chunks.damaged and sum(chunk.runs for chunk in chunks.whole) != manifest.runs:
             changed.append(f"{FOLDER}/index.txt")
         lock = folder / STUDY_LOCK
         if lock.exists():

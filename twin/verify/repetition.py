@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 
 from scenes.yaml.errors import InputError
+from scenes.yaml.input_file import why_unreadable
+from twin.run.netcdf_file import read_netcdf
 from twin.run.provenance import Provenance
 from twin.run.run_folder import read_manifest
-from twin.run.versions import ROOT, source_digest, versions
+from twin.run.versions import BEFORE, ROOT, source_digest, versions
 from twin.study.runs.block_result import BlockResult
-from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore
+from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.task import Task, evaluate
@@ -114,9 +115,9 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is gone: {started_in}")
     # modules are those of this program, whatever lies in the folder where it starts
-    command = [sys.executable, "-P", "-m", *words, "--out", str(place.absolute())]
+    command = [sys.executable, "-P", "-m", f"{BEFORE}{words[0]}", *words[1:], "--out", str(place.absolute())]
     command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    paths = os.pathsep.join(filter(None, (str(ROOT.parent if BEFORE else ROOT), os.environ.get("PYTHONPATH"))))
     with subprocess.Popen(
         command,
         cwd=started_in,
@@ -169,7 +170,7 @@ def repeat_chunk(state: FolderState) -> Repetition:
     try:
         plan = Plan.of(resolve_study(folder / CONFIG))
         store = ChunkStore(folder, plan)
-        store.look()
+        store.entries.update({entry.first: entry for entry in examined(folder).whole})
         whole = store.result() if not store.missing else None
     except (ChunkError, InputError) as error:
         raise CannotRepeat(str(error)) from error
@@ -204,11 +205,12 @@ def _data_difference(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[F
     """study.nc and study.json against what the chunks hold."""
     name = "study.nc"
     try:
-        with xr.open_dataset(folder / name, engine="h5netcdf") as data:
-            kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
+        data = read_netcdf((folder / name).read_bytes())
+        kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
         told = json.loads((folder / "study.json").read_bytes())
-    except (OSError, ValueError) as error:
-        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {error}"),)
+    # readers of spoilt files fail in ways that cannot be foreseen
+    except Exception as error:
+        return (FileDifference(name, DIFFERENT, why=f"cannot be read: {why_unreadable(error)}"),)
     made = make_dataset(plan, whole)
     found = [
         array_difference(str(key), kept.get(str(key), np.array([])), np.asarray(made[key].values))

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.units import MOMENT, format_quantity
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.angle.angle_flight import LEAST_SIGMA
-from twin.orbit.angle.angle_run import AngleRun
-from twin.orbit.angle.measured_angle import MeasuredAngleRun
+from twin.orbit.angle.angle_run import AngleRun, SimulatedAngleRun
 from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS
 from twin.orbit.flight.line_times import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
@@ -30,14 +28,14 @@ _IMAGE_SIGMA = 1e-6
 """Pixels: the errors of the points are those on the ground, and a table's sigmas must be positive."""
 
 
-def angle_exported(run: AngleRun | MeasuredAngleRun) -> dict[str, str]:
+def angle_exported(run: AngleRun) -> dict[str, str]:
     """Path -> text of the files: the pass that is shown, with the errors that were drawn for it.
 
     Raises:
         InputError: the measurements are files already, or the lines are an instrument's, which no payload's file says.
     """
     test = run.setup.test
-    if isinstance(run, MeasuredAngleRun) or not isinstance(run.setup, AngleSetup):
+    if not isinstance(run, SimulatedAngleRun):
         text = "measurements are files already; --export writes those of a simulation"
         raise test.error(text, ("data",), allowed="the file of a simulated test")
     if run.setup.camera is None:
@@ -47,7 +45,7 @@ def angle_exported(run: AngleRun | MeasuredAngleRun) -> dict[str, str]:
     return files | {TEST_FILE: dump_yaml(_test(run))}
 
 
-def _measurements(run: AngleRun) -> PassMeasurements:
+def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
     """The shown pass before anything was taken out of its points."""
     flight, spec = run.flight, run.flight.spec
     raw = flight.measure(flight.ground(flight.effects), run.shown, NO_EFFECTS)
@@ -83,7 +81,7 @@ def _measurements(run: AngleRun) -> PassMeasurements:
     return PassMeasurements(spec.name, platform, dict.fromkeys(flight.lines, line_times), ground, images)
 
 
-def _test(run: AngleRun) -> dict[str, Any]:
+def _test(run: SimulatedAngleRun) -> dict[str, Any]:
     """The test file: the same angles, moment, effects and sigmas."""
     spec = run.flight.spec
     plain = spec.plain()

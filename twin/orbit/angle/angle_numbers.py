@@ -10,13 +10,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from analysis.units import ARCSEC
-from optics.numerics.backend import Backend
-from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
-from scenes.specs.orbit.setup import AngleSetup, resolve_angle
-from twin.orbit.angle.angle_run import AngleRun, Scatter, run_angle, values_of
-from twin.orbit.angle.measured_angle import MeasuredAngleRun, MeasuredAngles, run_measured_angle
+from twin.orbit.angle.angle_run import AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Advance, Procedure, silent
 
 ByAngle = Mapping[str, float | None]
 """A number for each angle of the test's file; what could not be computed is None."""
@@ -52,7 +47,7 @@ class TruthNumbers:
     along_track: ByAngle
 
     @classmethod
-    def of(cls, run: AngleRun) -> Self:
+    def of(cls, run: SimulatedAngleRun) -> Self:
         """Of a run."""
         angles = run.flight.look, run.flight.dihedral, run.flight.along_track
         return cls(*(_degrees(run.names, values.values()) for values in angles))
@@ -67,7 +62,7 @@ class ChangeNumbers:
     trace: ByAngle
 
     @classmethod
-    def of(cls, run: AngleRun) -> Self:
+    def of(cls, run: SimulatedAngleRun) -> Self:
         """Of a run."""
         flight = run.flight
         return cls(
@@ -112,15 +107,15 @@ class PassesNumbers:
     resection: ScatterNumbers
 
     @classmethod
-    def of(cls, run: AngleRun) -> Self:
+    def of(cls, run: SimulatedAngleRun) -> Self:
         """Of a run."""
         estimators = run.planes, run.along, run.resection
         return cls(len(run.planes.values), *(ScatterNumbers.of(run.names, scatter) for scatter in estimators))
 
 
 @dataclass(frozen=True)
-class AngleNumbers:
-    """angle.json; frames: of every form of the planes in every frame."""
+class SimulatedNumbers:
+    """What angle.json has of a simulated test beside its pass; frames: of every form of the planes in every frame."""
 
     seed: int
     time_s: float
@@ -141,7 +136,7 @@ class AngleNumbers:
     height_m_per_arcsec: ByAngle
 
     @classmethod
-    def of(cls, run: AngleRun) -> Self:
+    def of(cls, run: SimulatedAngleRun) -> Self:
         """Of a run."""
         estimate, flight, names = run.estimate, run.flight, run.names
         return cls(
@@ -182,8 +177,8 @@ class AngleNumbers:
 
 
 @dataclass(frozen=True)
-class MeasuredPassNumbers:
-    """Angles of a measured pass; those of the laboratory's camera; time from the epoch."""
+class PassNumbers:
+    """Angles of a pass, simulated or measured; those of the laboratory's camera; time from the epoch."""
 
     time_s: float
     points: Mapping[str, int]
@@ -197,7 +192,7 @@ class MeasuredPassNumbers:
     resection_p_value: float
 
     @classmethod
-    def of(cls, one: MeasuredAngles) -> Self:
+    def of(cls, one: PassAngles) -> Self:
         """Of one pass."""
         names, pairs, estimate = tuple(one.pairs), tuple(one.pairs.values()), one.estimate
         section, tls, along = estimate.resection, estimate.angles["tls"], estimate.along
@@ -219,24 +214,7 @@ class MeasuredPassNumbers:
         )
 
 
-def run_any_angle(
-    setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent
-) -> AngleRun | MeasuredAngleRun:
-    """On measurements, or on a simulation: ``python -m twin.orbit angle``.
-
-    Raises:
-        InputError, BenchError: as `run_angle` and `run_measured_angle`.
-    """
-    if isinstance(setup, MeasuredAngleSetup):
-        return run_measured_angle(setup, backend, seed, advance)
-    return run_angle(setup, backend, seed, advance)
-
-
-def angle_numbers(run: AngleRun | MeasuredAngleRun) -> dict[str, Any]:
+def angle_numbers(run: AngleRun) -> dict[str, Any]:
     """Contents of angle.json without its frames. Keys of angles begin with their names."""
-    if isinstance(run, MeasuredAngleRun):
-        return {"measured": plain_data({one.name: MeasuredPassNumbers.of(one) for one in run.passes})}
-    return dict(plain_data(AngleNumbers.of(run)))
-
-
-ANGLE = Procedure("angle", AngleSetup, resolve_angle, run_any_angle, angle_numbers)
+    numbers = plain_data({"measured": {one.name: PassNumbers.of(one) for one in run.passes}})
+    return {**(plain_data(SimulatedNumbers.of(run)) if isinstance(run, SimulatedAngleRun) else {}), **numbers}

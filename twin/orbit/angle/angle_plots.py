@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from analysis.orbit.angles import AXES
 from analysis.units import ARCSEC
-from twin.orbit.angle.angle_run import AngleRun, Scatter
+from twin.orbit.angle.angle_run import Scatter, SimulatedAngleRun
 from twin.run.svg import (
     BLUE,
     GREEN,
@@ -41,7 +41,7 @@ def signs(names: Iterable[str]) -> list[str]:
     return [_GREEK.get(name, name.replace("_", " ")) for name in names]
 
 
-def panels(run: AngleRun) -> dict[str, list[tuple[str, str]]]:
+def panels(run: SimulatedAngleRun) -> dict[str, list[tuple[str, str]]]:
     """Figure of the sensitivity -> its panels: what is moved, and the angle."""
     pairs = run.flight.pairs
     out = {"station": [("station", name) for name in pairs]}
@@ -49,7 +49,7 @@ def panels(run: AngleRun) -> dict[str, list[tuple[str, str]]]:
     return out
 
 
-def geometry_figure(run: AngleRun) -> Figure:
+def geometry_figure(run: SimulatedAngleRun) -> Figure:
     """Station, planes and strips, seen from the side (along the lines) and from above; orbital axes."""
     flight = run.flight
     figure = new_figure(4.6)
@@ -88,7 +88,7 @@ def geometry_figure(run: AngleRun) -> Figure:
     return figure
 
 
-def sensitivity_figure(run: AngleRun, name: str) -> Figure:
+def sensitivity_figure(run: SimulatedAngleRun, name: str) -> Figure:
     """Difference of the angles, resection minus planes, over a move of 0 to 10 m, per axis."""
     rows = {(row.what, row.axis): row for row in run.table}
     shows = panels(run)[name]
@@ -113,7 +113,7 @@ def sensitivity_figure(run: AngleRun, name: str) -> Figure:
     return figure
 
 
-def scatter_figure(run: AngleRun) -> Figure:
+def scatter_figure(run: SimulatedAngleRun) -> Figure:
     """Angles of all passes about the truth, with what the claimed covariance says: of the first two angles the 95%
     ellipse, of a single one the normal distribution.
     """
@@ -144,7 +144,7 @@ def scatter_figure(run: AngleRun) -> Figure:
     return figure
 
 
-def figure_svg(name: str, run: AngleRun) -> str:
+def figure_svg(name: str, run: SimulatedAngleRun) -> str:
     """One figure as SVG; name: ``geometry``, ``scatter`` or one of `panels`."""
     with look(f"angle-{name}"):
         if name in panels(run):

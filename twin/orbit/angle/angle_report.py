@@ -1,20 +1,22 @@
-"""Report of an intersection-angle test: lead, the main table, facts."""
+"""Report of an intersection-angle test: against the laboratory, and of a simulated one also against the truth."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import chi2
 
 from analysis.units import ARCSEC
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import PlainPerturbationSpec
-from scenes.yaml.units import LENGTH, format_quantity
+from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
+from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.angle.angle_plots import signs
-from twin.orbit.angle.angle_run import AngleRun, values_of
+from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections
 from twin.run.artefact import FAR, Cell, Table, fixed
-from twin.run.report import Report, one_sentence
+from twin.run.report import Report, Section, one_sentence
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AngleSetup
@@ -25,24 +27,39 @@ METHOD_NAMES = {
     "corrected": "planes, eq. 5 with the right sign",
     "tls": "planes, total least squares",
 }
+_FALSE_ALARM = 1e-4
+"""Of a point that is named for its distance from its plane, over all points of a line."""
 
 
 def angle_report(run: AngleRun) -> Report:
     """Report of an intersection angle test."""
-    verdict, lead = _found(run)
+    first = run.passes[0]
+    along, change = first.estimate.along, first.estimate.along.values - first.along_track
+    changed = [
+        f"{name} has changed by {fixed(change[k] / ARCSEC, 2)} ± {along.sigma[k] / ARCSEC:.2f} arcsec"
+        for k, name in enumerate(signs(first.pairs))
+    ]
+    simulated = run if isinstance(run, SimulatedAngleRun) else None
+    said, lead = (
+        (["the sigmas are those of points, image points and readings"], ()) if simulated is None else _found(simulated)
+    )
+    verdict = one_sentence(
+        f"Since the laboratory {listed(changed)}, along the track, as the ground points of {first.name} see it", *said
+    )
+    setup = run.setup
     return Report(
         "Intersection angles from ground points",
         verdict,
         lead,
-        _facts(run.setup),
+        _measured_facts(run, setup) if isinstance(setup, MeasuredAngleSetup) else _facts(setup),
         _methods(run),
-        sections(run),
+        (_planes(run), *(() if simulated is None else sections(simulated))),
         warnings=_warnings(run),
     )
 
 
-def _found(run: AngleRun) -> tuple[str, tuple[str, ...]]:
-    """The verdict, and what else is said at the top."""
+def _found(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
+    """What the verdict says of the truth, and what else is said at the top."""
     names, flight, few = signs(run.names), run.flight, run.narrow
     tls, along = run.estimate.angles["tls"], run.estimate.along
     truth = np.where(few, values_of(flight.along_track), values_of(flight.dihedral))
@@ -72,44 +89,107 @@ def _found(run: AngleRun) -> tuple[str, tuple[str, ...]]:
     if worst is not None:
         held = "all are within" if worst <= FAR else "not all are within"
         said.append(f"{held} {FAR:g} σ of the truth, the farthest {worst:.1f} σ: see the methods")
-    return one_sentence(*said), tuple(lead)
+    return said, tuple(lead)
 
 
 def _methods(run: AngleRun) -> Table:
-    truth, estimate, names = run.flight, run.estimate, signs(run.names)
-    look, dihedral, along = (values_of(a) for a in (truth.look, truth.dihedral, truth.along_track))
+    """Every method of every pass against the laboratory and, where it is known, the truth."""
+    flight = run.flight if isinstance(run, SimulatedAngleRun) else None
+    truth = () if flight is None else tuple(values_of(a) for a in (flight.dihedral, flight.look, flight.along_track))
     rows: list[tuple[Cell, ...]] = []
-    for k, name in enumerate(names):
-        for method, angles in estimate.angles.items():
-            text = " (folded)" if angles.folded[k] else ""
-            rows.append(
-                (name, METHOD_NAMES[method], f"dihedral{text}", *_row(angles.values, angles.sigma, dihedral, k))
-            )
-        # across the track the sigma is another one
-        mostly = abs(along[k]) > 0.99 * look[k]
-        sighted = _row(estimate.look, estimate.along.sigma, look, k)
-        rows.append((name, SIGHTED, "look", sighted[0], sighted[1] if mostly else None, sighted[2]))
-        rows.append((name, SIGHTED, "along track", *_row(estimate.along.values, estimate.along.sigma, along, k)))
-        rows.append((name, "resection", "along track", *_row(run.resected, run.resected_sigma, along, k)))
-        for kind, true in (("dihedral", dihedral), ("look", look), ("along track", along)):
-            rows.append((name, "true camera", kind, float(np.degrees(true[k])), None, None))
+    for one in run.passes:
+        estimate, along, section = one.estimate, one.estimate.along, one.estimate.resection
+        pairs, known = tuple(one.pairs.values()), (one.dihedral, one.look, one.along_track)
+        resected = section.angles(pairs), np.sqrt(np.diag(section.angle_covariance(pairs)))
+        for k, name in enumerate(signs(one.pairs)):
+            # across the track the sigma of the look is another one
+            mostly = abs(one.along_track[k]) > 0.99 * one.look[k]
+            kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, int]] = [
+                (METHOD_NAMES[method], "dihedral" + " (folded)" * bool(a.folded[k]), a.values, a.sigma, 0)
+                for method, a in estimate.angles.items()
+            ]
+            kinds.append((SIGHTED, "look", estimate.look, along.sigma if mostly else None, 1))
+            kinds.append((SIGHTED, "along track", along.values, along.sigma, 2))
+            kinds.append(("resection", "along track", *resected, 2))
+            for method, kind, value, sigma, which in kinds:
+                off = (float((value[k] - side[which][k]) / ARCSEC) for side in (known, truth) if side)
+                spread = None if sigma is None else float(sigma[k] / ARCSEC)
+                rows.append((one.name, name, method, kind, float(np.degrees(value[k])), spread, *off))
+    heads: tuple[str, ...] = ("pass", "", "method", "angle", "deg", "σ [arcsec]", "− laboratory [arcsec]")
     return Table(
         "methods",
         "Angles by each method",
         "Dihedral: between the planes of the lines. Look: between the lines of sight of the lines' centres. Along "
         "track: the look's signed part along the track, positive where the first line looks ahead of the second. Each "
-        "is compared with its own truth. The resection's angle is one of pitch in the body, which differs from the "
+        "is compared with that of the laboratory's camera"
+        + (" and with its own truth" if truth else "")
+        + ". The resection's angle is one of pitch in the body, which differs from the "
         "angle along the track by less than 0.01 arcsec where the lines of sight begin within 20 arcsec of each other "
         "across the track. The planes are fitted in the Earth-fixed frame. Folded: below three sigmas, where an "
         "unsigned angle is pushed up by its noise.",
-        ("", "method", "angle", "deg", "σ [arcsec]", "− truth [arcsec]"),
+        (*heads, "− truth [arcsec]") if truth else heads,
         rows,
-        (None, None, None, 7, 3, 3),
+        (None, None, None, None, 7, 3, 3, 3)[: len(heads) + bool(truth)],
     )
 
 
-def _row(values: np.ndarray, sigma: np.ndarray, truth: np.ndarray, k: int) -> tuple[float, ...]:
-    return float(np.degrees(values[k])), float(sigma[k] / ARCSEC), float((values[k] - truth[k]) / ARCSEC)
+def _planes(run: AngleRun) -> Section:
+    rows: list[tuple[Cell, ...]] = []
+    for one in run.passes:
+        for line, fit in zip(one.lines, one.estimate.planes["tls"], strict=True):
+            freedom = len(fit.residual) - 2
+            rows.append(
+                (
+                    one.name,
+                    line,
+                    len(fit.residual),
+                    *one.span[line],
+                    float(np.sqrt(np.mean(fit.residual**2))),
+                    fit.chi_square / max(freedom, 1),
+                    float(chi2.sf(fit.chi_square, freedom)) if freedom > 0 else None,
+                )
+            )
+    table = Table(
+        "planes",
+        "Planes of the lines",
+        "Through the station and the points of each line; when its points were seen, seconds from the moment; RMS "
+        "distance of the points from the plane, metres; chi-square over its degrees of freedom and its chance.",
+        ("pass", "line", "points", "from [s]", "to [s]", "RMS [m]", "χ²/dof", "chance"),
+        rows,
+        (None, None, None, 2, 2, 3, 2, 3),
+    )
+    text: tuple[str, ...] = (
+        "Changes of a principal distance do not change planes, but the resection, which has the laboratory's, does not "
+        "fit then.",
+    )
+    if not isinstance(run, SimulatedAngleRun):
+        text = (
+            "Lines see their points at many moments. Each arm from the station to a point, freed of light time, "
+            "aberration and refraction, is carried along in the body to one moment, by the measured attitude. The "
+            "sigmas hold the points' coordinates, their places in the image, and the noise of orbit and attitude, "
+            "which all points of one reading share.",
+            "A bias of the attitude turns all arms alike and leaves the angles as they are. What no sigma holds is a "
+            "bias that drifts while one line sees the field after the other, a shift that all points share, and an "
+            f"atmosphere unlike the standard one. {text[0]}",
+        )
+    return Section("Planes", text, (table,))
+
+
+def _measured_facts(run: AngleRun, setup: MeasuredAngleSetup) -> tuple[tuple[str, str], ...]:
+    first = run.passes[0]
+    tracker, gps, effects = setup.test.errors.star_tracker, setup.test.errors.gps, setup.test.effects
+    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
+    moments = ", ".join(f"{one.name} {one.time:.4g} s" for one in run.passes)
+    return (
+        ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
+        ("Passes", ", ".join(one.name for one in run.passes)),
+        ("Angles", "; ".join(f"{n} between {a} and {b}" for n, (a, b) in first.pairs.items())),
+        ("Moment, from the epoch", moments),
+        ("Noise of the attitude, 1σ", ", ".join(format_quantity(v, ANGLE) for v in tracker.noise)),
+        ("Noise of the orbit, 1σ", ", ".join(format_quantity(v, LENGTH) for v in gps.noise)),
+        ("Effects on the light", f"{', '.join(on) or 'none'}{' taken out' * bool(on and effects.corrected)}"),
+        ("Description", setup.test.description),
+    )
 
 
 def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
@@ -165,25 +245,49 @@ def _change_text(change: PlainPerturbationSpec) -> str:
     return ", ".join(text) if text else "unchanged"
 
 
+def far_points(one: PassAngles) -> list[tuple[str, int, float]]:
+    """Line, number on it and sigmas of points that lie farther from their plane than chance allows."""
+    found = []
+    for line, fit in zip(one.lines, one.estimate.planes["tls"], strict=True):
+        sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))
+        away = np.abs(fit.residual) / sigma
+        limit = np.sqrt(chi2.isf(_FALSE_ALARM / len(away), 1))
+        found += [(line, int(k), float(away[k])) for k in np.flatnonzero(away > limit)]
+    return found
+
+
 def _warnings(run: AngleRun) -> tuple[str, ...]:
-    spec, found = run.flight.spec, []
-    left = [e for e in ("light_time", "aberration", "refraction") if getattr(spec.effects, e)]
-    if left and not spec.effects.corrected:
-        found.append(
-            f"the analysis leaves {', '.join(left).replace('_', ' ')} in the points; the angles are biased as the "
-            "table of effects says"
-        )
-    if any(spec.errors.datum):
-        found.append("the points share a shift that no sigma contains and no residual shows; see the table of effects")
-    folded = [n for n, f in zip(signs(run.names), run.estimate.angles["tls"].folded, strict=True) if f]
-    if folded:
-        found.append(
-            f"the planes of {listed(folded)} are parallel within their noise: the unsigned dihedral angle folds at "
-            "zero; use the angle along the track, which has a sign"
-        )
-    if run.estimate.resection.p_value < 1e-3:
-        found.append(
-            f"the resection does not fit: a chi-square as large has a chance of {run.estimate.resection.p_value:.1g}; "
-            "lines may have turned about the flight direction or the vertical since the laboratory"
-        )
+    found = []
+    if isinstance(run, SimulatedAngleRun):
+        spec = run.flight.spec
+        left = [e for e in ("light_time", "aberration", "refraction") if getattr(spec.effects, e)]
+        if left and not spec.effects.corrected:
+            found.append(
+                f"the analysis leaves {', '.join(left).replace('_', ' ')} in the points; the angles are biased as the "
+                "table of effects says"
+            )
+        if any(spec.errors.datum):
+            found.append(
+                "the points share a shift that no sigma contains and no residual shows; see the table of effects"
+            )
+    for one in run.passes:
+        folded = [n for n, f in zip(signs(one.pairs), one.estimate.angles["tls"].folded, strict=True) if f]
+        if folded:
+            found.append(
+                f"{one.name}: the planes of {listed(folded)} are parallel within their noise: the unsigned dihedral "
+                "angle folds at zero; use the angle along the track, which has a sign"
+            )
+        far = far_points(one)
+        if far:
+            worst = max(far, key=lambda point: point[2])
+            name = one.ids[worst[0]][worst[1]]
+            found.append(
+                f"{one.name}: {len(far)} points lie farther from their planes than chance allows, the farthest {name} "
+                f"of {worst[0]}, {worst[2]:.0f} σ; `angle` leaves none out: look at them, or let `calibrate` find them"
+            )
+        if one.estimate.resection.p_value < 1e-3:
+            found.append(
+                f"{one.name}: the resection does not fit (chance {one.estimate.resection.p_value:.1g}); principal "
+                "distances may have changed, or lines turned about the flight direction or the vertical"
+            )
     return tuple(found)

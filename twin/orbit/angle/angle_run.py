@@ -10,7 +10,7 @@ lines of sight onto straight lines.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -34,10 +34,13 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import LineCamera, along_track_angle, dihedral_angle
+from twin.orbit.flight.line_camera import look_angle as line_look_angle
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
+    from scenes.specs.measured.orbit_data_setup import AnyAngle
     from scenes.specs.orbit.setup import AngleSetup
 
 EFFECTS = ("light_time", "aberration", "refraction")
@@ -155,15 +158,82 @@ class Scatter:
 
 
 @dataclass(frozen=True, eq=False)
+class PassAngles:
+    """Angles of one pass, simulated or measured.
+
+    Attributes:
+        name: of the pass.
+        time: of the moment, seconds from the epoch.
+        pairs: angle -> the two lines that it lies between.
+        laboratory: line -> camera as the laboratory knows it.
+        pixel: line -> pixels of its points, (n,).
+        ids: line -> names of its points, (n,).
+        span: line -> first and last time of its points from the moment, seconds.
+        measurement: points as the lines would see them at the moment.
+        estimate: from it.
+    """
+
+    name: str
+    time: float
+    pairs: Mapping[str, tuple[str, str]]
+    laboratory: Mapping[str, LineCamera]
+    pixel: Mapping[str, np.ndarray]
+    ids: Mapping[str, np.ndarray]
+    span: Mapping[str, tuple[float, float]]
+    measurement: Measurement
+    estimate: Estimate
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """Those that angles are measured of."""
+        return tuple(self.pixel)
+
+    @property
+    def reference(self) -> str:
+        """The line whose look is zero in a resection: the second of the first angle."""
+        return next(iter(self.pairs.values()))[1]
+
+    @property
+    def look(self) -> np.ndarray:
+        """Angles between the lines of sight of the lines' centres in the laboratory, (m,), radians."""
+        return self._of(line_look_angle)
+
+    @property
+    def along_track(self) -> np.ndarray:
+        """Their signed part along the track, (m,), radians."""
+        return self._of(along_track_angle)
+
+    @property
+    def dihedral(self) -> np.ndarray:
+        """Angles between the planes of the lines where the points are in the laboratory, (m,), radians."""
+        cameras, pixel = self.laboratory, self.pixel
+        return np.array([dihedral_angle(cameras[a], cameras[b], (pixel[a], pixel[b])) for a, b in self.pairs.values()])
+
+    def _of(self, angle: Callable[[LineCamera, LineCamera], float]) -> np.ndarray:
+        return np.array([angle(self.laboratory[a], self.laboratory[b]) for a, b in self.pairs.values()])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class AngleRun:
-    """A finished test.
+    """A finished test, simulated or on measurements.
 
     Attributes:
         setup: what its file says.
         seed: of all random numbers.
+        passes: measured, one by one; of a simulation the one that is shown.
+    """
+
+    setup: AnyAngle
+    seed: int
+    passes: tuple[PassAngles, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulatedAngleRun(AngleRun):
+    """A simulated test, which also knows the truth.
+
+    Attributes:
         flight: the truth.
-        measurement: of the pass that is shown.
-        estimate: from it.
         frames: all methods in all frames.
         effects: each alone and all together, without errors.
         planes, resection, along: scatter of the dihedral angles (tls), of the resection's, and of the planes' angles
@@ -174,10 +244,7 @@ class AngleRun:
     """
 
     setup: AngleSetup
-    seed: int
     flight: AnglePass
-    measurement: Measurement
-    estimate: Estimate
     frames: tuple[FrameRow, ...]
     effects: tuple[EffectRow, ...]
     planes: Scatter
@@ -186,6 +253,16 @@ class AngleRun:
     difference_sigma: np.ndarray
     table: tuple[Sensitivity, ...]
     height: Mapping[str, float | None]
+
+    @property
+    def measurement(self) -> Measurement:
+        """Of the pass that is shown."""
+        return self.passes[0].measurement
+
+    @property
+    def estimate(self) -> Estimate:
+        """From the pass that is shown."""
+        return self.passes[0].estimate
 
     @property
     def shown(self) -> np.random.SeedSequence:
@@ -235,7 +312,7 @@ def values_of(angles: Mapping[str, float]) -> np.ndarray:
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
-def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
+def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Advance = silent) -> SimulatedAngleRun:
     """Fly, measure and estimate: ``python -m twin.orbit angle``.
 
     Args:
@@ -278,22 +355,31 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
         )
         third = Scatter(np.array([a.values for a in alongs]), np.mean([a.covariance for a in alongs], axis=0), along)
         common = centred(measurement, estimate.resection)
-        return AngleRun(
-            setup,
-            seed,
-            flight,
+        one = PassAngles(
+            "pass 1",
+            flight.spec.time,
+            flight.pairs,
+            {name: flight.laboratory[name] for name in flight.lines},
+            flight.pixel,
+            {name: np.array([f"point {k + 1}" for k in range(len(p))]) for name, p in flight.pixel.items()},
+            dict.fromkeys(flight.lines, (0.0, 0.0)),
             measurement,
             estimate,
-            frame_rows(flight, common),
-            effect_rows(flight),
-            first,
-            second,
-            third,
-            np.std(
-                np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values)), 0, ddof=1
-            ),
-            sensitivity(measurement.station, common.strips, flight.pairs),
-            flight.height_per_arcsec(),
+        )
+        off = np.where(narrow(flight), third.values - second.values, first.values - np.abs(second.values))
+        return SimulatedAngleRun(
+            setup=setup,
+            seed=seed,
+            passes=(one,),
+            flight=flight,
+            frames=frame_rows(flight, common),
+            effects=effect_rows(flight),
+            planes=first,
+            resection=second,
+            along=third,
+            difference_sigma=np.std(off, 0, ddof=1),
+            table=sensitivity(measurement.station, common.strips, flight.pairs),
+            height=flight.height_per_arcsec(),
         )
     except (PlaneError, AngleError, ResectionError) as error:
         raise BenchError(str(error), ("strips",), "a longer strip, more points, or smaller errors") from error

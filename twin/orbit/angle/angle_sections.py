@@ -8,13 +8,13 @@ import numpy as np
 
 from analysis.units import ARCSEC
 from twin.orbit.angle.angle_plots import figure_svg, panels, signs
-from twin.orbit.angle.angle_run import AngleRun, Scatter, values_of
+from twin.orbit.angle.angle_run import Scatter, SimulatedAngleRun, values_of
 from twin.orbit.flight.light_effects import SPEED_OF_LIGHT
 from twin.run.artefact import Cell, SvgFigure, Table, fixed
 from twin.run.report import Section
 
 
-def sections(run: AngleRun) -> tuple[Section, ...]:
+def sections(run: SimulatedAngleRun) -> tuple[Section, ...]:
     """Geometry, change, methods, frames, effects on the light, sensitivity."""
     return _geometry(run), _change(run), _sections_scatter(run), _frames(run), _effects(run), _sensitivity(run)
 
@@ -24,7 +24,7 @@ def listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
-def _geometry(run: AngleRun) -> Section:
+def _geometry(run: SimulatedAngleRun) -> Section:
     flight, names = run.flight, signs(run.names)
     apart = (values_of(flight.look) - values_of(flight.dihedral)) / ARCSEC
     between = [f"{n} between {a} and {b}" for n, (a, b) in zip(names, flight.pairs.values(), strict=True)]
@@ -54,11 +54,11 @@ def _geometry(run: AngleRun) -> Section:
     return Section("Geometry", tuple(text), (figure,))
 
 
-def _bow(run: AngleRun) -> float:
+def _bow(run: SimulatedAngleRun) -> float:
     return max(float(np.max(np.linalg.norm(bow, axis=1))) for bow in run.measurement.bow.values()) / ARCSEC
 
 
-def _change(run: AngleRun) -> Section:
+def _change(run: SimulatedAngleRun) -> Section:
     flight, measured = run.flight, run.change / ARCSEC
     true = (values_of(flight.look) - values_of(flight.laboratory_look)) / ARCSEC
     sigma = run.estimate.along.sigma / ARCSEC
@@ -81,7 +81,7 @@ def _change(run: AngleRun) -> Section:
     return Section("Since the laboratory", (text,), (table,))
 
 
-def _sections_scatter(run: AngleRun) -> Section:
+def _sections_scatter(run: SimulatedAngleRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     names = signs(run.names)
     cases = (("planes, tls", run.planes), ("planes, along track", run.along), ("resection", run.resection))
@@ -122,7 +122,7 @@ def _sections_scatter(run: AngleRun) -> Section:
     return Section("Planes and resection", text, (both, table, figure))
 
 
-def _shared(run: AngleRun) -> str:
+def _shared(run: SimulatedAngleRun) -> str:
     if len(run.names) == 1:
         return "Beside the normal distribution of the claimed sigma."
     first, second = signs(run.names)[:2]
@@ -137,7 +137,7 @@ def _scatter_row(scatter: Scatter, k: int) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-def _frames(run: AngleRun) -> Section:
+def _frames(run: SimulatedAngleRun) -> Section:
     reference = run.estimate.angles["tls"].values
     rows: list[tuple[Cell, ...]] = []
     for row in run.frames:
@@ -173,7 +173,7 @@ def _frames(run: AngleRun) -> Section:
     return Section("Forms of the plane and frames", tuple(text), (table,))
 
 
-def _heads(run: AngleRun) -> list[str]:
+def _heads(run: SimulatedAngleRun) -> list[str]:
     return [f"{name} [arcsec]" for name in signs(run.names)]
 
 
@@ -184,7 +184,7 @@ def _failure(worst: float) -> str:
     return f"misses by up to {size}"
 
 
-def _effects(run: AngleRun) -> Section:
+def _effects(run: SimulatedAngleRun) -> Section:
     names = {
         "light_time": "light time",
         "aberration": "aberration",
@@ -216,7 +216,7 @@ def _effects(run: AngleRun) -> Section:
     return Section("Effects on the light", text, (table,))
 
 
-def _sensitivity(run: AngleRun) -> Section:
+def _sensitivity(run: SimulatedAngleRun) -> Section:
     figures = []
     for name in panels(run):
         moved = "The station" if name == "station" else f"Points, {signs([name.removesuffix('-points')])[0]}"

@@ -19,13 +19,14 @@ from analysis.orbit.planes import PlaneError, Station, Strip
 from analysis.orbit.resection import ResectionError
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import one_blas_thread
+from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
 from scenes.yaml.errors import names_text, nearest
 from twin.orbit.angle.angle_flight import INTERIOR, LEAST_SIGMA, Measurement, interior, without_effects
-from twin.orbit.angle.angle_run import Estimate, estimated
+from twin.orbit.angle.angle_run import AngleRun, PassAngles, estimated, run_angle
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineCamera, along_track_angle, dihedral_angle, line_cameras, look_angle
+from twin.orbit.flight.line_camera import LineCamera, line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.measurement_tables import read_measurements
@@ -35,64 +36,6 @@ from twin.run.procedure import Advance, BenchError, silent
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.measured.orbit_data import ReadingErrorsSpec
-    from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredAngles:
-    """Angles of one pass.
-
-    Attributes:
-        name: of the pass.
-        time: of the moment, seconds from the pass's epoch.
-        pairs: angle -> the two lines that it lies between.
-        laboratory: line -> camera as the laboratory knows it.
-        pixel: line -> pixels of its points, (n,).
-        ids: line -> names of its points, (n,).
-        span: line -> first and last time of its points from the moment, seconds.
-        measurement: points as the lines would see them at the moment.
-        estimate: from it.
-    """
-
-    name: str
-    time: float
-    pairs: Mapping[str, tuple[str, str]]
-    laboratory: Mapping[str, LineCamera]
-    pixel: Mapping[str, np.ndarray]
-    ids: Mapping[str, np.ndarray]
-    span: Mapping[str, tuple[float, float]]
-    measurement: Measurement
-    estimate: Estimate
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """Those that angles are measured of."""
-        return tuple(self.pixel)
-
-    @property
-    def reference(self) -> str:
-        """The line whose look is zero in a resection: the second of the first angle."""
-        return next(iter(self.pairs.values()))[1]
-
-    @property
-    def look(self) -> np.ndarray:
-        """Angles between the lines of sight of the lines' centres in the laboratory, (m,), radians."""
-        return self._of(look_angle)
-
-    @property
-    def along_track(self) -> np.ndarray:
-        """Their signed part along the track, (m,), radians."""
-        return self._of(along_track_angle)
-
-    @property
-    def dihedral(self) -> np.ndarray:
-        """Angles between the planes of the lines where the points are in the laboratory, (m,), radians."""
-        cameras, pixel = self.laboratory, self.pixel
-        return np.array([dihedral_angle(cameras[a], cameras[b], (pixel[a], pixel[b])) for a, b in self.pairs.values()])
-
-    def _of(self, angle: object) -> np.ndarray:
-        assert callable(angle)
-        return np.array([angle(self.laboratory[a], self.laboratory[b]) for a, b in self.pairs.values()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,24 +50,20 @@ class _Tested:
         return next(iter(self.pairs.values()))[1]
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredAngleRun:
-    """A finished test on measurements.
+def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
+    """On measurements, or on a simulation: ``python -m twin.orbit angle``.
 
-    Attributes:
-        setup: what its file says.
-        passes: one by one.
+    Raises:
+        InputError, BenchError: as `run_angle` and `run_measured_angle`.
     """
-
-    setup: MeasuredAngleSetup
-    passes: tuple[MeasuredAngles, ...]
+    if isinstance(setup, MeasuredAngleSetup):
+        return run_measured_angle(setup, seed, advance)
+    return run_angle(setup, backend, seed, advance)
 
 
 @one_blas_thread()
-def run_measured_angle(
-    setup: MeasuredAngleSetup, backend: Backend | None, seed: int, advance: Advance = silent
-) -> MeasuredAngleRun:
-    """Read and estimate; nothing is drawn or traced, so that seed and backend are not used.
+def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advance = silent) -> AngleRun:
+    """Read and estimate; nothing is drawn, so that the seed is not used.
 
     Raises:
         InputError: files that cannot be used, or angles of lines that have no points.
@@ -137,10 +76,10 @@ def run_measured_angle(
         except (PlaneError, AngleError, ResectionError, ValueError) as error:
             remedy = "more points on each line, spread over its length, and the right conventions"
             raise BenchError(f"{one.name}: {error}", ("data",), remedy) from error
-    return MeasuredAngleRun(setup, tuple(passes))
+    return AngleRun(setup=setup, seed=seed, passes=tuple(passes))
 
 
-def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> MeasuredAngles:
+def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAngles:
     """Angles of one pass.
 
     Args:
@@ -179,7 +118,7 @@ def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> Measure
         strips,
         **{key: {name: each[key] for name, each in inside.items()} for key in INTERIOR},
     )
-    return MeasuredAngles(
+    return PassAngles(
         one.name,
         moment,
         FrozenMap(pairs),

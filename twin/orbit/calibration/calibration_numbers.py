@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.null_space import Combination
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from twin.orbit.calibration.attitude_drift import DriftNumbers
-from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, run_calibration
+from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult
 from twin.orbit.calibration.campaign import FieldPass, Rejected, interior_names
 from twin.orbit.calibration.chip_steps import StepNumbers
 from twin.orbit.calibration.image_numbers import ImageNumbers
@@ -31,7 +30,6 @@ from twin.orbit.calibration.scheme_numbers import (
     VerdictNumbers,
 )
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 Array = NDArray[np.float64]
 
@@ -466,6 +464,3 @@ class CalibrationNumbers:
 def calibration_numbers(run: CalibrationRun) -> dict[str, Any]:
     """Contents of calibration.json without its frames; what is not defined is None."""
     return dict(plain_data(CalibrationNumbers.of(run)))
-
-
-CALIBRATION = Procedure("calibration", CalibrationSetup, resolve_calibration, run_calibration, calibration_numbers)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from analysis.orbit.three_line_model import BIAS, misclosure
@@ -17,14 +16,15 @@ from twin.run.svg import (
     GREEN,
     GREY,
     INK,
-    LIGHT,
     ORANGE,
     PURPLE,
     SKY,
     VERMILION,
+    gridded,
     look,
     new_figure,
-    plain_axes,
+    shared_legend,
+    signed_map,
     to_svg,
 )
 
@@ -80,9 +80,7 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
     right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
     for axes in (left, right):
         axes.set_ylim(0.0, None)
-        axes.grid(color=LIGHT, lw=0.5)
-        axes.set_axisbelow(True)
-        plain_axes(axes)
+        gridded(axes)
         axes.tick_params(colors=INK)
     handles, labels = left.get_legend_handles_labels()
     more, other = right.get_legend_handles_labels()
@@ -124,9 +122,8 @@ def schemes_figure(run: CalibrationRun) -> Figure:
         if limit < 1.35 * table.max():
             axes.axhline(limit, color=GREY, lw=0.9, ls="--")
         axes.set_xticklabels(labels)
-        _finish(axes)
-    handles, names = panels[0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4)
+        gridded(axes)
+    shared_legend(figure, panels[0], "lower center", 4)
     return figure
 
 
@@ -151,7 +148,7 @@ def latitude_figure(run: CalibrationRun) -> Figure:
             np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
         )
         axes.set(title=f"{axis} [arcsec]", xlabel="latitude [deg]")
-        _finish(axes)
+        gridded(axes)
         handles = axes.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=4)
     return figure
@@ -165,7 +162,7 @@ def correlation_figure(run: CalibrationRun) -> Figure:
     names = [found.names[k] for k in free]
     figure = new_figure(min(9.2, 2.6 + 0.14 * len(names)))
     axes = figure.subplots()
-    shown = axes.imshow(found.correlation[np.ix_(free, free)], vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    shown = signed_map(axes, found.correlation[np.ix_(free, free)], 1.0)
     size = 6.5 if len(names) > 40 else 8.0
     axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
     axes.set_yticks(np.arange(len(names)), names, fontsize=size)
@@ -207,7 +204,7 @@ def residual_figure(run: CalibrationRun) -> Figure:
         axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
         axes.set(xlabel="pixel")
         axes.margins(0.12)
-        _finish(axes)
+        gridded(axes)
     panels[0].set_ylabel("image line, thousands")
     return figure
 
@@ -247,7 +244,7 @@ def check_figure(run: CalibrationRun) -> Figure:
         axes.set_aspect("equal")
         axes.margins(0.14)
         figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error [m]", location="bottom")
-        _finish(axes)
+        gridded(axes)
     panels[0].set_ylabel("north [km]")
     return figure
 
@@ -267,9 +264,3 @@ def _offsets(name: str) -> list[str]:
 
 def _count(fields: int) -> str:
     return "1 field" if fields == 1 else f"{fields} fields"
-
-
-def _finish(axes: Axes) -> None:
-    axes.grid(color=LIGHT, lw=0.5)
-    axes.set_axisbelow(True)
-    plain_axes(axes)

@@ -8,12 +8,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.measured.orbit_data_setup import CheckSetup, resolve_check
-from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried, run_check
+from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.possible_readings import QUESTIONS, Changes, changed
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 
 def value_of(name: str, value: Any) -> Any:
@@ -168,6 +166,3 @@ class CheckNumbers:
 def check_numbers(run: Check) -> dict[str, Any]:
     """Contents of check.json without its frames."""
     return dict(plain_data(CheckNumbers.of(run)))
-
-
-CHECK = Procedure("check", CheckSetup, resolve_check, run_check, check_numbers, judged=False, seeded=False)

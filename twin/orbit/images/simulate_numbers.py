@@ -9,13 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.orbit.setup import SimulateSetup, resolve_simulate
 from twin.orbit.ground.orthophoto import Raster
 from twin.orbit.images.image_points import CONSENSUS, MatchedLine, MatchedPoints, PatchPoints, status_text
 from twin.orbit.images.patch import LineImage
-from twin.orbit.images.simulate_run import Simulation, run_simulation
+from twin.orbit.images.simulate_run import Simulation
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 
 @dataclass(frozen=True)
@@ -199,6 +197,3 @@ class SimulateNumbers:
 def simulate_numbers(run: Simulation) -> dict[str, Any]:
     """Contents of simulate.json without its frames."""
     return dict(plain_data(SimulateNumbers.of(run)))
-
-
-SIMULATE = Procedure("simulate", SimulateSetup, resolve_simulate, run_simulation, simulate_numbers)

@@ -8,13 +8,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from scenes.specs.measured.orbit_data_setup import MatchSetup, resolve_match
 from twin.orbit.images.simulate_numbers import PointNumbers
-from twin.orbit.matching.match_run import Match, UserImage, run_match
+from twin.orbit.matching.match_run import Match, UserImage
 from twin.orbit.measured.map_part import MapPart
 from twin.orbit.measured.measurement_files import campaign_files
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 
 @dataclass(frozen=True)
@@ -94,6 +92,3 @@ def match_numbers(run: Match) -> dict[str, Any]:
 def exported(run: Match) -> dict[str, str]:
     """Path -> text of a folder of measurements."""
     return campaign_files([run.measurements], run.setup.camera.plain())
-
-
-MATCH = Procedure("match", MatchSetup, resolve_match, run_match, match_numbers, judged=False, seeded=False)

@@ -110,10 +110,8 @@ class Measured:
             times: of the states, seconds.
             spots: their names.
         """
-        worst = self.evidence.worst
-        told = self.evidence.doubt(worst, spots)
-        bad = int(np.count_nonzero(~self.evidence.holds))
-        return () if told is None else (f"at {moment(times[worst])}, the worst of {bad} times: {told.text}",)
+        told = self.evidence.course_doubt([moment(time) for time in times], spots)
+        return () if told is None else (told,)
 
     @property
     def shifts(self) -> np.ndarray:

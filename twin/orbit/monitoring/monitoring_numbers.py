@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.orbit.monitor import PARAMETERS
-from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight
-from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms, run_monitor
+from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms
 from twin.run.plain_data import plain_data
-from twin.run.procedure import Procedure
 
 Array = NDArray[np.float64]
 
@@ -377,6 +375,3 @@ class MonitorNumbers:
 def monitor_numbers(run: MonitorRun) -> dict[str, Any]:
     """Contents of monitor.json without its frames."""
     return dict(plain_data(MonitorNumbers.of(run)))
-
-
-MONITOR = Procedure("monitor", MonitorSetup, resolve_monitor, run_monitor, monitor_numbers)

@@ -11,12 +11,11 @@ from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 
 from scenes.yaml.errors import key_text
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table, plain, significant
-from twin.run.page import artefact_content, environment, place, reproduce, write_artefacts
-from twin.run.report import one_sentence
+from twin.run.artefact import Cell, SvgFigure, Table, plain, significant
+from twin.run.page import links, report_page, write_artefacts
+from twin.run.report import Report, Section, one_sentence
 from twin.run.run_folder import RunFolder
 from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
-from twin.run.versions import versions
 from twin.study.gradient.gradient_numbers import doubtful, unit_text
 from twin.study.gradient.study_gradient import AD, Gradient
 from twin.study.report.study_plots import finish
@@ -24,7 +23,6 @@ from twin.study.report.study_runs import typeset
 from twin.study.runs.setup import StudySetup
 from twin.study.runs.study_folder import PROGRAM
 
-TEMPLATE = "gradient.html.j2"
 DOUBTFUL_TEXT = (
     "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "
     "is noisy)"
@@ -41,7 +39,7 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
         warnings: what is wrong with what the study is given.
     """
     with look("gradient"):
-        figures = [
+        figures = (
             SvgFigure(
                 "heat-map",
                 "Which factor moves which response",
@@ -56,28 +54,39 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
                 "the sum of squares over all factors.",
                 to_svg(tornado(found)),
             ),
-        ]
-    tables: list[Artefact] = [response_table(found), factor_rows(found)]
-    write_artefacts((*figures, *tables), folder)
-    page = (
-        environment(__package__)
-        .get_template(TEMPLATE)
-        .render(
-            title=f"{setup.study.name}: gradient",
-            verdict=verdict(found),
-            warnings=[*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := doubtful(found)) else ())],
-            study=setup.study,
-            found=found,
-            exact=int((found.method == AD).sum()),
-            entries=found.method.size,
-            worst=significant(found.worst, 3, floor=0.0) if found.worst is not None else None,
-            tables=[artefact_content(a, place(a)) for a in tables],
-            figures=[artefact_content(a, place(a)) for a in figures],
-            command=reproduce((PROGRAM, "config.yaml", "--gradient")),
-            versions=versions(),
         )
+    study = setup.study
+    about = (
+        f"Derivatives of {len(found.responses)} responses by {len(found.factors)} factors of {study.base.command}, at "
+        "the base's own values; the design plays no part.",
+        f"{int((found.method == AD).sum())} of {found.method.size} entries are by automatic differentiation through "
+        f"the trace.{_agreement(found)} All other entries are differences. Spots are the means of their rays, as the "
+        "energy centroid has them; estimators are applied to these.",
     )
-    folder.write_text("report.html", page)
+    report = Report(
+        f"{study.name}: gradient",
+        verdict(found),
+        (*([study.description] if study.description else ()), *about),
+        (),
+        response_table(found),
+        (Section("Sensitivity", (), figures), Section("Factors", (), (factor_rows(found),))),
+        warnings=(*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := doubtful(found)) else ())),
+    )
+    write_artefacts(report.artefacts, folder)
+    numbers = links(("gradient.csv", "gradient.json", "config.yaml"))
+    folder.write_text(
+        "report.html", report_page(report, (PROGRAM, "config.yaml", "--gradient"), [("Numbers", numbers)])
+    )
+
+
+def _agreement(found: Gradient) -> str:
+    if found.worst is None:
+        return ""
+    return (
+        f" They and central differences through perturbed traces agree to {significant(found.worst, 3, floor=0.0)}: "
+        "relative to the entry, but for entries below 0.001 of their response's largest one relative to that; and for "
+        "a response that is a difference of two numbers, relative to these."
+    )
 
 
 def verdict(found: Gradient) -> str:
@@ -156,7 +165,7 @@ def factor_rows(found: Gradient) -> Table:
         rows.append([factor.name, where, typeset(factor.unit), value, spread, ", ".join(steps), kind])
     heads = ("factor", "in the base", "unit", "value in the base", "spread", "steps", "method")
     caption = "Differences are central, at the step and half of it, extrapolated after Richardson."
-    return Table("factors", "Factors", caption, heads, rows)
+    return Table("factors", "", caption, heads, rows)
 
 
 MOST_BARS = 8

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from twin.run.svg import BLUE, GREEN, GREY, INK, SKY, VERMILION, new_figure, plain_axes
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, SKY, VERMILION, new_figure, plain_axes
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_plots import finish, jitter, name_texts, positions, short, some
@@ -184,7 +184,7 @@ def matrix_figure(found: StudyAnalysis) -> Figure:
 def _correlation(axes: Axes, x: Factor | Response, y: Factor | Response) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
-    axes.spines[:].set_color("#d9dde3")
+    axes.spines[:].set_color(LIGHT)
     if any(isinstance(thing, Factor) and not thing.numeric for thing in (x, y)):
         axes.set_axis_off()
         return

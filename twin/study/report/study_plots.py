@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
+from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, gridded, new_figure
 from twin.study.report.study_analysis import StudyAnalysis
 from twin.study.report.study_runs import Factor, Response, typeset
 from twin.study.report.study_statistics import Description, mean_interval
@@ -37,9 +37,7 @@ def panels(count: int, wide: int, height: float) -> tuple[Figure, list[Axes]]:
 
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
     """The look of all panels; None leaves the ticks of an axis as they are."""
-    axes.grid(color=LIGHT, lw=0.5)
-    axes.set_axisbelow(True)
-    plain_axes(axes)
+    gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
         _plain_numbers(axes, "x")
@@ -267,7 +265,7 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
         y = np.array([part.mean() for part in row if len(part)])
         whisker = [float(np.std(part, ddof=1)) if len(part) > 1 else 0.0 for part in row if len(part)]
         colour = COLOURS[k % len(COLOURS)]
-        style = {"capsize": 2.5, "ecolor": "#1b1f24", "elinewidth": 0.9, "label": label or None}
+        style = {"capsize": 2.5, "ecolor": INK, "elinewidth": 0.9, "label": label or None}
         if from_zero:
             bar = {name: style[name] for name in ("capsize", "ecolor", "label")}
             axes.bar(x, y, 0.92 * width, yerr=whisker, color=colour, alpha=0.85, **bar)  # type: ignore[arg-type]

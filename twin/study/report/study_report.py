@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import xarray as xr
 
 from scenes.specs.study import StudySpec
-from twin.run.artefact import Artefact, Undrawn
+from twin.run.artefact import Undrawn
 from twin.run.owned_files import every_file
-from twin.run.page import artefact_content, environment, place, reproduce
+from twin.run.page import links, report_page
+from twin.run.report import Report, Section
 from twin.run.run_folder import json_text
-from twin.run.versions import versions
 from twin.study.report.conclusions import conclusions, design_title, verdict, warnings
 from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
 from twin.study.report.study_runs import StudyRuns
-from twin.study.report.study_sections import factor_table, own_file, response_table, sections
+from twin.study.report.study_sections import STATISTICS, factor_table, response_table, sections
+from twin.study.report.study_wording import plural
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
 
 __all__ = ["report_files", "summary", "write_report"]
 
-TEMPLATE = "study.html.j2"
-STATISTICS = "statistics.json"
 ARTEFACTS = "artefacts"
 
 
@@ -75,46 +73,24 @@ def report_files(
 ) -> StudyReport:
     """The report with all its files; arguments as of ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
-    responses, factors = response_table(found), factor_table(found.runs)
-    parts = sections(found)
-    shown = (responses, factors, *(a for section in parts for a in section.artefacts))
-    undrawn = tuple(artefact.note for artefact in shown if isinstance(artefact, Undrawn))
-    contents = {place(artefact): artefact.content() for artefact in shown if own_file(artefact)}
-    said = verdict(found)
-    contents[STATISTICS] = json_text({**plain_data(found), "verdict": said}).encode()
-    page = (
-        environment(__package__)
-        .get_template(TEMPLATE)
-        .render(
-            title=study.name,
-            verdict=said,
-            study=study,
-            runs=found.runs,
-            failed=int(found.runs.failed.sum()),
-            design=design_title(found.runs.kind),
-            warnings=[*given, *undrawn, *warnings(found)],
-            conclusions=conclusions(found),
-            responses=_shown(responses),
-            factors=_shown(factors),
-            sections=[
-                {
-                    "title": section.title,
-                    "folded": section.folded,
-                    "text": section.text,
-                    "artefacts": [_shown(a) for a in section.artefacts],
-                }
-                for section in parts
-            ],
-            files=files,
-            command=reproduce((PROGRAM, "config.yaml")),
-            versions=versions(),
-        )
+    said, runs = verdict(found), found.runs
+    about = (
+        f"{plural(runs.count, 'run')} of {study.base.command}, {int(runs.failed.sum())} of them failed; "
+        f"{design_title(runs.kind)}, seed {study.design.seed}."
     )
-    contents["report.html"] = page.encode()
+    report = Report(
+        study.name,
+        said,
+        (*([study.description] if study.description else ()), about),
+        (),
+        response_table(found),
+        (Section("Factors", (), (factor_table(runs),)), *sections(found)),
+        conclusions=tuple(conclusions(found)),
+    )
+    undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
+    report = replace(report, warnings=(*given, *undrawn, *warnings(found)))
+    contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
+    contents[STATISTICS] = json_text({**plain_data(found), "verdict": said}).encode()
+    numbers = links((*files, "study.json", STATISTICS, "config.yaml"))
+    contents["report.html"] = report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
     return StudyReport(said, contents, undrawn)
-
-
-def _shown(artefact: Artefact) -> dict[str, Any]:
-    if artefact.name == "factors":
-        return artefact_content(artefact, "config.yaml")
-    return artefact_content(artefact, place(artefact) if own_file(artefact) else STATISTICS)

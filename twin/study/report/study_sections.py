@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 from scenes.specs.study import FactorSpec
 from scenes.yaml.errors import key_text
-from twin.run.artefact import Artefact, Cell, SvgFigure, Table, Undrawn, fixed, plain
+from twin.run.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
 from twin.run.report import Section
 from twin.run.svg import look, to_svg
 from twin.study.report import conclusions
@@ -39,6 +39,8 @@ from twin.study.report.study_wording import DASH, normality_text, number, percen
 from twin.study.runs.base_job import one_line
 
 MOST_NAMED = 6
+STATISTICS = "statistics.json"
+"""Holds all digits of tables whose cells are texts, which have no file of their own."""
 
 
 def factor_table(runs: StudyRuns) -> Table:
@@ -49,7 +51,7 @@ def factor_table(runs: StudyRuns) -> Table:
         places += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
         rows.append([factor.name, typeset(factor.unit), "; ".join(places), _source(factor.spec), _values(factor)])
     heads = ("factor", "unit", "in the base", "distribution", "values run")
-    return Table("factors", "Factors", "What was varied.", heads, rows)
+    return Table("factors", "", "What was varied.", heads, rows, within="config.yaml")
 
 
 def _source(spec: FactorSpec) -> str:
@@ -118,16 +120,7 @@ def response_table(found: StudyAnalysis) -> Table:
             "Over the combinations of the grid, all counted alike; they are no sample, so that there are no intervals."
         )
     caption = f"Over the runs that have a number; 95% and 99.7% of the runs lie below those columns. {how}"
-    return Table(name="responses", title="Responses", caption=caption, heads=heads, rows=rows)
-
-
-WORDED = ("responses", "factors", "requirements", "linear-model", "sobol")
-"""Tables whose cells are texts: all digits stand in statistics.json, not in a file of their own."""
-
-
-def own_file(artefact: Artefact) -> bool:
-    """Whether an artefact is written to a file of its own."""
-    return artefact.name not in WORDED
+    return Table("responses", "Responses", caption, heads, rows, within=STATISTICS)
 
 
 def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
@@ -184,6 +177,7 @@ def _requirements(found: StudyAnalysis) -> Section | None:
                 "judged.",
                 ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
                 rows,
+                within=STATISTICS,
             ),
         ),
     )
@@ -257,6 +251,7 @@ def _influences(found: StudyAnalysis) -> Section | None:
         + (", with 95% intervals. Where the last two differ much, the response is curved." if sampled else "."),
         ("response", "factor", "from … to", "swing", "unit", "standardised", "rank correlation"),
         rows,
+        within=STATISTICS,
     )
     cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
     remarks = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
@@ -290,7 +285,7 @@ def _indices(found: StudyAnalysis) -> Section | None:
     caption = "First order: share of the variance that the factor explains alone; total: with all its interactions."
     if chaos:
         caption += " RBD-FAST (SALib) needs no model and checks the first order; its own error is some 0.03 to 0.1."
-    table = Table("sobol", "Indices", caption, heads, rows)
+    table = Table("sobol", "Indices", caption, heads, rows, within=STATISTICS)
     intervals = "with 95% intervals" if chaos else "exact for the grid"
     figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {intervals}.",
                      lambda: indices_figure(found))  # fmt: skip

@@ -140,23 +140,15 @@ def std_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval
     return s / factor, s * factor
 
 
-def quantile_ranks(n: int, q: float, confidence: float = CONFIDENCE) -> tuple[int | None, int | None]:
-    """Ranks, from 0, of the values that enclose the quantile ``q`` of any continuous distribution.
+def quantile_interval(values: np.ndarray, q: float, confidence: float = CONFIDENCE) -> Interval:
+    """Interval of the quantile ``q`` of any continuous distribution by order statistics of (n,) values.
 
-    The number of values below the quantile is binomial; each end is passed with a chance of (1 - confidence)/2 at
-    most. None where n values do not reach.
+    Each end is passed with a chance of (1 - confidence)/2 at most; an end that n values do not reach is None.
     """
-    side = 0.5 * (1.0 - confidence)
-    # the value of rank l (from 0) lies above the quantile when at most l values lie below it
-    low = int(stats.binom.ppf(side, n, q)) - 1
-    high = int(stats.binom.ppf(1.0 - side, n, q))
-    return (low if low >= 0 else None), (high if high < n else None)
-
-
-def quantile_interval(ordered: np.ndarray, q: float, confidence: float = CONFIDENCE) -> Interval:
-    """Interval of the quantile ``q`` by order statistics of (n,) sorted values; an end is None if it lies outside."""
-    low, high = quantile_ranks(len(ordered), q, confidence)
-    return (None if low is None else float(ordered[low])), (None if high is None else float(ordered[high]))
+    found = stats.quantile_test(values, p=q).confidence_interval(confidence)
+    return (None if math.isnan(found.low) else float(found.low)), (
+        None if math.isnan(found.high) else float(found.high)
+    )
 
 
 def runs_for_quantile(q: float, confidence: float = CONFIDENCE) -> int:

@@ -10,10 +10,11 @@ from typing import Any, Protocol
 from analysis.measurement_error import MeasurementError
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
+from scenes.specs.procedures import Procedure
 from scenes.yaml.errors import InputError, KeyPath
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.run.procedure import Procedure, silent
+from twin.run.procedure import silent
 from twin.study.runs.config_tree import Tree, with_values
 
 
@@ -82,12 +83,12 @@ class ProcedureBase:
         procedure: the test.
     """
 
-    procedure: Procedure[Any, Any]
+    procedure: Procedure
 
     @property
     def model(self) -> type[Spec]:
         """The test's set-up."""
-        return self.procedure.setup
+        return self.procedure.model
 
     @property
     def block(self) -> int:

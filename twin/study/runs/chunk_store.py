@@ -101,15 +101,6 @@ class ChunkStore:
         if self.corrupt or self._index_is_damaged(listed):
             self._rewrite_index()
 
-    def look(self) -> None:
-        """As `open`, but nothing in the folder is touched: chunks that are not whole are not among the entries."""
-        for entry in self._listed():
-            try:
-                self.read(entry)
-            except ChunkError:
-                continue
-            self.entries[entry.first] = entry
-
     @property
     def done(self) -> set[int]:
         """Numbers of the blocks that are there."""
@@ -234,12 +225,12 @@ class ChunkFiles:
     Attributes:
         damaged: files that are not as they were written, the index among them; paths in the study's folder.
         unlisted: files that the index does not know.
-        runs: number of runs in chunks that are whole.
+        whole: chunks that are.
     """
 
     damaged: tuple[str, ...]
     unlisted: tuple[str, ...]
-    runs: int
+    whole: tuple[Entry, ...]
 
 
 def examined(study: Path) -> ChunkFiles:
@@ -248,7 +239,8 @@ def examined(study: Path) -> ChunkFiles:
     Args:
         study: its folder.
     """
-    folder, damaged, listed, runs = study / FOLDER, [], set(), 0
+    folder, damaged, listed = study / FOLDER, [], set()
+    good: list[Entry] = []
     try:
         lines = _content(folder / INDEX).splitlines(keepends=True)
     except OSError:
@@ -265,13 +257,13 @@ def examined(study: Path) -> ChunkFiles:
         except OSError:
             whole = False
         if whole:
-            runs += entry.runs
+            good.append(entry)
         else:
             damaged.append(entry.file)
     there = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     others = sorted(there - listed - {INDEX})
     in_study = [tuple(f"{FOLDER}/{name}" for name in names) for names in (damaged, others)]
-    return ChunkFiles(in_study[0], in_study[1], runs)
+    return ChunkFiles(in_study[0], in_study[1], tuple(good))
 
 
 def _packed(first: int, blocks: int, result: BlockResult) -> bytes:

@@ -160,7 +160,9 @@ def _column(setup: StudySetup, name: str, sampled: np.ndarray) -> Column:
         return Column(name, numbers.unit or "", _like(setup, name, sampled))
     if numbers.numeric:
         listed = np.array(numbers.values, np.float64)
-        return Column(name, numbers.unit or "", (listed.astype(np.int64) if numbers.whole else listed)[sampled])
+        # a whole number beyond these is none of a base job, which says so when it reads it
+        whole = numbers.whole and bool(np.all(np.abs(listed) < 2.0**53))
+        return Column(name, numbers.unit or "", (listed.astype(np.int64) if whole else listed)[sampled])
     scalars = factor.scalars()
     if all(isinstance(value, bool) for value in scalars):
         return Column(name, "", np.array(scalars, bool)[sampled])

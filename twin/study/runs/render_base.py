@@ -8,19 +8,15 @@ from __future__ import annotations
 import json
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from analysis.monitor.recovery import Recovery, recover
-from analysis.spots.spot_positions import SpotError
+from analysis.monitor.recovery import Recovery
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
-from optics.numerics.threads import one_blas_thread
-from optics.raytrace.aim import AimError
-from optics.raytrace.trace import BeamMissedError
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob, resolve
@@ -28,6 +24,7 @@ from scenes.yaml.spec import Spec
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe
 from twin.monitor.truth import Truth
 from twin.study.runs.base_job import PHYSICS, Failure, Outcome, Run, one_line
 from twin.study.runs.config_tree import Tree
@@ -108,102 +105,27 @@ def run_together(
         For each run its results, or why it has none. When one run's light is lost, all runs of the group are tried
         alone, and those that are good are done together without it.
     """
-    out: list[Outcome | None] = [None] * len(runs)
-    left = list(range(len(runs)))
-    traced = _traced(experiment, [run.state for run in runs])
-    if traced is None:
-        for k in left:
-            try:
-                _trace(experiment, [runs[k].state])
-            except (AimError, BeamMissedError) as error:
-                out[k] = Failure(str(error))
-        left = [k for k in left if out[k] is None]
-        traced = _trace(experiment, [runs[k].state for k in left]) if left else None
-    if traced is None:
-        return [outcome for outcome in out if outcome is not None]
-    truth, photons = traced
-    # runs that share their noise have the same frames before, which are then measured once
+    out: list[Outcome] = [Failure("not done")] * len(runs)
     shared = len({run.seed for run in runs}) == 1
-    first = (
-        before(runs[0].frames, runs[0].seed)
-        if shared
-        else np.stack([before(r.frames, r.seed) for r in _of(runs, left)])
-    )
-    after = np.empty((*photons.shape[:2], runs[0].frames, *photons.shape[2:]), np.uint16)
-    for i, run in enumerate(_of(runs, left)):
-        after[i : i + 1] = experiment.frames_after(photons[i : i + 1], run.frames, run.seed)
-    good = list(range(len(left)))
-    while good:
-        try:
-            with one_blas_thread():
-                start = first if shared else _of(first, good)
-                stated = experiment.disturbances
-                frames = _of(after, good)
-                again = experiment.motion_models
-                known = experiment.calibration
-                recovery = recover(start, frames, known, _centroid(runs[0]), 1, stated, motions=again)
-        except SpotError as error:
-            lost = _lost(error, experiment, good)
-            for i, reason in lost.items():
-                out[left[i]] = Failure(f"a spot cannot be measured ({reason})")
-            good = [i for i in good if i not in lost]
-            continue
-        for j, i in enumerate(good):
-            run, one = runs[left[i]], (_truth_of(truth, i), recovery.at(slice(j, j + 1)))
-            out[left[i]] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *one)
-        break
-    return [outcome for outcome in out if outcome is not None]
 
+    def leave(k: int, why: str) -> None:
+        out[k] = Failure(why)
 
-def _of(things: Any, chosen: Sequence[int]) -> Any:
-    """Those of the given numbers; no copy of arrays when it is all of them."""
-    if len(chosen) == len(things):
-        return things
-    return things[list(chosen)] if isinstance(things, np.ndarray) else [things[k] for k in chosen]
+    def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        own = [runs[k] for k in numbers]
+        # runs that share their noise have the same frames before, which are then measured once
+        first = [before(run.frames, run.seed) for run in (own[:1] if shared else own)]
+        pairs = zip(photons, own, strict=True)
+        after = [experiment.frames_after(one[None], run.frames, run.seed) for one, run in pairs]
+        return first[0] if shared else np.stack(first), np.concatenate(after)
 
-
-def _centroid(run: MonitorRun) -> str:
-    return run.resolved.job.analysis.centroid
-
-
-def _traced(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Truth, np.ndarray] | None:
-    try:
-        return _trace(experiment, states)
-    except (AimError, BeamMissedError):
-        return None
-
-
-def _trace(experiment: MonitorExperiment, states: Sequence[State]) -> tuple[Truth, np.ndarray]:
-    """Truth, and expected photons (S, C, rows, columns)."""
-    truth = experiment.sight.truth(states)
-    return truth, experiment.path.expected_photons(states, chunk=len(states))
-
-
-def _lost(error: SpotError, experiment: MonitorExperiment, good: Sequence[int]) -> dict[int, str]:
-    """State -> why its spots, before or after, cannot be measured."""
-    channels = experiment.path.channels
-    out: dict[int, str] = {}
-    for index in error.indices:
-        state, spot = divmod(index, len(channels))
-        out.setdefault(good[state], f"{channels[spot].key}: {error.reasons[index]}")
+    how = Observing(record, runs[0].resolved.job.analysis.centroid, len(runs), leave=leave)
+    for found in observe(experiment, [run.state for run in runs], how):
+        for j, k in enumerate(found.numbers):
+            run, one = runs[k], slice(j, j + 1)
+            told = found.truth.at(one), found.recovery.at(one)
+            out[k] = monitor_results(run.resolved, experiment, run.state, run.frames, run.seed, *told)
     return out
-
-
-def _truth_of(truth: Truth, i: int) -> Truth:
-    """The truth of one of the states."""
-    one = slice(i, i + 1)
-    cameras = {
-        name: replace(
-            change,
-            d_alpha=change.d_alpha[one],
-            d_beta=change.d_beta[one],
-            d_gamma=change.d_gamma[one],
-            principal_distance=change.principal_distance[one],
-            d_f=change.d_f[one],
-        )
-        for name, change in truth.cameras.items()
-    }
-    return replace(truth, cameras=cameras, angle_change=truth.angle_change[one], lines=truth.lines[:, [0, i + 1]])
 
 
 BLOCK = 25

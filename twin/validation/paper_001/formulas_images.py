@@ -19,6 +19,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
 from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
@@ -121,7 +122,8 @@ class MonitorImages:
         progress(0.0, "trace the truth")
         self.truth: Truth = experiment.sight.truth(every)
         progress(0.4, "render and measure the spots")
-        pieces = [piece for _, piece in experiment.measure(every, FRAMES, seed)]
+        how = Observing(one_detector(experiment, FRAMES, seed), stated=False)
+        pieces = [found.recovery for found in observe(experiment, every, how)]
         self.before = np.concatenate([p.before for p in pieces])
         self.after = np.concatenate([p.after for p in pieces])
         self.covariance = np.concatenate([p.shift_covariance for p in pieces])

@@ -100,6 +100,7 @@ def fit_table(spec: TurntableTestSpec, seed: int) -> FittedTable:
     """Calibrate a table, fit it in all five ways, and look at the readings in between."""
     done = run_turntable(spec, seed, names=CLOSED_FORMS)
     series, held = done.series, done.held_out
+    assert held is not None
     found = {name: rms(done.held_out_residual(name)) for name in done.fits}
     try:
         # without its cross-validation, which takes ten times as long and chooses nothing here

@@ -17,6 +17,7 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family
+from twin.monitor.observation import Observing, observe, one_detector
 from twin.validation.checks.group import load_printed
 from twin.validation.paper_001.ranges.curves import FORMS, Bench, Curves, Domain, sampled
 
@@ -304,5 +305,7 @@ def _measured(
     experiment: MonitorExperiment, bench: Bench, states: Sequence[State], seed: int
 ) -> dict[str, dict[str, np.ndarray]]:
     """Readings from noisy frames of all states."""
-    parts = [bench.readings(found.before, found.after) for _, found in experiment.measure(states, bench.frames, seed)]
+    how = Observing(one_detector(experiment, bench.frames, seed), stated=False)
+    seen = [found.recovery for found in observe(experiment, states, how)]
+    parts = [bench.readings(found.before, found.after) for found in seen]
     return {c: {form: np.concatenate([part[c][form] for part in parts]) for form in FORMS} for c in bench.cameras}

@@ -1,0 +1,167 @@
+"""Where measured figures come from, and the file in which they stand."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ruamel.yaml import YAML
+
+ROOT = Path(__file__).resolve().parents[2]
+FILE = Path(__file__).with_name("figures.yaml")
+SUMMARY = ROOT / "docs/validation/README.md"
+"""The summary of a full run of twin.validate."""
+HEAD = "# Measured figures that README and docs quote. Made by `python -m docs.figures`; not to be edited.\n"
+_NUMBER = re.compile(r"(-?[\d.]+(?:e-?\d+)?)(?: ± ([\d.]+))?")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured number.
+
+    Attributes:
+        value: in the unit.
+        sigma: one standard deviation in the unit, None where none is known.
+        unit: empty for a pure number.
+        digits: decimals with which pages quote it, if they do not say otherwise.
+        command: what measures it.
+        seed: of its random numbers, None where it has none.
+    """
+
+    value: float
+    sigma: float | None
+    unit: str
+    digits: int
+    command: str
+    seed: int | None
+
+
+CHECKS: Mapping[str, tuple[int, float, str]] = {
+    "000.height.alpha": (1, 1.0, "m"),
+    "001.eq2": (3, 1.0, ""),
+    "001.eq3": (3, 1.0, ""),
+    "001.eq5": (4, 1.0, ""),
+    "001.eq7": (4, 1.0, ""),
+    "001.table1.d_f": (5, 1.0, ""),
+    "001.table4.root_sum": (3, 1.0, "arcsec"),
+    "001.table4.together": (3, 1.0, "arcsec"),
+    "001.table5.d_alpha": (3, 1.0, "arcsec"),
+    "001.table5.d_beta": (3, 1.0, "arcsec"),
+    "001.table5.d_gamma": (2, 1.0, "arcsec"),
+    "001.table5.d_f": (3, 1.0, "mm"),
+    "003.before.plan": (0, 1.0, "m"),
+    "003.before.height": (0, 1.0, "m"),
+    "003.scheme1.plan": (1, 1.0, "m"),
+    "003.scheme4.plan": (1, 1.0, "m"),
+    "003.scheme5.plan": (1, 1.0, "m"),
+    "003.scale50000.height": (1, 1.0, "m"),
+    "004.alignment.confocal": (1, 1e3, "um"),
+    "004.table1.P": (3, 1.0, ""),
+    "004.table1.B1": (3, 1.0, ""),
+    "004.table1.B2": (3, 1.0, ""),
+    "004.table1.B3": (3, 1.0, ""),
+    "004.table1.B4": (3, 1.0, ""),
+    "004.table2.compensation": (0, 1.0, "%"),
+    "004.table2.reduction": (0, 1.0, "%"),
+}
+"""Check of a paper -> decimals, factor from the summary's unit, unit."""
+
+
+def _angle(run: Path, key: str) -> float:
+    """A number of what the posterior reads of the intersection angle."""
+    tree = json.loads((run / "recovered.json").read_text("utf-8"))
+    return float(tree["intersection_angle"]["posterior"][f"change_arcsec_{key}"])
+
+
+def _share(run: Path) -> float:
+    """Of the backward M2's motions in that reading's variance, per cent."""
+    tree = json.loads((run / "uncertainty.json").read_text("utf-8"))
+    lines = tree["quantities"]["intersection_angle"]["change_arcsec"]["after"]["posterior"]["lines"]
+    return 100.0 * sum(one["share"] for one in lines if one["motion"].startswith("base/backward/M2 "))
+
+
+def _false_turn(run: Path) -> float:
+    """About Y that the forward camera's spots show and that is not there, arcseconds."""
+    read, true = (json.loads((run / f"{name}.json").read_text("utf-8"))["cameras"] for name in ("recovered", "truth"))
+    return abs(float(read["forward"]["model"]["d_alpha_arcsec"] - true["forward"]["d_alpha_arcsec"]))
+
+
+RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Callable[[Path], float]]]] = {
+    ("twin.render", "scenes/examples/perturb.yaml", "--seed", "1"): {
+        "launch.angle_sigma": (2, "arcsec", lambda run: _angle(run, "sigma")),
+        "launch.angle_noise": (4, "arcsec", lambda run: _angle(run, "sigma_noise")),
+        "launch.angle_share": (0, "%", _share),
+        "launch.false_turn": (3, "arcsec", _false_turn),
+    },
+}
+"""Command that makes a run folder -> its figures: decimals, unit, and how it is read there."""
+
+
+def of_validation(summary: str) -> dict[str, Figure]:
+    """The figures that a full validation gives: the checks' measured values, and how many rows have which verdict.
+
+    Args:
+        summary: text of the page that it makes.
+    """
+    command = re.findall(r"Made by `(python -m twin\.validate .*?)`", summary)[0]
+    seed = int(re.findall(r"--seed (\d+)", command)[0])
+    rows: dict[str, str] = {}
+    for line in summary.splitlines():
+        if line.startswith("| `"):
+            cells = line.strip("| ").split(" | ")
+            rows |= dict.fromkeys(re.findall(r"`([^`]+)`", cells[0]), cells[4])
+    out = {}
+    for name, (digits, factor, unit) in CHECKS.items():
+        number = _NUMBER.match(rows[name].replace("−", "-"))
+        if number is None:
+            raise ValueError(f"{name}: no number: {rows[name]}")
+        sigma = None if number[2] is None else float(f"{float(number[2]) * factor:.6g}")
+        out[name] = Figure(float(f"{float(number[1]) * factor:.6g}"), sigma, unit, digits, command, seed)
+    counts = {name: int(n) for name, n in re.findall(r"^\| ([a-z ]+) \| (\d+) \|", summary, re.M)}
+    counts["all"] = sum(counts.values())
+    for name, number_of in counts.items():
+        out[f"rows.{name.replace(' ', '_')}"] = Figure(number_of, None, "", 0, command, seed)
+    return out
+
+
+def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
+    """All figures, those anew whose names begin with ``only``."""
+    out = dict(known) | {k: v for k, v in of_validation(SUMMARY.read_text("utf-8")).items() if k.startswith(only)}
+    if "libraries".startswith(only) or only.startswith("libraries"):
+        from docs.figures.libraries import SEED, measured
+
+        for name, (value, digits, unit) in measured().items():
+            out[name] = Figure(
+                float(f"{value:.3g}"), None, unit, digits, "python -m docs.figures --only libraries", SEED
+            )
+    for words, wanted in RUNS.items():
+        if not any(name.startswith(only) for name in wanted):
+            continue
+        with tempfile.TemporaryDirectory(prefix="figures-") as place:
+            run = Path(place, "run")
+            subprocess.run([sys.executable, "-m", *words, "--quiet", "--out", str(run)], cwd=ROOT, check=True)
+            seed = int(words[words.index("--seed") + 1])
+            for name, (digits, unit, read) in wanted.items():
+                out[name] = Figure(float(f"{read(run):.6g}"), None, unit, digits, f"python -m {' '.join(words)}", seed)
+    return out
+
+
+def read_figures(file: Path = FILE) -> dict[str, Figure]:
+    """The file's figures by name."""
+    tree = YAML(typ="safe").load(file) if file.exists() else {}
+    return {name: Figure(**one) for name, one in tree.items()}
+
+
+def write_figures(figures: Mapping[str, Figure], file: Path = FILE) -> None:
+    """Write the file."""
+    yaml = YAML()
+    yaml.width = 200
+    with file.open("w", encoding="utf-8") as out:
+        out.write(HEAD)
+        yaml.dump({name: asdict(figures[name]) for name in sorted(figures)}, out)

@@ -1,0 +1,389 @@
+"""The tests that commands run, each listed once: which files it reads, what runs it, what it computes, its report.
+
+Commands and their help, the JSON Schemas, studies, the documentation and `twin.perform` read this list. What a test
+names is imported when it is used: help and messages about files wait for nothing that computes, and what computes waits
+for nothing that draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from optics.numerics.frozen_map import FrozenMap
+
+if TYPE_CHECKING:
+    from scenes.yaml.spec import Spec
+
+
+@dataclass(frozen=True)
+class Named:
+    """A function or a class that is imported when it is used.
+
+    Attributes:
+        path: module and name, ``twin.laboratory.export:export_focus``.
+    """
+
+    path: str
+
+    def get(self) -> Any:
+        """The function or the class."""
+        module, _, name = self.path.partition(":")
+        return getattr(import_module(module), name)
+
+    def __call__(self, *values: Any, **named: Any) -> Any:
+        """Import the function and call it."""
+        return self.get()(*values, **named)
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A kind of file.
+
+    Attributes:
+        name: of its JSON Schema.
+        described: model of what it may say, or its name as `Named` takes it.
+        what: it is, with article, for messages.
+        command: that reads it, as the user calls it; empty for what only other files name.
+        place: where other files name it; empty for what only a command reads.
+    """
+
+    name: str
+    described: type[Spec] | str
+    what: str
+    command: str = ""
+    place: str = ""
+
+    @property
+    def model(self) -> type[Spec]:
+        """What it may say."""
+        described: Any = self.described
+        return Named(described).get() if isinstance(described, str) else described
+
+    def strangers(self, keys: set[str]) -> int | None:
+        """How many of the keys are none of this kind's; None if one that it needs is missing."""
+        fields = self.model.model_fields
+        needed = {name for name, item in fields.items() if item.is_required()}
+        return len(keys - set(fields)) if needed <= keys else None
+
+
+@dataclass(frozen=True)
+class Procedure:
+    """A test, of whose run a command makes a report and a study takes the numbers.
+
+    Functions and the set-up may be given as names that `Named` takes. No module that ``run`` and ``numbers`` need draws
+    anything or fills a template.
+
+    Attributes:
+        kind: for example ``focus``; KIND.json has the numbers.
+        setup: class of the simulated test with all it refers to; has ``test``, ``with_seed`` and ``to_yaml``.
+        resolve: file, or the name of one in the library -> set-up. Raises InputError.
+        run: set-up, backend, seed and progress -> everything that was computed. Raises InputError, BenchError.
+        numbers: run -> what KIND.json holds, plain data; keys end in their unit.
+        report: run -> `twin.run.report.Report`.
+        export: run -> path and contents of files with what was measured; the command then has an option ``--export``.
+        files: kinds of file that it reads; their command is known from the list.
+        varied: whether a study can vary it.
+        judged: whether the user is warned of cameras among what the test is given that are blurred as designed.
+        seeded: whether anything is drawn at random; config.yaml then states the seed.
+        about: what ``--help`` says of it, in Markdown; its first paragraph stands in the list of subcommands.
+        frames: quantity of KIND.json -> what it refers to, where `twin.run.reference_frames.FRAMES` does not say it.
+    """
+
+    kind: str
+    setup: Any
+    resolve: Any
+    run: Any
+    numbers: Any
+    report: Any
+    export: Any = None
+    files: tuple[FileKind, ...] = ()
+    varied: bool = False
+    judged: bool = True
+    seeded: bool = True
+    about: str = ""
+    frames: Mapping[str, str] = field(default_factory=FrozenMap)
+
+    def __post_init__(self) -> None:
+        """Functions that are given by name are imported when they are called."""
+        for name in ("resolve", "run", "numbers", "report", "export"):
+            if isinstance(path := getattr(self, name), str):
+                object.__setattr__(self, name, Named(path))
+
+    @property
+    def model(self) -> Any:
+        """Class of the simulated test's set-up."""
+        return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
+
+
+def studied() -> tuple[str, ...]:
+    """Tests that a study can vary."""
+    return tuple(name for name, procedure in PROCEDURES.items() if procedure.varied)
+
+
+PROCEDURES: dict[str, Procedure] = {
+    "lab focus": Procedure(
+        "focus",
+        setup="scenes.specs.resolved:FocusSetup",
+        resolve="scenes.specs.resolved:resolve_focus_test",
+        run="twin.laboratory.measured_focus:run_focus_test",
+        numbers="twin.laboratory.focus_numbers:focus_numbers",
+        report="twin.laboratory.focus_measured_report:any_focus_report",
+        export="twin.laboratory.export:export_focus",
+        files=(
+            FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test"),
+            FileKind("measured_focus", "scenes.specs.camera_tests:MeasuredFocusSpec", "a focus test on measurements"),
+        ),
+        varied=True,
+        about="""
+    Align a mis-set focal plane: through-focus MTF of a slanted edge in every field and band, a weighted plane,
+    shims, and the same again.
+
+    focus.json holds, for every round, the confocal error, the line's level, MTF at Nyquist by band and the shims,
+    and under `truth` what the exact trace says.
+
+    Example: `python -m twin.lab focus scenes/lab/focus.yaml`
+    """,
+    ),
+    "lab distortion": Procedure(
+        "distortion",
+        setup="scenes.specs.resolved:DistortionSetup",
+        resolve="scenes.specs.resolved:resolve_distortion_test",
+        run="twin.laboratory.distortion_run:run_distortion",
+        numbers="twin.laboratory.distortion_numbers:distortion_numbers",
+        report="twin.laboratory.distortion_report:distortion_report",
+        export="twin.laboratory.export:export_distortion",
+        files=(
+            FileKind("distortion_test", "scenes.specs.camera_tests:DistortionTestSpec", "a distortion test"),
+            FileKind(
+                "measured_distortion",
+                "scenes.specs.camera_tests:MeasuredDistortionSpec",
+                "a distortion test on measurements",
+            ),
+        ),
+        varied=True,
+        about="""
+    Measure principal distance, principal point and distortion: a pinhole's spots on the line CCD while a turntable
+    turns the camera, with raw and with compensated angles.
+
+    distortion.json: `rms_raw_um` and `rms_compensated_um` are what a laboratory can state, the scatter of the points
+    about a smooth curve; how wrong the distortion is stands under `truth`, `error_rms_raw_um` and
+    `error_rms_compensated_um`.
+
+    Example: `python -m twin.lab distortion scenes/lab/distortion.yaml`
+    """,
+    ),
+    "lab turntable": Procedure(
+        "turntable",
+        setup="scenes.specs.resolved:TurntableSetup",
+        resolve="scenes.specs.resolved:resolve_turntable_test",
+        run="twin.laboratory.turntable_run:run_turntable_test",
+        numbers="twin.laboratory.turntable_numbers:turntable_numbers",
+        report="twin.laboratory.turntable_report:turntable_report",
+        export="twin.laboratory.export:export_turntable",
+        files=(
+            FileKind("turntable_test", "scenes.specs.turntable:TurntableTestSpec", "a turntable test"),
+            FileKind(
+                "measured_turntable",
+                "scenes.specs.turntable:MeasuredTurntableSpec",
+                "a turntable test on measurements",
+            ),
+        ),
+        varied=True,
+        about="""
+    Calibrate a turntable's dividing error by regional comparison and compare five fits of it on held-out angles.
+
+    Example: `python -m twin.lab turntable scenes/lab/turntable.yaml --seed 2`
+    """,
+    ),
+    "orbit angle": Procedure(
+        "angle",
+        setup="scenes.specs.orbit.setup:AngleSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_angle",
+        run="twin.orbit.angle.measured_angle:run_angle_test",
+        numbers="twin.orbit.angle.angle_numbers:angle_numbers",
+        report="twin.orbit.angle.angle_report:angle_report",
+        export="twin.orbit.angle.angle_export:angle_exported",
+        files=(
+            FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),
+            FileKind(
+                "measured_angle",
+                "scenes.specs.measured.orbit_data:MeasuredAngleSpec",
+                "intersection angles on measurements",
+            ),
+        ),
+        varied=True,
+        about="""
+    Intersection angles of a three-line camera by planes through the station and ground points (paper 000), with
+    space resection as the second method.
+
+    A file with `data: DIR` runs on the measurements of that folder, as `calibrate` does: the angles of every pass,
+    against those of the laboratory. `--export DIR` writes such a folder of what a simulation measured, with a test file
+    angle.yaml.
+
+    angle.json holds the angles with sigmas, the truth, planes minus resection, and the sensitivity to errors of the
+    station and of the points.
+
+    Example: `python -m twin.orbit angle scenes/orbit/angle.yaml`
+    """,
+    ),
+    "orbit calibrate": Procedure(
+        "calibration",
+        setup="scenes.specs.orbit.setup:CalibrationSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_calibration",
+        run="twin.orbit.calibration.calibration_run:run_calibration",
+        numbers="twin.orbit.calibration.calibration_numbers:calibration_numbers",
+        report="twin.orbit.calibration.calibration_report:calibration_report",
+        export="twin.orbit.calibration.calibration_export:exported",
+        files=(
+            FileKind(
+                "orbit_calibration", "scenes.specs.orbit.calibration:OrbitCalibrationSpec", "an in-orbit calibration"
+            ),
+            FileKind(
+                "measured_calibration",
+                "scenes.specs.measured.orbit_data:MeasuredCalibrationSpec",
+                "a calibration on measurements",
+            ),
+        ),
+        varied=True,
+        about="""
+    Interior orientation and attitude biases of a three-line camera over test fields, and schemes of averaged
+    parameters tested on all fields without ground control (paper 003); simulated, or on measured passes.
+
+    A file with `data: DIR` runs on the measurements of that folder: orbit, attitude, line times, ground and image
+    points. `--export DIR` writes such a folder of what the run measured, with a test file calibrate.yaml.
+
+    calibration.json holds the parameters with sigmas and truth, correlations, null vectors and gauge, and the errors in
+    plan and height of every field before calibration and by each scheme.
+
+    Example: `python -m twin.orbit calibrate scenes/orbit/calibrate.yaml`
+    """,
+    ),
+    "orbit check": Procedure(
+        "check",
+        setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
+        run="twin.orbit.conventions.check_run:run_check",
+        numbers="twin.orbit.conventions.check_numbers:check_numbers",
+        report="twin.orbit.conventions.check_report:check_report",
+        export="twin.orbit.conventions.check_export:exported",
+        files=(
+            FileKind(
+                "orbit_check",
+                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
+                "a check of the conventions of a pass",
+            ),
+        ),
+        judged=False,
+        seeded=False,
+        about="""
+    Conventions of a pass in files: every reading of what is mistaken for one another (order and sense of the
+    quaternion, frames, time scales, an offset of the line times, origins and axes of pixels and lines), alone and two
+    at once, is tried on the ground points and ranked.
+
+    check.json holds the readings with residuals and likelihoods, what the points tell of each convention and what they
+    cannot, and where the first points would fall under each reading. Exit codes: 0 the stated reading stands, 3 another
+    one does, 4 none explains the points. With `--export DIR` a pass whose conventions stand goes into a folder that
+    `twin.orbit calibrate` reads.
+
+    Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
+    """,
+    ),
+    "orbit match": Procedure(
+        "match",
+        setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
+        run="twin.orbit.matching.match_run:run_match",
+        numbers="twin.orbit.matching.match_numbers:match_numbers",
+        report="twin.orbit.matching.match_report:match_report",
+        export="twin.orbit.matching.match_numbers:exported",
+        files=(
+            FileKind(
+                "orbit_match",
+                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
+                "points to be measured in line images",
+            ),
+        ),
+        judged=False,
+        seeded=False,
+        about="""
+    Points measured in a user's line images: distinct places of an orthophoto with heights of an elevation model, and
+    tie points, are sought in every image by least squares matching, as in a simulated patch.
+
+    match.json holds for every line how many points were matched and what by. With `--export DIR` the points go with
+    orbit, attitude and line times into a folder that `twin.orbit calibrate` reads.
+
+    Example: `python -m twin.orbit match scenes/orbit/measured/match.yaml`
+    """,
+    ),
+    "orbit monitor": Procedure(
+        "monitor",
+        setup="scenes.specs.orbit.setup:MonitorSetup",
+        resolve="scenes.specs.orbit.setup:resolve_monitor",
+        run="twin.orbit.monitoring.monitoring_run:run_monitor",
+        numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
+        report="twin.orbit.monitoring.monitoring_report:monitor_report",
+        files=(
+            FileKind("orbit_monitor", "scenes.specs.orbit.monitor:OrbitMonitorSpec", "a test of monitoring in orbit"),
+        ),
+        varied=True,
+        about="""
+    Height errors of a stereo pair along its orbit with and without on-board monitoring of its cameras (paper 001's
+    monitor, heights as in papers 000 and 003).
+
+    monitor.json holds the true and the monitored changes, errors in plan and height as calibrated, monitored at every
+    time and at an interval, the interval's table, metres per arcsecond, and where the rest comes from.
+
+    Example: `python -m twin.orbit monitor scenes/orbit/monitor.yaml`
+    """,
+    ),
+    "orbit simulate": Procedure(
+        "simulate",
+        setup="scenes.specs.orbit.setup:SimulateSetup",
+        resolve="scenes.specs.orbit.setup:resolve_simulate",
+        run="twin.orbit.images.simulate_run:run_simulation",
+        numbers="twin.orbit.images.simulate_numbers:simulate_numbers",
+        report="twin.orbit.images.simulate_report:simulation_report",
+        export="twin.orbit.calibration.calibration_export:simulation_exported",
+        files=(
+            FileKind(
+                "orbit_simulate",
+                "scenes.specs.orbit.simulate:OrbitSimulateSpec",
+                "a simulation of images of the ground",
+            ),
+        ),
+        about="""
+    Images of a patch of ground by every line of a camera, physically rendered, with an orthophoto, an elevation
+    model and the measured orbit and attitude: all that an in-orbit calibration from images needs.
+
+    simulate.json holds for every line where its window lies, grey values, ground sample distance and MTF. What only the
+    truth knows is in artefacts/truth.json. `--export DIR` writes points, orbit and attitude as tables that `calibrate`
+    reads.
+
+    Example: `python -m twin.orbit simulate scenes/orbit/simulate.yaml`
+    """,
+    ),
+    "design camera": Procedure(
+        "design",
+        setup="scenes.models.camera_design:CameraDesignSetup",
+        resolve="scenes.models.camera_design:resolve_design",
+        run="twin.design.design_run:run_design",
+        numbers="twin.design.design_run:design_numbers",
+        report="twin.design.design_report:design_report",
+        files=(FileKind("camera_design", "scenes.specs.camera:CameraDesignSpec", "an optimisation of a camera"),),
+        judged=False,
+    ),
+    "design monitor": Procedure(
+        "layouts",
+        setup="scenes.models.monitor_layout:MonitorDesignSetup",
+        resolve="scenes.models.monitor_layout:resolve_monitor_design",
+        run="twin.design.monitor_design:run_monitor_design",
+        numbers="twin.design.monitor_design:monitor_design_numbers",
+        report="twin.design.monitor_report:monitor_design_report",
+        files=(FileKind("monitor_design", "scenes.specs.camera:MonitorDesignSpec", "a search for a monitor's layout"),),
+        judged=False,
+    ),
+}
+"""As the command is called after ``twin.`` -> the test. A test is its own modules and one entry here."""

@@ -1,0 +1,224 @@
+"""What the report says of single motions: moves of the spots, readings of all estimators, factors of the formulas."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from itertools import groupby
+
+import numpy as np
+from markupsafe import Markup
+
+from scenes.specs.instrument import BASE
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import PARAMETERS
+from twin.main_job.result_sections import IN_PAGE, figure
+from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
+from twin.run.artefact import (
+    SAME,
+    SYMBOLS,
+    Artefact,
+    Cell,
+    Marked,
+    Table,
+    Text,
+    fixed,
+    plain,
+    shown_unit,
+    significant,
+)
+from twin.run.report import Section
+
+WRONG = 0.1
+"""A reading that departs from the truth by more than this part of it is marked ..."""
+UNSEEN = 0.01
+"""... if that is also more than this part of the run's noise: what a hundred units would not show is not marked."""
+
+
+def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
+    """Moves of the spots by each motion, and three ways to change the focal length."""
+    caption = (
+        "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
+        "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
+        "are logarithmic over three decades, red is positive. 0 stands for less than 10⁻⁶. The CSV also has what is "
+        "true and what each estimator reads. Four coordinates for each camera cannot tell these motions apart; the "
+        "first four are the family that the papers' estimators assume. `crosstalk.json` says of every motion in words "
+        "what the spots make of it."
+    )
+    parts: list[Artefact] = [figure(drawn, "motions", caption, full=_motions(run))]
+    for k, (name, table) in enumerate(run.crosstalk.items()):
+        labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
+        first = _pretty(table.observability.statements[0].split(": ", 1), labels)
+        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.focal_length_statements()]
+        title = f"Three ways to change the focal length of {name}: piston, despace, growth"
+        parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
+    return Section("What a motion does to the spots", (), tuple(parts), len(run.crosstalk), "motions")
+
+
+_TYPESET = (*SYMBOLS.items(), (" um", " µm"), ("[um]", "[µm]"), ('"', " arcsec"))
+
+
+def _pretty(parts: list[str], labels: set[str], keep: bool = False) -> str:
+    """A statement as reports write it; a motion's label that it begins with is kept or left out."""
+    known = len(parts) > 1 and parts[0] in labels
+    text = parts[1] if known and not keep else ": ".join(parts)
+    for plain_text, typeset in _TYPESET:
+        text = text.replace(plain_text, typeset)
+    text = re.sub(r"(?<=\d) x (?=[A-Za-z])", " × ", text)
+    text = re.sub(r"(?<=\d)e-0?(\d)", "e\N{MINUS SIGN}\\1", text)
+    return re.sub(r"(?<= )-(?=\d| )", "\N{MINUS SIGN}", text)
+
+
+def _motions(run: RenderRun) -> Table:
+    """Per unit of each motion: where the spots go, the true change, and every estimator's reading."""
+    pitch = 1e6 * run.experiment.path.pitch
+    places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
+    heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
+    heads += [f"{p.symbol} [{p.unit}] true" for p in PARAMETERS]
+    heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in run.estimators.values() for p in PARAMETERS]
+    rows: list[list[Cell]] = []
+    for name, table in run.crosstalk.items():
+        for k, motion in enumerate(table.motions):
+            row: list[Cell] = [name, motion.label, motion.body, shown_unit(motion.unit)]
+            moved = dict(zip(table.coordinates, table.spot_shift[:, k], strict=True))
+            row += [float(moved[place]) * pitch if place in moved else None for place in places]
+            row += [float(true) for true in table.true[:, k]]
+            for estimator in run.estimators:
+                row += [float(reading) for reading in table.readings[estimator][:, k]]
+            rows.append(row)
+    return Table("motions", "Motions", "", heads, rows)
+
+
+def crosstalk_section(run: RenderRun) -> Section:
+    """Per unit of motion what is true and what every estimator reads, a table for each camera."""
+    about = (
+        "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
+        f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
+        "run's "
+        'noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. "printed" is '
+        "eqs. (2), (3), (5) and Table 1, which agree there."
+    )
+    tables = tuple(_crosstalk(run, k) for k in range(len(run.crosstalk)))
+    return Section("Crosstalk: what every motion reads as", (about,), tables, name="crosstalk", closed=True)
+
+
+def _crosstalk(run: RenderRun, camera: int) -> Table:
+    name, table = list(run.crosstalk.items())[camera]
+    columns = [_columns(run, table, p) for p in range(len(PARAMETERS))]
+    own = run.recovered_dict()["cameras"][name][run.judged]
+    floors = [max(SAME, UNSEEN * own[f"{p.key}_sigma_noise"]) for p in PARAMETERS]
+    bodies = [motion.body for motion in table.motions]
+    rows: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    for body, members in groupby(sorted(range(len(bodies)), key=lambda k: bodies.index(bodies[k])), bodies.__getitem__):
+        bands[len(rows)] = body.removeprefix(f"{BASE}/")
+        for k in members:
+            motion = table.motions[k]
+            row: list[Cell] = [_short(motion.label), Marked(shown_unit(motion.unit), "", "number")]
+            for p, floor in enumerate(floors):
+                true = float(table.true[p, k])
+                row.append(Marked(significant(true), "", "truth start"))
+                for _, estimator in columns[p]:
+                    reading = float(table.readings[estimator][p, k])
+                    row.append(
+                        Marked(significant(reading), "", "wrong" if is_wrong(reading, true, floor) else "number")
+                    )
+            rows.append(row)
+    caption = Markup('All digits: the table of <a href="#motions">motions and spots</a>.')
+    heads = ["Motion", "per", *(head for own in columns for head in ("true", *(label for label, _ in own)))]
+    over = [("", 2), *((f"{p.symbol} [{p.unit}]", 1 + len(columns[i])) for i, p in enumerate(PARAMETERS))]
+    title = f"Camera {name}"
+    return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
+
+
+def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tuple[str, str]]:
+    """(heading, estimator) of one parameter; the two printed sets share a column where they are the same formula."""
+    single, joint = (table.readings[e][parameter] for e in ("paper_single", "paper_joint"))
+    same = np.allclose(single, joint, rtol=1e-9, atol=0.0)
+    columns = []
+    for estimator in run.estimators:
+        if estimator == "paper_joint" and same:
+            continue
+        heading = run.estimators[estimator].title
+        if (estimator, parameter) in PRINTED:
+            heading = "printed" if same else {"paper_single": "printed (7)", "paper_joint": "Table 1"}[estimator]
+        columns.append((heading, estimator))
+    return columns
+
+
+def _short(label: str) -> str:
+    """A motion's label without its body, which stands above the rows."""
+    for word in ("figure ", "along ", "about "):
+        if word in label:
+            return (word + label.partition(word)[2]).removeprefix("figure ")
+    return label.removeprefix("whole camera ")
+
+
+def is_wrong(reading: float, true: float, floor: float = SAME) -> bool:
+    """Whether a reading departs from the truth by more than ``WRONG`` of it and by more than ``floor``."""
+    return abs(reading - true) > max(WRONG * abs(true), floor)
+
+
+def formula_section(run: RenderRun) -> Section:
+    """Factors of the printed formulas, two columns for each camera, and what explains them."""
+    about = (
+        "Each printed formula is fed with the spot shifts that the exact trace gives for the one motion it was derived "
+        "for. A factor of 1 is a correct formula."
+    )
+    every = {name: table.factors for name, table in run.crosstalk.items()}
+    symbols = {p.key: p.symbol for p in PARAMETERS}
+    rows: list[list[Cell]] = []
+    for same in zip(*every.values(), strict=True):
+        row: list[Cell] = [f"{symbols[same[0].parameter]}, {same[0].formula}", same[0].motion]
+        for name, f in zip(every, same, strict=True):
+            for which in ("by_model", "by_truth"):
+                key = f"factor.{name}.{f.estimator}.{f.parameter}.{which}"
+                row.append(Marked(fixed(float(getattr(f, which)), 4), "", "number", key))
+        rows.append(row)
+    full: list[list[Cell]] = [
+        [name, f.formula, f.parameter, f.motion, float(f.by_model), float(f.by_truth)]
+        for name, factors in every.items()
+        for f in factors
+    ]
+    heads = ["camera", "formula", "parameter", "motion", "of the paper's model", "of the real camera"]
+    table = Table(
+        "factors",
+        "Reading divided by the change",
+        "",
+        ("Formula", "Motion", *("of the paper's model", "of the real camera") * len(every)),
+        rows,
+        over=(("", 2), *((name, 2) for name in every)),
+        within=IN_PAGE,
+        full=Table("factors", "Factors", "", heads, full),
+    )
+    texts: dict[str, list[str]] = {}
+    for name in every:
+        texts.setdefault(_factor_text(run, name), []).append(name)
+    points = (
+        "Of the paper's model divides by what a thin lens would do (shift/f, the turn itself, scale × f). Of the real "
+        "camera divides by the traced change and therefore contains the camera's anamorphism fₓ/f and its distortion.",
+        *(f"{', '.join(names)}: {text}" for text, names in texts.items()),
+        "The paper's X and Y are before − after. Table 1 does not say how Y_L is signed and uses it in both Δβ and Δf; "
+        "here each row takes the sign that agrees with the single-change formula beside it: Y_L = y₀₁ − y₁₁ for Δβ, "
+        "y₁₁ − y₀₁ for Δf.",
+    )
+    notes = Text("formula-notes", "", "", points, within=IN_PAGE)
+    return Section("What the printed formulas read", (about,), (table, notes), name="formulas", closed=True)
+
+
+def _factor_text(run: RenderRun, name: str) -> str:
+    """The numbers behind a camera's factors."""
+    geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
+    assert geometry.focal_length_x_m is not None
+    by_model = {(f.estimator, f.parameter): float(f.by_model) for f in factors}
+    beta, alpha = geometry.field_beta_rad, geometry.field_alpha_rad
+    return (
+        f"the printed Δγ, eq. (5), reads {fixed(by_model['paper_single', 'd_gamma_arcsec'], 3)} times the turn of the "
+        f"line; the joint Δf of Table 1 reads {fixed(by_model['paper_joint', 'd_f_um'], 3)} times the change. The "
+        f"anamorphism is fₓ/f = {fixed(geometry.focal_length_x_m / geometry.focal_length_m, 4)} (plate scale across "
+        f"the line {fixed(geometry.focal_length_x_m, 4)} m, principal distance along it "
+        f"{fixed(geometry.focal_length_m, 4)} m). Eqs. (2), (3) and Table 1 carry a cos² of angles that the paper "
+        f"leaves undefined; taken as the field angles of the area CCDs, cos² β = {fixed(math.cos(beta) ** 2, 5)} at "
+        f"{plain(math.degrees(beta))}° and cos² α = {fixed(math.cos(alpha) ** 2, 5)} at {plain(math.degrees(alpha))}°."
+    )

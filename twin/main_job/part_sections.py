@@ -1,0 +1,320 @@
+"""What the report says of image quality, targets and stray light, where a job asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from twin.main_job.render_results import RenderRun
+from twin.main_job.result_sections import IN_PAGE, figure
+from twin.main_job.verdict import sharpness_lost
+from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
+from twin.path_tracing.families import family_name
+from twin.path_tracing.path_result import Family
+from twin.run.artefact import (
+    FAR,
+    Artefact,
+    Cell,
+    Marked,
+    Table,
+    fixed,
+    plain,
+    residual,
+    residual_cell,
+    significant,
+)
+from twin.run.report import Section
+from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
+from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
+
+WHEN = ("before", "after")
+FREE = "the pupils are free: `obstruction: ignore`"
+
+
+def quality_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:
+    """Wavefront errors, focus and MTF of the line CCDs; None when they were not asked for."""
+    quality = run.quality
+    if quality is None:
+        return None
+    rows: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    for name, camera in quality.cameras.items():
+        first, last = (plain(1e9 * wavelength) for wavelength in camera.wavelengths)
+        light = f"{first} nm" if first == last else f"{first} to {last} nm"
+        nyquist = plain(1e-3 * camera.nyquist, 4)
+        bands[len(rows)] = f"Camera {name}, MTF with light of {light}, Nyquist {nyquist} cycles/mm"
+        rows += _quality_rows(name, camera, quality)
+    bodies = "; ".join(f"in {name} {', '.join(camera.bodies) or 'nothing'}" for name, camera in quality.cameras.items())
+    taken = f"What stands in the beams is missing in the pupils: {bodies}." if quality.obstruction else ""
+    caption = (
+        "Of the light that reaches fixed pixels of each line CCD, at its middle and at its left (+Y′) and right end. "
+        f"Wavefront errors are rms over the pupil at {plain(1e9 * quality.wavelength)} nm, without piston and tilt. "
+        "Best focus counts along the light: + lies behind the CCD. The MTF is that of the traced pupil over the named "
+        "light, with the pixel and, where the camera describes them, charge diffusion and TDI. "
+        f"{taken or f'{FREE[0].upper()}{FREE[1:]} leaves out what stands in the beams.'} Means and worst: "
+        f"`quality.json`. The CSV has all {len(quality.fields)} fields."
+    )
+    parts: list[Artefact] = [
+        Table(
+            "quality",
+            "",
+            caption,
+            ("", *WHEN * len(PLACES)),
+            rows,
+            over=(("", 1), *((place, len(WHEN)) for place in PLACES)),
+            bands=bands,
+            within=IN_PAGE,
+            full=_every_field(quality),
+        )
+    ]
+    if quality.obstruction:
+        caption = (
+            "Pupils as three places of each line CCD see them, in units of their mean radius, and the light that is "
+            "lost before → after. Dark: shadows of what stands in the beam, before; orange: after."
+        )
+        parts.append(figure(drawn, "pupils", caption))
+    share, where, change = sharpness_lost(quality)
+    lost = f"At most {significant(100.0 * share, 2, floor=0.0)} % of the MTF at Nyquist are lost, {where}: {change}."
+    lost = lost if share > 0.0 else "The perturbation takes nothing of the MTF at Nyquist."
+    return Section("Image quality", (lost,), tuple(parts), name="quality")
+
+
+def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> list[list[Cell]]:
+    lines = (
+        ("wfe_rms_waves", "wavefront error, rms [waves]", camera.wfe, 1.0, 4),
+        ("wfe_rms_waves_focus_removed", "the same at best focus [waves]", camera.wfe_refocused, 1.0, 4),
+        ("defocus_um", "best focus − line CCD [µm]", camera.defocus, 1e6, 1),
+        ("mtf_along_line", "MTF at Nyquist along the line", camera.mtf_along_line, 1.0, 4),
+        ("mtf_along_track", "MTF at Nyquist along the track", camera.mtf_along_track, 1.0, 4),
+        ("light_lost", "light taken by bodies in the beam [%]", camera.light_lost, 1e2, 2),
+    )
+    rows: list[list[Cell]] = []
+    for key, label, values, unit, decimals in lines:
+        row: list[Cell] = [label]
+        for place, field in PLACES.items():
+            for s, when in enumerate(WHEN):
+                value = unit * float(values[s, quality.fields.index(field)])
+                text = fixed(value, decimals, sign=key == "defocus_um")
+                row.append(Marked(text, "", "number", f"quality.{name}.{key}.{place}.{when}"))
+        rows.append(row)
+    return rows
+
+
+def _every_field(quality: ImageQuality) -> Table:
+    """All digits at every field, not only at those that the report shows."""
+    places = {quality.fields.index(field): place for place, field in PLACES.items()}
+    rows: list[list[Cell]] = []
+    for name, camera in quality.cameras.items():
+        for s, when in enumerate(WHEN):
+            for k, field in enumerate(quality.fields):
+                numbers = (camera.wfe, camera.wfe_refocused, 1e6 * camera.defocus, camera.mtf_along_line)
+                values = [float(n[s, k]) for n in (*numbers, camera.mtf_along_track, 1e2 * camera.light_lost)]
+                rows.append([name, when, float(field), places.get(k, ""), *values])
+    heads = ["camera", "state", "field", "place", "wavefront error [waves]", "at best focus [waves]"]
+    heads += ["best focus - line CCD [µm]", "MTF at Nyquist along the line", "MTF at Nyquist along the track"]
+    return Table("quality", "Image quality", "", [*heads, "light taken [%]"], rows)
+
+
+METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
+TITLES = {"edge": "knife edge", "bars": "bars"}
+DECIMALS = 4
+"""Of an MTF."""
+
+
+def target_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:
+    """MTF from images of targets, and these images; None when no targets were asked for."""
+    targets = run.targets
+    if targets is None:
+        return None
+    images = run.resolved.job.render.target_images
+    kinds = [kind for kind, image in (("edge", "knife_edge"), ("bars", "bars")) if image in images]
+    about = (
+        "Targets at infinity stand still in the directions that three places of each line CCD see in the nominal "
+        "state. Their images are rendered through the traced pupil, over the band, with pixel, charge diffusion and "
+        f"TDI; {targets.frames} frames each, bright areas at {plain(100.0 * run.resolved.targets.white)} % of the full "
+        f"well{', less what bodies in the beams take' if targets.obstruction else f'; {FREE}'}."
+    )
+    if kinds:
+        methods = ", ".join(METHODS[kind] for kind in kinds)
+        about += (
+            f" The MTF is measured in these frames alone ({methods}) and compared with that of the traced pupil and "
+            "the detector."
+        )
+    parts: list[Artefact] = [_mtf_table(targets, kinds)] if kinds else []
+    curves = [name for name in targets.cameras if f"mtf {name}" in drawn]
+    for k, name in enumerate(curves):
+        caption = f"Camera {name}: MTF along the edge's normal."
+        if k == 0:
+            squares = ", squares: of the bars" if "bars" in kinds else ""
+            caption += (
+                " Lines: traced pupil and detector. Dots: measured in the images of the knife edge"
+                f"{squares}. Below each panel measured − true of the edge in thousandths, with bands of ±2 σ of the "
+                "noise; where the MTF itself vanishes, noise can only lengthen it. Dotted: Nyquist frequency."
+            )
+        parts.append(figure(drawn, f"mtf {name}", caption, count=k))
+    for k, name in enumerate(targets.cameras):
+        caption = (
+            f"Camera {name}: mean of {targets.frames} frames, columns along the line (+Y′ to the right), rows along "
+            "the track (+X′ downward), grey from the darkest to the brightest pixel of each image, in proportion to "
+            "the signal where not said otherwise. The window follows the image by whole pixels. Files: "
+            f"`images/{name}_PLACE_TARGET_before.tiff` and `…_after.tiff`."
+        )
+        title = f"Images of the targets, camera {name}"
+        parts.append(figure(drawn, f"targets {name}", caption, title, count=k))
+    return Section("Test targets and MTF", (about,), tuple(parts), len(targets.cameras), "targets")
+
+
+def _mtf_table(targets: TargetRun, kinds: list[str]) -> Table:
+    rows: list[list[Cell]] = []
+    full: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    biases = []
+    for name, camera in targets.cameras.items():
+        nyquist, pitch = plain(1e-3 * NYQUIST / camera.pitch, 4), plain(1e6 * camera.pitch)
+        bands[len(rows)] = f"Camera {name}, band {camera.band}, Nyquist {nyquist} cycles/mm, {pitch} µm pixels"
+        for place, own in camera.places.items():
+            biases += [edge.nyquist_bias for shots in own.shots.values() for edge in shots.edges.values()]
+            for direction in DIRECTIONS:
+                row: list[Cell] = [f"{place}, {DIRECTION_NAMES[direction]}"]
+                for kind in kinds:
+                    for when, shots in own.shots.items():
+                        reading = (shots.edges if kind == "edge" else shots.bars)[direction]
+                        row += _mtf_cells(f"mtf.{name}.{place}.{direction}.{when}.{kind}", reading)
+                move = fixed(1e6 * float(own.shift[DIRECTIONS.index(direction)]), 2, sign=True)
+                rows.append([*row, Marked(f"{move} {DIRECTION_NAMES[direction]}", "", "number")])
+        full += _mtf_rows(name, camera)
+    known = [bias for bias in biases if bias is not None]
+    amount = f"at most {significant(max(known), 2, floor=0.0)}" if known else "an unknown amount"
+    caption = f"Below each value: (measured − true) in units of σ, ● within {FAR:g} σ, ▲ beyond."
+    if "edge" in kinds:
+        caption += f" At Nyquist noise lengthens the knife edge's values by {amount} on the average, not corrected."
+    if "bars" in kinds:
+        caption += (
+            " Bars are tilted at the Nyquist frequency; the levels to which their fundamental is referred are frames "
+            "with the shutter closed and of even light, for in an area beside them the tails of diffraction take a per "
+            "cent of the contrast."
+        )
+    heads = ["camera", "band", "place", "direction", "state", "target", "MTF at Nyquist", "sigma", "true"]
+    heads += ["along the line [cycles/px]", "along the track [cycles/px]", "true on the axis"]
+    return Table(
+        "mtf",
+        "MTF at the Nyquist frequency, measured (±1 σ from noise) and true; move of the image on the line CCD, traced",
+        f"{caption} More: `mtf.json`.",
+        ("Place, direction of the MTF", *("before", "true", "after", "true") * len(kinds), "image moves [µm]"),
+        rows,
+        over=(("", 1), *((TITLES[kind], 4) for kind in kinds), ("", 1)),
+        bands=bands,
+        within=IN_PAGE,
+        full=Table("mtf", "MTF", "", heads, full),
+    )
+
+
+def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
+    """All digits of a camera's readings."""
+    rows: list[list[Cell]] = []
+    for place, targets in camera.places.items():
+        for direction in DIRECTIONS:
+            for when, shots in targets.shots.items():
+                for kind, reading in (("edge", shots.edges.get(direction)), ("bars", shots.bars.get(direction))):
+                    if reading is not None:
+                        value, sigma = _reading(reading) or (None, None)
+                        where: list[Cell] = [name, camera.band, place, DIRECTION_NAMES[direction], when, kind]
+                        true: list[Cell] = [reading.true_nyquist, *reading.at_nyquist, reading.true_axis]
+                        rows.append([*where, value, sigma, *true])
+    return rows
+
+
+def _reading(reading: EdgeReading | BarReading) -> tuple[float, float] | None:
+    return reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
+
+
+def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
+    """One measured value and its truth."""
+    true = Marked(fixed(reading.true_nyquist, DECIMALS), "", "truth", f"{key}.true")
+    found = _reading(reading)
+    if found is None:
+        return Marked("not measurable", "", "number", key), true
+    value, sigma = found
+    text = f"{fixed(value, DECIMALS)} ± {fixed(sigma, DECIMALS)}"
+    return residual_cell(text, residual(value - reading.true_nyquist, sigma), key), true
+
+
+STRONGEST = 4
+"""Families listed of each source."""
+
+
+def stray_section(run: RenderRun) -> Section | None:
+    """Shares and families of the perturbed state; None when no stray light was asked for."""
+    if run.stray is None:
+        return None
+    after = run.stray.after
+    shares = after.share(run.photons_after - after.photons)
+    amounts: list[list[Cell]] = []
+    families: list[list[Cell]] = []
+    surfaces: list[list[Cell]] = []
+    full: list[list[Cell]] = []
+    for i, channel in enumerate(run.experiment.path.channels):
+        name = f"{channel.key}/area_ccd"
+        found = [one for one in after.traced.relative(channel.key) if one[0].detector == name]
+        by_kind = [sum(share for family, share, _ in found if family.kind == kind) for kind in ("ghost", "stray")]
+        amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
+        nominal = after.traced.runs[channel.key].nominal(name).touches
+        for k, (family, share, sigma) in enumerate(sorted(found, key=lambda one: -one[1])):
+            what, (x, y) = family_name(family.touches, nominal), (1e6 * float(c) for c in family.centroid)
+            chain = " ".join(map(str, family.touches))
+            full.append([channel.key, family.kind, what, share, sigma, x, y, family.count, chain])
+            if k < STRONGEST:
+                size = Marked(f"{significant(share)} ± {significant(sigma, 1)}", "", "number")
+                where = [Marked(fixed(c, 1), "", "number") for c in (x, y)]
+                families.append([channel.key, family.kind, what, size, *where])
+                surfaces.append([channel.key, what, _way(family) or "not looked up"])
+    heads = ["area CCD", "kind", "name", "share of the spot", "its σ", "x [µm]", "y [µm]", "paths", "surfaces in order"]
+    parts: list[Artefact] = [
+        Table(
+            "stray-families",
+            "Strongest families on the CCD of their own channel; x, y from its middle",
+            "A ghost is named by the reflections at faces that nominal light passes, and how many they are. All "
+            "families, surface by surface: `stray.json` and the CSV.",
+            ("Area CCD", "kind", "what happens", "share", "x [µm]", "y [µm]"),
+            families,
+            within=IN_PAGE,
+            full=Table("stray_families", "Families", "", heads, full),
+        ),
+        Table(
+            "stray",
+            "Amounts",
+            "",
+            ("area CCD", "all / spot", "ghosts / spot", "scattered / spot", "brightest pixel [photons]"),
+            amounts,
+            (),
+            3,
+            within=IN_PAGE,
+        ),
+        Table(
+            "stray_surfaces",
+            "Surface by surface",
+            "Surfaces in order: > through the face, without mark reflected, * scattered, ~ diffused, ! outside of the "
+            "clear aperture.",
+            ("Area CCD", "what happens", "surfaces in order"),
+            surfaces,
+            within=IN_PAGE,
+        ),
+    ]
+    taken: list[list[Cell]] = [[o.body, o.beam, 100.0 * o.share, 100.0 * o.used] for o in run.stray.obstructions]
+    if taken:
+        heads = ["prism", "beam", "takes [%]", "of it used by its channel [%]"]
+        title = "Prisms that stand in a beam, nominal instrument: what they take of its cross-section"
+        parts.append(Table("stray_prisms", title, "", heads, taken, (None, None, 1, 1), within=IN_PAGE))
+    paths = f"{after.paths:,}".replace(",", "\N{THIN SPACE}")
+    about = (
+        f"{paths} paths from every pinhole through the perturbed instrument, each told apart by the surfaces it met. "
+        "The nominal way is the spot itself; all else is part of the images and listed here, relative to the spot."
+    )
+    return Section("Ghosts and stray light", (about,), tuple(parts), len(parts) - 2, "stray")
+
+
+def _way(family: Family) -> str:
+    """Surfaces in order, without ``base/<camera>/monitor/<side>/`` of the prisms' names, which every step repeats."""
+    way = [str(touch) for touch in family.touches]
+    prisms = [step for step in way if "/monitor/" in step]
+    common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
+    return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)

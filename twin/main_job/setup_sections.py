@@ -1,0 +1,184 @@
+"""What the report says of what was set up: instrument, estimators, cameras, stated motions, perturbations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from analysis.units import ARCSEC
+from optics.geometry.tree import Motion
+from optics.thermal.heat import Temperature
+from scenes.models.job_state import motions_of
+from twin.main_job.render_results import RenderRun
+from twin.main_job.report_labels import CENTROID_NOTES, PAPER
+from twin.main_job.result_sections import IN_PAGE
+from twin.run.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
+from twin.run.report import Section
+
+ZERO_CELSIUS = 273.15
+
+
+def facts(run: RenderRun) -> tuple[tuple[str, str], ...]:
+    """What was set up, and what the estimators assume."""
+    resolved, instrument = run.resolved, run.experiment.instrument
+    spec, stated = resolved.instrument, run.experiment.stated is not None
+    monitor, ccd = spec.monitor, spec.monitor.area_ccd
+    fields = [float(np.degrees(one.field)) for name in spec.cameras for one in spec.channels_of(name).values()]
+    family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
+    judged = run.estimators[run.judged].title
+    about = (
+        f"Only shifts of the line CCD along X and Y, its turn about Z and a scale of the whole optics are assumed by: "
+        f"{family}. Any other motion is read as a mixture of these, an error that no number of frames reduces "
+        f"(Residuals, Crosstalk){'; σ holds it, as far as it is by stated disturbances' if stated else ''}. "
+        + (f"The {judged} weighs all stated motions against the noise. " if stated else "")
+        + "Structures expand freely and carry what stands on them, mirrors and prisms bend (finite elements), glass "
+        "changes its index."
+    )
+    return (
+        ("Assumptions", about),
+        *((estimator.title, estimator.note) for estimator in run.estimators.values()),
+        ("Paper", PAPER),
+        ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name),
+        (
+            "Monitor",
+            f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
+            f"{_all([1e3 * c.aperture for c in instrument.channels])} mm wide, area CCDs at {_fields(fields)}° of "
+            "field",
+        ),
+        (
+            "Area CCD",
+            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, {resolved.detector.bit_depth} bits, "
+            f"exposure {plain(1e3 * ccd.exposure)} ms",
+        ),
+        (
+            "Light",
+            f"{_all([1e-6 * c.photons for c in instrument.channels])} million photons per spot and frame expected at "
+            "the CCD",
+        ),
+        ("Frames", f"{run.frames} before and {run.frames} after, seed {run.seed}"),
+        ("Spot centres", CENTROID_NOTES[resolved.job.analysis.centroid]),
+    )
+
+
+def _all(values: list[float]) -> str:
+    """Different values among those of all channels: ``50``, or ``34, 24``."""
+    return ", ".join(dict.fromkeys(plain(value) for value in values))
+
+
+def _fields(degrees: list[float]) -> str:
+    """Different field places: ``±1.22``, or ``±1.22, 1.25`` where one end of the line has more than the other."""
+    ends: dict[str, set[bool]] = {}
+    for field in degrees:
+        ends.setdefault(plain(abs(field)), set()).add(field > 0.0)
+    signs = {frozenset((True, False)): "±", frozenset((True,)): "", frozenset((False,)): MINUS}
+    return ", ".join(signs[frozenset(own)] + size for size, own in ends.items())
+
+
+def setup_section(run: RenderRun) -> Section:
+    """The cameras, and cause by cause what is stated to move."""
+    spec, instrument = run.resolved.instrument, run.experiment.instrument
+    rows: list[list[Cell]] = []
+    for name, model in instrument.cameras.items():
+        focal, line = float(run.experiment.nominal_truth.principal_distance[name]), model.spec.line
+        row: list[Cell] = [name, model.spec.name, float(np.degrees(spec.cameras[name].look)), focal]
+        row += [focal / model.spec.entrance_pupil, line.pixels, 1e6 * line.pitch, 1e3 * line.pixels * line.pitch]
+        rows.append([*row, 1e3 * float(instrument.separation[name])])
+    heads = ["camera", "prescription", "look angle [deg]", "principal distance [m]", "F-number", "pixels"]
+    heads += ["pitch [µm]", "line [mm]", "distance of the area CCDs [mm]"]
+    decimals = (None, None, 2, 4, 1, None, None, 1, 2)
+    cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
+    stated = () if run.experiment.stated is None else (_stated(run),)
+    title = "Cameras, and what is stated to move" if stated else "Cameras"
+    return Section(title, (), (*stated, cameras), closed=True)
+
+
+def _stated(run: RenderRun) -> Table:
+    motions, spec = run.experiment.stated, run.resolved.disturbances
+    assert motions is not None
+    assert spec is not None
+    rows: list[list[Cell]] = []
+    full: list[list[Cell]] = []
+    for name, cause in spec.causes.items():
+        own = [c for c in motions.components if c.cause == name]
+        bodies = list(dict.fromkeys(c.body for c in own))
+        sizes: dict[tuple[str, str], list[str]] = {}
+        for c in own:
+            amount = c.sigma / c.unit_size
+            full.append([name, c.body, c.what, amount, shown_unit(c.unit), cause.time.text, cause.reason])
+            if c.body == bodies[0]:
+                size = f"{plain(amount)} {shown_unit(c.unit)}"
+                sizes.setdefault((c.kind, size), []).append(c.what.removeprefix(c.kind).strip())
+        what = []
+        for (kind, size), axes in sizes.items():
+            which = "" if axes in (["x", "y", "z"], [""]) else f" {', '.join(axes)}"
+            what.append(f"{kind.replace('_', ' ')}{which} {size}")
+        if cause.together is not None:
+            what.append(f"bodies together {plain(cause.together)}")
+        if cause.correlations:
+            what.append(f"{len(cause.correlations)} correlations")
+        which = f"{len(bodies)}: `{', '.join(cause.bodies)}`"
+        rows.append([name.replace("_", " "), which, "; ".join(what), cause.time.text, cause.reason])
+    heads = ["cause", "body", "motion", "sigma", "unit", "in time", "reason"]
+    return Table(
+        "disturbances",
+        f"What is stated to move: disturbances {spec.name}, one standard deviation of each component of each body",
+        f"{spec.description.strip()} Component by component." if spec.description else "Component by component.",
+        ("Cause", "Bodies", "One standard deviation", "In time", "Reason"),
+        rows,
+        within=IN_PAGE,
+        full=Table("disturbances", "Disturbances", "", heads, full),
+    )
+
+
+def done_table(run: RenderRun) -> Table:
+    """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
+    job = run.resolved.job
+    shown = None if run.series is None else run.series.shown
+    motions, fields = motions_of(job, shown), job.fields(shown)
+    rows: list[list[Cell]] = []
+    for path in dict.fromkeys((*motions, *fields)):
+        motion, given = motions.get(path, Motion()), job.perturb.get(path)
+        warm = given is not None and given.temperature.table is not None
+        parts = [_motion_text(motion)]
+        if path in fields and not (warm and fields[path] == Temperature()):
+            parts.append(_heat_text(fields[path]))
+        if given is not None and given.deformation is not None:
+            parts.append("deformed by a table of nodes")
+        if warm:
+            parts.append("warmed by a table of nodes")
+        rows.append([path, "; ".join(filter(None, parts)) or "nothing (all zero)", motion.pivot])
+    heated, caption = _heated(run), "In each body's own frame: rotation vector about the pivot, then shift."
+    if heated:
+        caption += (
+            f" A temperature is the change from {fixed(run.resolved.instrument.temperature - ZERO_CELSIUS, 2)} °C at "
+            "the body's origin plus gradient · r; what the body carries has the same field unless it stands here "
+            f"itself. {heated} bodies are at other temperatures than nominal."
+        )
+    return Table("perturbation", "", caption, ("body", "motion", "pivot"), rows, within=IN_PAGE)
+
+
+def _heated(run: RenderRun) -> int:
+    """How many bodies have another temperature than nominal, faces of prisms not counted."""
+    job = run.resolved.job
+    time = None if run.series is None else run.series.shown
+    fields = run.experiment.thermal.fields(run.experiment.fields(job, time))
+    return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
+
+
+def _motion_text(motion: Motion) -> str:
+    parts = []
+    for name, vector, unit, size in (("rotate", motion.rotate, "arcsec", ARCSEC), ("shift", motion.shift, "µm", 1e-6)):
+        if any(vector):
+            parts.append(f"{name} ({', '.join(plain(v / size) for v in vector)}) {unit}")
+    if motion.scale:
+        parts.append(f"scale {plain(1e6 * motion.scale)} ppm")
+    terms = [f"Z{j} {plain(1e9 * a)} nm" for j, a in motion.figure.items() if a]
+    if terms:
+        parts.append(f"figure {', '.join(terms)}")
+    return "; ".join(parts)
+
+
+def _heat_text(field: Temperature) -> str:
+    text = f"temperature {plain(field.change)} K"
+    if any(field.gradient):
+        text += f", gradient ({', '.join(plain(1e3 * g) for g in field.gradient)}) mK/m"
+    return text

@@ -1,0 +1,240 @@
+"""One observation: states of an instrument are traced, rendered, exposed and recovered.
+
+Whatever asks for images of states takes this way: the main job, courses, studies, the live twin, error budgets, random
+states. What differs from use to use is said by an `Observing`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from analysis.monitor.recovery import MeasuredSpots, Recovery, recover
+from analysis.spots.spot_positions import SpotError
+from optics.geometry.tree import PlacedBodies, State
+from optics.numerics.threads import cores, one_blas_thread
+from optics.raytrace.aim import AimError
+from optics.raytrace.trace import BeamMissedError
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth
+
+LOST = (AimError, BeamMissedError)
+"""What says that the light of a state is lost."""
+
+Record: TypeAlias = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray | MeasuredSpots, np.ndarray]]
+"""Exposes the detectors, by random streams of its own. From expected photons (S, C, rows, columns) and numbers (S,) of
+states to what is recorded before, (C, frames, rows, columns) for all states or (S, C, frames, rows, columns), or spots
+before that are measured already; and after, (S, C, frames, rows, columns).
+"""
+
+
+@dataclass(frozen=True)
+class Observing:
+    """How states are observed.
+
+    Attributes:
+        record: exposes the detectors.
+        centroid: as of ``analysis.monitor.recovery.recover``.
+        chunk: states that are done at once; the last digits of a state depend on which they are.
+        single: render in single precision.
+        leave: told of each state that is lost, by its number, and why: its light does not arrive, or a spot cannot be
+            measured. It is then left out; with None the error is raised.
+        stated: know what the experiment states to move, and trace its motions again; else there is noise alone.
+        keep_parts: of the noise, which are large.
+        frames: of which each recorded image is the mean; None where frames are recorded one by one.
+    """
+
+    record: Record
+    centroid: str = "ml"
+    chunk: int = 40
+    single: bool = True
+    leave: Callable[[int, str], None] | None = None
+    stated: bool = True
+    keep_parts: bool = False
+    frames: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """What comes of S states to the area CCDs.
+
+    Attributes:
+        numbers: (S,) of the states.
+        placed: their bodies.
+        truth: of them.
+        photons: expected photons per pixel and frame, (S, C, rows, columns).
+    """
+
+    numbers: np.ndarray
+    placed: PlacedBodies
+    truth: Truth
+    photons: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What S states do and what their images say.
+
+    Attributes:
+        light: of all states that were recorded.
+        measured: (S,) which of these could be measured.
+        after: what was recorded of all of ``light``, as of `Record`.
+        recovery: of those that were measured.
+    """
+
+    light: Light
+    measured: np.ndarray
+    after: np.ndarray
+    recovery: Recovery
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """(S,) of the states that were measured."""
+        return self.light.numbers[self.measured]
+
+    @property
+    def truth(self) -> Truth:
+        """Truth of the states that were measured."""
+        return self.light.truth.at(self.measured)
+
+
+def observe(
+    experiment: MonitorExperiment,
+    states: Sequence[State],
+    how: Observing,
+    numbers: Sequence[int] | np.ndarray | None = None,
+) -> Iterator[Observation]:
+    """Trace, render, expose and recover states, piece by piece.
+
+    Args:
+        experiment: the instrument.
+        states: to be observed.
+        how: the policies.
+        numbers: of the states, by which random streams are chosen; None to count from 0.
+
+    Yields:
+        Observations of ``how.chunk`` states, without those that are left out; none of a piece that is lost as a whole.
+
+    Raises:
+        BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
+        SpotError: a spot cannot be measured.
+    """
+    every = np.arange(len(states)) if numbers is None else np.asarray(numbers)
+    for first in range(0, len(states), how.chunk):
+        some, own = states[first : first + how.chunk], every[first : first + how.chunk]
+        try:
+            light = light_of(experiment, some, own, how.single)
+        except LOST:
+            if how.leave is None:
+                raise
+            reasons = [why_lost(experiment, state) for state in some]
+            for number, why in zip(own.tolist(), reasons, strict=True):
+                if why:
+                    how.leave(number, why)
+            good = [k for k, why in enumerate(reasons) if not why]
+            if not good:
+                continue
+            light = light_of(experiment, [some[k] for k in good], own[good], how.single)
+        found = read(experiment, light, how)
+        if found is not None:
+            yield found
+
+
+def light_of(
+    experiment: MonitorExperiment,
+    states: Sequence[State],
+    numbers: np.ndarray,
+    single: bool = True,
+    photons: np.ndarray | None = None,
+) -> Light:
+    """Trace and render states together.
+
+    Args:
+        experiment: the instrument.
+        states: S states.
+        numbers: (S,) of these.
+        single: render in single precision.
+        photons: (S, C, rows, columns) of the states, where they are rendered already.
+
+    Raises:
+        BeamMissedError, AimError: light is lost on its way, or a spot is not on its CCD.
+    """
+    with one_blas_thread():
+        placed = experiment.instrument.assembly.place(states)
+        truth = experiment.sight.truth(states, placed)
+        if photons is None and len(states) == 1:
+            photons = experiment.path.photons_of(states[0], placed, single)[None]
+        elif photons is None:
+            photons = experiment.path.expected_photons(states, chunk=len(states), single=single)
+    return Light(numbers, placed, truth, photons)
+
+
+def why_lost(experiment: MonitorExperiment, state: State) -> str:
+    """Where the light of a state is lost; empty where it is not."""
+    try:
+        light_of(experiment, [state], np.zeros(1, int))
+    except LOST as error:
+        return str(error)
+    return ""
+
+
+def read(experiment: MonitorExperiment, light: Light, how: Observing) -> Observation | None:
+    """Expose and recover states; None where all are left out since their spots cannot be measured.
+
+    Args:
+        experiment: the instrument.
+        light: of the states.
+        how: the policies.
+
+    Raises:
+        SpotError: a spot cannot be measured.
+    """
+    before, after = how.record(light.photons, light.numbers)
+    channels = experiment.path.channels
+    good = np.arange(len(after))
+    while len(good):
+        whole = len(good) == len(after)
+        first = before
+        if isinstance(before, np.ndarray) and before.ndim == after.ndim and not whole:
+            first = before[good]
+        try:
+            with one_blas_thread():
+                recovery = recover(
+                    first,
+                    after if whole else after[good],
+                    experiment.calibration,
+                    how.centroid,
+                    cores() if len(good) > 1 else 1,
+                    experiment.disturbances if how.stated else None,
+                    how.keep_parts,
+                    experiment.motion_models if how.stated else None,
+                    how.frames,
+                )
+            return Observation(light, good, after, recovery)
+        except SpotError as error:
+            if how.leave is None:
+                raise
+            lost: dict[int, str] = {}
+            for index in error.indices:
+                state, spot = divmod(index, len(channels))
+                lost.setdefault(state, f"{channels[spot].key}: {error.reasons[index]}")
+            for state, why in lost.items():
+                how.leave(int(light.numbers[good[state]]), f"a spot cannot be measured ({why})")
+            good = np.delete(good, list(lost))
+    return None
+
+
+def one_detector(experiment: MonitorExperiment, frames: int, seed: int, stray: np.ndarray | float = 0.0) -> Record:
+    """Every state is exposed by the same detectors, against one nominal measurement.
+
+    Args:
+        experiment: the instrument.
+        frames: of each exposure.
+        seed: of the detectors and of all noise; each state has a stream of its own.
+        stray: photons beside those of the nominal spots.
+    """
+    before = experiment.frames_before(frames, seed, stray)
+    return lambda photons, numbers: (before, experiment.frames_after(photons, frames, seed, numbers))
