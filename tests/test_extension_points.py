@@ -272,7 +272,7 @@ def test_an_unknown_noise_is_told_with_file_line_key_and_remedy(tmp_path: Path) 
 
 ESTIMATORS = "analysis.monitor.estimators.ESTIMATORS"
 TARGETS = "optics.targets.target_shapes.TARGETS"
-SECTIONS = "twin.run.further_sections.SECTIONS"
+SECTIONS = "twin.run.report.SECTIONS"
 FRAMES = "twin.run.data_files.FRAME_FORMATS"
 BAR = (8, 60)
 """Width and length of the toy target, pixels."""

@@ -31,7 +31,7 @@ from scenes.yaml.yaml_file import parse_yaml
 from tests.golden.fields import fields_file, fields_of, json_fields, kept_fields
 from tests.golden.golden import golden_file
 from tests.golden.jobs import ALL
-from twin.run.page_policy import checksum
+from twin.run.page import checksum
 
 ROOT = Path(__file__).resolve().parent.parent
 

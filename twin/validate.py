@@ -34,8 +34,8 @@ from twin.run.cli import (
     time_text,
 )
 from twin.run.ending_signals import exit_on_terminate
+from twin.run.provenance import program_digest
 from twin.run.run_folder import RunFolder
-from twin.run.versions import program_digest
 from twin.validation.checks.check import (
     CONFIRMED,
     CONSISTENT,

@@ -14,10 +14,9 @@ from optics.raytrace.trace import make_rays, trace
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from twin.monitor.monitor_derivative import ray_tangents
+from twin.monitor.monitor_derivative import every_motion, ray_tangents, spot_gradient
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import line_family, other_motions
-from twin.monitor.spot_gradient import every_motion, spot_gradient
 
 RULE, QUICK_RULE = (158, 632), (16, 64)
 """Rings and arms: 100 000 rays in each of 4 channels; few."""

@@ -15,9 +15,8 @@ from scenes.yaml.csv_table import read_table
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from twin.laboratory.measured_readings import read_comparisons
-from twin.orbit.measured.measurement_files import CONVENTIONS
-from twin.orbit.measured.measurement_tables import COLUMNS
-from twin.orbit.measured.platform_columns import platform_of
+from twin.orbit.measured.measurement_tables import COLUMNS, CONVENTIONS
+from twin.orbit.measured.platform_readings import platform_of
 
 ROWS, QUICK_ROWS = 1_000_000, 20_000
 LIMIT_S = 20.0

@@ -11,9 +11,8 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.numerics.quadrature import PupilNodes
-from twin.monitor.monitor_beams import MonitorBeams
+from twin.monitor.monitor_beams import CcdRays, MonitorBeams
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.monitor_rays import CcdRays
 
 RINGS_PER_RADIAN, LEAST_RINGS = 1.2, 48
 """Rings for the phase from the middle to the edge of the pupil, four times as many arms: more than a smooth pupil

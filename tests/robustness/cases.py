@@ -25,7 +25,7 @@ from tests.robustness.case import JOBS, Case, Reached, edited, job_of, text_of
 from twin.camera.__main__ import app as camera
 from twin.design.__main__ import app as design
 from twin.design.layout_gradient import LayoutNumber, Slope
-from twin.design.search_journal import Journal
+from twin.design.search_workers import Journal
 from twin.lab import app as lab
 from twin.live.__main__ import app as live
 from twin.orbit.__main__ import app as orbit

@@ -271,7 +271,7 @@ def match_files(folder: Path, flown: Any) -> dict[str, object]:
     """Files of a simulated pass as `match` reads them, and its specification as it stands in YAML."""
     from twin.orbit.flight.platform_table import PlatformTable
     from twin.orbit.images.simulate_report import map_facts
-    from twin.orbit.measured.measurement_files import _csv
+    from twin.orbit.measured.measurement_tables import _csv
     from twin.run.data_files import FrameFacts, tiff
 
     table = PlatformTable.sampled(flown.measured, 1.0, 0.125)

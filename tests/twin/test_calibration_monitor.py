@@ -30,7 +30,7 @@ from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
 from twin.orbit.calibration.schemes import tested as at_checks
-from twin.orbit.flight.payload_changes import drifted_payload
+from twin.orbit.flight.line_camera import drifted_payload
 
 run = partial(invoke, command.app)
 EXAMPLE = SCENES / ORBIT / "calibrate_monitor.yaml"

@@ -23,7 +23,7 @@ from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
 from twin.run.procedure import BenchError, silent
-from twin.targets.edge_images import TRACK
+from twin.targets.target_images import TRACK
 
 FILE = SCENES / LAB / "focus.yaml"
 ARCMIN = np.pi / 180 / 60

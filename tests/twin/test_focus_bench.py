@@ -18,13 +18,13 @@ from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import resolve_focus
 from twin.laboratory.focus_bench import BudgetLine, FocusBench, Site
 from twin.sensors.line_ccd import band_wavelengths
-from twin.targets.edge_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
+from twin.targets.target_images import ALONG, DIRECTIONS, TABLE_REACH, TRACK, EdgeImager
 from twin.validation.checks.group import load_printed
 
 ARCMIN = np.pi / 180 / 60
 MTF_NYQUIST = load_printed("004").numbers("table1.mtf_nyquist")
 TABLE = 2e-4
-"""Error of interpolated transfer functions that twin.targets.edge_images states."""
+"""Error of interpolated transfer functions that twin.targets.target_images states."""
 OUTSIDE = 1e-4
 """Outside of the table only the splines over frequency remain."""
 MISSET = Motion(rotate=(3.0 * ARCMIN, -8.0 * ARCMIN, 4.0 * ARCMIN), shift=(0.2e-3, -0.15e-3, 0.3e-3))

@@ -14,8 +14,8 @@ import pytest
 import twin
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
-from twin.live.answers import Answers
 from twin.live.camera_pictures import CameraPictures
+from twin.live.computer import Answers
 from twin.live.knobs import KINDS, knob_name, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState, AskedView, BlindState, packed
@@ -23,7 +23,7 @@ from twin.live.recording import course_text, job_text
 from twin.live.source import read_source
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
-from twin.run.versions import program_digest
+from twin.run.provenance import program_digest
 
 M2, PLANE = "base/forward/M2", "base/backward/focal_plane"
 

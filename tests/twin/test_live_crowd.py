@@ -21,9 +21,8 @@ from websockets.frames import Frame, Opcode
 from tests.twin.live_client import SECRET, StandIn, ask, connect, numbered, serving, state
 from tests.twin.live_crowd import SOCKET, WRONG, crowded
 from tests.twin.live_page import CHROMIUM, FLAGS
-from twin.live import connections
-from twin.live.connections import MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS
-from twin.live.guard import COOKIE, Guard, names_of_this_machine
+from twin.live import guard
+from twin.live.guard import COOKIE, MOST_KNOWN, MOST_OF_ONE, MOST_STRANGERS, Guard, names_of_this_machine
 
 PROMPT = 0.2
 """Seconds in which a user's page is answered."""
@@ -101,7 +100,7 @@ def test_one_address_does_not_take_the_places_of_others():
     ids=["nothing", "half a head", "half a body"],
 )
 def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
-    monkeypatch.setattr(connections, "HEAD", 0.4)
+    monkeypatch.setattr(guard, "HEAD", 0.4)
     with serving(StandIn()) as (port, server), ExitStack() as stack:
         [line] = lines(stack, port, 1, said)
         began = time.monotonic()
@@ -113,7 +112,7 @@ def test_what_is_never_said_whole_has_its_time(said, monkeypatch):
 
 
 def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
-    monkeypatch.setattr(connections, "HEAD", 0.4)
+    monkeypatch.setattr(guard, "HEAD", 0.4)
     whole = f"GET /session HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nCookie: space_camera_twin_%d={SECRET}\r\n\r\n"
     with serving(StandIn()) as (port, _), ExitStack() as stack:
         [line] = lines(stack, port, 1, (whole % (port, port)).encode())
@@ -124,7 +123,7 @@ def test_the_next_request_of_a_connection_has_its_time_too(monkeypatch):
 
 
 def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
-    monkeypatch.setattr(connections, "ANSWER", 0.5)
+    monkeypatch.setattr(guard, "ANSWER", 0.5)
     whole = f"GET /three.min.js HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nCookie: space_camera_twin_%d={SECRET}\r\n\r\n"
     with serving(StandIn()) as (port, server), ExitStack() as stack:
         lines(stack, port, 1, (whole % (port, port)).encode() * 40)
@@ -139,7 +138,7 @@ def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
     from twin.live import clients
 
     monkeypatch.setattr(clients, "PATIENCE", 0.3)
-    monkeypatch.setattr(connections, "UNREAD", 0.3)
+    monkeypatch.setattr(guard, "UNREAD", 0.3)
     with serving(StandIn(bytes_each=30_000_000)) as (port, server), ExitStack() as stack:
         head = SOCKET.replace(b"127.0.0.1", f"127.0.0.1:{port}".encode())
         said = head + f"Cookie: {COOKIE.format(port=port)}={SECRET}\r\n\r\n".encode()

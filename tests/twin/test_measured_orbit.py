@@ -37,8 +37,7 @@ from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_o
 from twin.orbit.calibration.schemes import schemes_tested
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import along_track_angle, line_cameras
-from twin.orbit.flight.payload_changes import changed_payload
+from twin.orbit.flight.line_camera import along_track_angle, changed_payload, line_cameras
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.images.simulate_run import run_simulation
 from twin.orbit.measured.measurement_tables import read_measurements

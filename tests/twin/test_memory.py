@@ -20,8 +20,8 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.run import memory
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
+from twin.study.runs.plan import require_study_memory, study_bytes
 from twin.study.runs.setup import resolve_study
-from twin.study.runs.study_memory import require_study_memory, study_bytes
 
 
 @pytest.mark.parametrize(("text", "number"), [("8 GB", 8e9), ("500MB", 5e8), (" 1.5 GB ", 1.5e9)])

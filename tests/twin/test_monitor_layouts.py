@@ -34,7 +34,7 @@ from twin.design import monitor_design, monitor_report
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
 from twin.design.monitor_design import MonitorDesignRun, monitor_design_numbers, run_monitor_design
-from twin.design.search_journal import Journal
+from twin.design.search_workers import Journal
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from scenes.specs.study import UNITS
-from twin.run.netcdf_file import COUNTS, SPELT, follow_cf, netcdf
+from twin.run.data_files import COUNTS, SPELT, follow_cf, netcdf
 
 UDUNITS = {
     *("arcsec", "arcmin", "milliarcsec", "degree", "rad", "urad", "mrad", "pm", "nm", "um", "mm", "m", "km"),

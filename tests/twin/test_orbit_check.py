@@ -18,7 +18,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin import orbit_file_bench as bench
 from tests.twin.commands import invoke
 from twin.orbit.conventions.check_run import DECIDED, Check, run_check
-from twin.orbit.conventions.possible_readings import QUESTIONS, asked, singles_and_pairs
+from twin.orbit.conventions.pass_readings import QUESTIONS, asked, singles_and_pairs
 
 run = partial(invoke, command.app)
 

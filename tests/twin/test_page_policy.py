@@ -13,8 +13,7 @@ from markupsafe import escape
 from tests.twin.policed_page import Policed, breaches
 from twin.pictures.viewer import viewer_programs, viewer_scripts
 from twin.run.artefact import Marked, SvgFigure, Table, Text
-from twin.run.page import RunFacts, _template, inline, render_report
-from twin.run.page_policy import FIGURES, checksum, page_policy
+from twin.run.page import FIGURES, RunFacts, _template, checksum, inline, page_policy, render_report
 from twin.run.report import Report, Section
 from twin.run.svg import look, new_figure, to_svg
 

@@ -21,10 +21,9 @@ from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism, screen, slab
 from twin.path_tracing.families import Event, decode, nominal_codes
-from twin.path_tracing.integrator import Sampling
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.tracer import PathTracer
+from twin.path_tracing.tracer import PathTracer, Sampling
 
 Z_LIMIT = 3.89
 INDEX = 1.5

@@ -17,10 +17,9 @@ from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
 from tests.twin.path_bench import flat_mirror, screen
 from twin.path_tracing.families import Event
-from twin.path_tracing.integrator import Sampling
-from twin.path_tracing.shading import Leaving, spread
+from twin.path_tracing.kernel import Leaving, spread
 from twin.path_tracing.source import DiskSource, random_streams
-from twin.path_tracing.tracer import PathTracer
+from twin.path_tracing.tracer import PathTracer, Sampling
 
 FALSE_ALARM = 1e-3
 N = 1_000_000

@@ -18,11 +18,10 @@ from tests.optics.bench import unit
 from tests.optics.test_scatter_table import lambert, of_lobe
 from tests.twin.path_bench import flat_mirror, glass_scene, screen, slab
 from twin.path_tracing.families import Event
-from twin.path_tracing.finish_tables import upload_finishes
-from twin.path_tracing.integrator import Sampling
-from twin.path_tracing.shading import Leaving, TableDraw, spread
+from twin.path_tracing.kernel import Leaving, TableDraw, spread
 from twin.path_tracing.source import DiskSource, random_streams
-from twin.path_tracing.tracer import PathTracer
+from twin.path_tracing.tables import upload_finishes
+from twin.path_tracing.tracer import PathTracer, Sampling
 
 FALSE_ALARM = 1e-3
 N = 1_000_000

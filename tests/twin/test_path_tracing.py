@@ -22,20 +22,20 @@ from tests.optics.bench import disk_points
 from tests.twin.path_bench import scene_beam
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes, signature
-from twin.path_tracing.integrator import (
+from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.source import DiskSource, RaySource
+from twin.path_tracing.stray_rays import monitor_families, trace_stray
+from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,
     NAME,
     VARIANTS,
+    PathTracer,
     Sampling,
     VariantUnavailable,
     load_mitsuba,
     make_integrator,
 )
-from twin.path_tracing.sinks import NOMINAL
-from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.stray_rays import monitor_families, trace_stray
-from twin.path_tracing.tracer import PathTracer
 
 INSTRUMENTS = ["gf7_pair", "monitor_pair"]
 STATE = {

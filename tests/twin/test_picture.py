@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 import twin.main_job.render_command
 import twin.pictures.picture
-import twin.pictures.picture_light as picture_light
+import twin.pictures.picture as picture_light
 import twin.render as command
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
@@ -27,6 +27,7 @@ from twin.pictures.picture import (
     SHOTS,
     PictureError,
     Shot,
+    colour_variant,
     displayed,
     render_shot,
     staged,
@@ -35,7 +36,6 @@ from twin.pictures.picture import (
     without_grain,
     write_pictures,
 )
-from twin.pictures.picture_light import colour_variant
 from twin.pictures.picture_scene import framed, looking, points_in_world
 from twin.pictures.scene_file import build_scene
 

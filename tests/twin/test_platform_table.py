@@ -5,7 +5,7 @@ import pytest
 
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude, Trajectory

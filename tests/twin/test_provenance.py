@@ -11,34 +11,34 @@ from pathlib import Path
 import numpy as np
 import tifffile
 
-from twin.run import versions
+from twin.run import provenance
 from twin.run.provenance import Provenance, SelfCheck, checks_in, inputs_in
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 def digest_with(root: Path) -> str:
-    code = "from twin.run.versions import program_digest; print(program_digest())"
+    code = "from twin.run.provenance import program_digest; print(program_digest())"
     ran = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
     return ran.stdout.strip()
 
 
 def test_the_digest_is_of_all_files_and_follows_each(tmp_path):
     """Copies without what Git, editors and Python leave have the same one; a line of the library changes it."""
-    for package in versions.SOURCES:
+    for package in provenance.SOURCES:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "twin/run/notes.txt~").write_text("an editor's")
-    assert digest_with(tmp_path) == versions.program_digest()
+    assert digest_with(tmp_path) == provenance.program_digest()
     sheet = tmp_path / "scenes/library/detectors/monitor_ccd.yaml"
     sheet.write_text(sheet.read_text("utf-8") + "\n", "utf-8")
-    assert digest_with(tmp_path) != versions.program_digest()
+    assert digest_with(tmp_path) != provenance.program_digest()
 
 
 def test_every_kind_of_file_of_the_program_counts():
-    named = ["git", "ls-files", *versions.SOURCES]
+    named = ["git", "ls-files", *provenance.SOURCES]
     listed = subprocess.run(named, cwd=ROOT, capture_output=True, text=True, check=True)
     endings = {Path(name).suffix for name in listed.stdout.split()}
-    assert endings == set(versions.ENDINGS)
+    assert endings == set(provenance.ENDINGS)
 
 
 def test_what_rounds_numbers_is_named():
@@ -58,9 +58,9 @@ def test_every_package_that_the_program_asks_for_is_named():
     known = {re.match(r"[A-Za-z0-9._-]+", line)[0] for line in importlib.metadata.requires("space-camera-twin")}
     asked = {re.match(r"[A-Za-z0-9._-]+", line)[0] for line in project["dependencies"]} & known
     assert len(asked) > 25
-    assert asked <= {*versions.versions(), *versions.other_packages()}
-    assert versions.versions()["numpy"] == np.__version__
-    assert versions.other_packages()["tifffile"] == tifffile.__version__
+    assert asked <= {*provenance.versions(), *provenance.other_packages()}
+    assert provenance.versions()["numpy"] == np.__version__
+    assert provenance.other_packages()["tifffile"] == tifffile.__version__
 
 
 def test_inputs_are_the_files_that_a_set_up_names(tmp_path):

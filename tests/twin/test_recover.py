@@ -22,8 +22,7 @@ from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
 from twin.recover.__main__ import app
-from twin.recover.frame_origin import order_warnings
-from twin.recover.measured_frames import ChannelFrames, StateFrames
+from twin.recover.measured_frames import ChannelFrames, StateFrames, order_warnings
 from twin.recover.recover_report import recover_numbers, recover_report
 from twin.recover.recover_run import run_recover
 from twin.render import app as render_app

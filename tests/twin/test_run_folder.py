@@ -18,9 +18,9 @@ import xarray as xr
 
 from tests.twin.study_bench import ROOT
 from twin.run import durable, run_folder
+from twin.run.provenance import versions
 from twin.run.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
 from twin.run.unfinished import LOCK, OLD, PARTIAL, Unfinished, scratch
-from twin.run.versions import versions
 
 
 def everything(folder: Path) -> set[str]:

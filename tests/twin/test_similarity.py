@@ -26,8 +26,8 @@ from scenes.models.scenery import build_scenery
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.load import load_camera, load_instrument
 from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_beams import CcdRays
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.monitor_rays import CcdRays
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
 from twin.pictures.light_paths import trace_light_paths

@@ -7,10 +7,9 @@ import pytest
 
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
-from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_derivative import every_motion, spot_gradient, spot_jacobian
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions
-from twin.monitor.spot_gradient import every_motion, spot_gradient
 
 CAMERAS = ("forward", "backward")
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 import twin.run.durable
-import twin.run.versions
+import twin.run.provenance
 from tests.twin.commands import files
 from tests.twin.study_bench import ROOT, write_study
 from twin.run.durable import exchange
+from twin.run.provenance import source_digest, sources
 from twin.run.run_folder import Numbered, RunFolder, RunFolderError, is_run_folder, unlisted, write_manifest
-from twin.run.versions import source_digest, sources
 from twin.study.runs.setup import StudySetup, resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.runs.task import OtherProgramError, Task, evaluate
@@ -94,7 +94,7 @@ def test_other_code_is_not_mixed_in(setup, tmp_path, monkeypatch, change) -> Non
         del other["twin/sensors/area_detector.py"]
     else:
         other["twin/sensors/area_detector.py" if change == "edited" else "twin/new.py"] = "0" * 16
-    monkeypatch.setattr(twin.run.versions, "sources", lambda: other)
+    monkeypatch.setattr(twin.run.provenance, "sources", lambda: other)
     monkeypatch.setattr("twin.study.runs.study_folder.sources", lambda: other)
     named = "twin/new.py" if change == "new" else "twin/sensors/area_detector.py"
     with pytest.raises(RunFolderError, match=rf"another version of the program.*changed: {named}.*--out.*--force"):
@@ -105,9 +105,9 @@ def test_other_code_is_not_mixed_in(setup, tmp_path, monkeypatch, change) -> Non
 
 def test_another_version_of_a_package_is_named(setup, tmp_path, monkeypatch) -> None:
     path = work(tmp_path / "run", setup)
-    other = twin.run.versions.versions() | {"numpy": "1.0"}
+    other = twin.run.provenance.versions() | {"numpy": "1.0"}
     for place in (
-        "twin.run.versions.versions",
+        "twin.run.provenance.versions",
         "twin.study.runs.study_folder.versions",
         "twin.study.runs.setup.versions",
     ):
@@ -120,7 +120,7 @@ def test_sources_change_with_the_files(tmp_path, monkeypatch) -> None:
     for name in ("optics/a.py", "twin/b.py", "twin/validation/c.py", "scenes/d.yaml"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("x = 1\n")
-    monkeypatch.setattr(twin.run.versions, "ROOT", tmp_path)
+    monkeypatch.setattr(twin.run.provenance, "ROOT", tmp_path)
     read = sources.__wrapped__
     first = read()
     assert set(first) == {"optics/a.py", "twin/b.py"}

@@ -27,8 +27,7 @@ from scenes.specs.camera import BandSpec
 from scenes.specs.load import load_detector
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
-from twin.targets.edge_images import ALONG, DIRECTIONS, TRACK
-from twin.targets.target_images import PLACES, BarDesign, TargetCamera, TargetLostError, View
+from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
 from twin.targets.target_measurement import CURVE, on_axis, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
 

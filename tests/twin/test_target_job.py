@@ -16,8 +16,7 @@ from scenes.specs.resolved import resolve, resolve_job
 from tests.twin.commands import files, invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.reference_frames import described
-from twin.targets.edge_images import DIRECTIONS
-from twin.targets.target_images import PLACES
+from twin.targets.target_images import DIRECTIONS, PLACES
 from twin.targets.target_measurement import render_targets
 
 run = partial(invoke, command.app)

@@ -19,8 +19,7 @@ from scenes.yaml.errors import InputError
 from tests.twin.commands import invoke
 from tests.twin.study_bench import write_study
 from twin.compare.__main__ import app as compare_app
-from twin.run.data_files import FrameFacts, preview_png, tiff
-from twin.run.netcdf_file import netcdf
+from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
 from twin.run.run_folder import MANIFEST, RunFolder, write_manifest
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.chunk_store import ChunkStore

@@ -72,7 +72,7 @@ def main(
         from scenes.models.camera_sharpness import blur_warnings
         from twin.camera.camera_report import camera_report
         from twin.camera.camera_run import camera_data, camera_numbers, run_camera
-        from twin.run.netcdf_file import netcdf
+        from twin.run.data_files import netcdf
         from twin.run.page import RunFacts, write_test
 
         run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)

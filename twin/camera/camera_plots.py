@@ -10,7 +10,7 @@ from optics.geometry import zernike
 from scenes.models.camera_sharpness import BLURRED, FIELDS
 from twin.camera.camera_optics import Field
 from twin.camera.camera_run import GRID, SHARP, CameraRun
-from twin.camera.view_plots import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
+from twin.camera.camera_view import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
 from twin.run.artefact import plain
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, new_figure, plain_axes
 

@@ -20,7 +20,7 @@ from scenes.yaml.input_file import why_unreadable
 from scenes.yaml.json_file import read_json
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml
-from twin.run.netcdf_file import read_netcdf
+from twin.run.data_files import read_netcdf
 from twin.run.run_folder import MANIFEST, Manifest, read_manifest
 
 Leaf = float | int | str | bool | None

@@ -18,8 +18,7 @@ import numpy as np
 from scenes.models.monitor_layout import Beam, changed_beam, drawn_beam, kinds_of, start_beams
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, combined, touching
 from twin.design.layout_refinement import Ask, ratios, refined
-from twin.design.search_journal import Journal
-from twin.design.search_workers import Workers
+from twin.design.search_workers import Journal, Workers
 from twin.run.procedure import Advance
 
 FIRST_STEP = 0.15

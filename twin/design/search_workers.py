@@ -1,20 +1,164 @@
-"""What tries beams and layouts for a search, here or in processes of one thread each, and keeps what came of them."""
+"""What tries beams and layouts for a search, here or in other processes, and the journal of what came of them."""
 
 from __future__ import annotations
 
+import base64
+import hashlib
+import json
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, BinaryIO
 
+import numpy as np
+
+from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import LIMIT, one_blas_thread
 from scenes.models.monitor_layout import Beam
-from twin.design.layout_bench import LayoutBench, bench_of
-from twin.design.layout_gradient import LayoutNumber, slope_of
-from twin.design.search_journal import Journal
+from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of
+from twin.design.layout_gradient import LayoutNumber, Slope, slope_of
+from twin.run.durable import make_folders
 from twin.run.procedure import Advance
+from twin.run.provenance import source_digest
+from twin.run.run_folder import RunFolderError
+
+_CLASSES: Mapping[str, type[Any]] = {
+    cls.__name__: cls for cls in (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope)
+}
+
+Item = Beam | tuple[Beam, ...] | LayoutNumber
+"""What can be tried."""
+
+
+class Journal:
+    """Context manager; inside it everything that is kept stands in the file at once. The file stays: whoever writes
+    what came of the search removes it when that is safe.
+
+    Args:
+        file: of the journal; what it holds already is known. None keeps nothing.
+        config: what the search is about; a file about anything else, or of another program, is refused.
+
+    Raises:
+        RunFolderError: on entering, the file is about another search; then and later, it cannot be written.
+    """
+
+    def __init__(self, file: Path | None, config: str) -> None:
+        self.file = file
+        self._head = hashlib.sha256(f"{source_digest()}\n{config}".encode()).hexdigest()
+        self._known: dict[str, Any] = {}
+        self._out: BinaryIO | None = None
+
+    def __enter__(self) -> Journal:
+        """Read what is there."""
+        if self.file is not None:
+            try:
+                self._read(self.file)
+            except BaseException:
+                self._close()
+                raise
+        return self
+
+    def _read(self, file: Path) -> None:
+        try:
+            make_folders(file.parent)
+            self._out = file.open("r+b" if file.exists() else "x+b")
+            lines = self._out.read().splitlines(keepends=True)
+            if lines and lines[0] != f"{self._head}\n".encode():
+                raise RunFolderError(
+                    f"{file} is of another search, or of another version of this program; remove it to begin anew"
+                )
+            whole = len(lines[0]) if lines else 0
+            for line in lines[1:]:
+                if not line.endswith(b"\n"):  # the last line of a process that was killed
+                    break
+                whole += len(line)
+                check, _, text = line[:-1].partition(b" ")
+                if check != _check(text):  # damaged: what it held is tried again
+                    continue
+                entry = json.loads(text)
+                self._known[entry["of"]] = _decoded(entry["is"])
+            self._out.truncate(whole)
+            self._out.seek(whole)
+        except OSError as error:
+            raise RunFolderError(f"{file}: {error.strerror}") from error
+        if not whole:
+            self._write(self._head)
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Close the file."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._out is not None:
+            with suppress(OSError):  # what could not be written has been told
+                self._out.close()
+
+    def known(self, item: Item) -> Any:
+        """What came of a beam, a layout or a number of one, None if it was not tried."""
+        return self._known.get(_name(item))
+
+    def keep(self, item: Item, result: BeamFacts | LayoutFacts | Slope) -> None:
+        """Keep what came of it."""
+        if self._out is not None:
+            self._write(_line(_name(item), result))
+
+    def _write(self, line: str) -> None:
+        assert self._out is not None
+        try:
+            self._out.write(f"{line}\n".encode())
+            self._out.flush()
+        except OSError as error:
+            text = f"{self.file}: {error.strerror}; what it holds is kept, go on with --resume"
+            raise RunFolderError(text) from error
+
+
+def _line(name: str, result: Any) -> str:
+    """A line of the journal: a checksum, and what was tried with what came of it."""
+    text = json.dumps({"of": name, "is": _encoded(result)})
+    return f"{_check(text.encode()).decode()} {text}"
+
+
+def _check(text: bytes) -> bytes:
+    return hashlib.sha256(text).hexdigest()[:16].encode()
+
+
+def _name(item: Item) -> str:
+    return repr(item)
+
+
+def _encoded(value: Any) -> Any:
+    """Plain data that hold every bit of a result."""
+    if isinstance(value, np.ndarray):
+        data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
+        return {"array": str(value.dtype), "shape": list(value.shape), "data": data}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {
+            "class": type(value).__name__,
+            "with": {f.name: _encoded(getattr(value, f.name)) for f in fields(value)},
+        }
+    if isinstance(value, Mapping):
+        return {"map": {key: _encoded(one) for key, one in value.items()}}
+    if isinstance(value, tuple):
+        return [_encoded(one) for one in value]
+    return float(value) if isinstance(value, np.floating) else value
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_decoded(one) for one in value)
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        flat = np.frombuffer(base64.b64decode(value["data"]), dtype=value["array"])
+        return flat.reshape(value["shape"]).copy()
+    if "class" in value:
+        return _CLASSES[value["class"]](**{key: _decoded(one) for key, one in value["with"].items()})
+    return FrozenMap({key: _decoded(one) for key, one in value["map"].items()})
 
 
 class Workers:

@@ -24,7 +24,7 @@ from twin.laboratory.turntable_report import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import GREY, INK, look, new_figure, plain_axes, to_svg
-from twin.targets.edge_images import DIRECTION_NAMES
+from twin.targets.target_images import DIRECTION_NAMES
 
 MOVED = {
     "image": "image, along the light",

@@ -17,7 +17,7 @@ from twin.laboratory.focus_scan import VERTEX_ERROR
 from twin.laboratory.measured_focus import MeasuredAlignment
 from twin.laboratory.turntable_numbers import FileNumbers
 from twin.run.plain_data import plain_data
-from twin.targets.edge_images import ALONG, TRACK
+from twin.targets.target_images import ALONG, TRACK
 
 
 @dataclass(frozen=True)

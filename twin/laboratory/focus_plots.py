@@ -10,7 +10,7 @@ from analysis.mtf.slanted_edge import measure_edge
 from analysis.units import UM_PER_M as UM
 from twin.laboratory.focus_alignment import Alignment, State
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
+from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ from twin.laboratory.focus_numbers import focus_numbers
 from twin.laboratory.focus_plots import defocus_svg, edges_svg, mtf_svg, through_focus_svg
 from twin.run.artefact import SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
-from twin.targets.edge_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
+from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 
 def focus_report(alignment: Alignment) -> Report:

@@ -18,7 +18,7 @@ from twin.laboratory.focus_bench import FocusBench, Site
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
-from twin.targets.edge_images import ALONG, DIRECTIONS
+from twin.targets.target_images import ALONG, DIRECTIONS
 
 NYQUIST = 0.5
 """Cycles per pixel."""

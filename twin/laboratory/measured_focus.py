@@ -33,7 +33,7 @@ from twin.laboratory.focus_alignment import Alignment, Shimming, decide, mount_o
 from twin.laboratory.focus_scan import SiteScan, edge_mtf
 from twin.laboratory.measured_readings import DataFile
 from twin.run.procedure import Advance, silent
-from twin.targets.edge_images import ALONG, DIRECTIONS
+from twin.targets.target_images import ALONG, DIRECTIONS
 
 __all__ = ["MeasuredAlignment", "MeasuredSite", "align_measured", "run_focus_test"]
 

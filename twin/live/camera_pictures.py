@@ -12,14 +12,12 @@ from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, resolve_job, target_band
 from scenes.yaml.errors import InputError
-from twin.camera.camera_view import CameraView
-from twin.camera.view_plots import draw_mtf, draw_spot, draw_wavefront, field_text
+from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront, field_text
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.random_streams import stream
 from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.sensors.line_ccd import LineCcd
-from twin.targets.edge_images import DIRECTIONS
-from twin.targets.target_images import TargetCamera
+from twin.targets.target_images import DIRECTIONS, TargetCamera
 from twin.targets.target_measurement import read_edge
 from twin.targets.target_path import TargetPath
 from twin.targets.target_result import EdgeReading

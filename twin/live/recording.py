@@ -13,8 +13,7 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.live.knobs import AXES, Knob, perturbation
 from twin.live.live_bench import LiveBench
 from twin.live.messages import AskedState
-from twin.run.provenance import Provenance
-from twin.run.versions import versions
+from twin.run.provenance import Provenance, versions
 
 HEAD = "# Recorded with python -m twin.live; repeat it: python -m twin.render THIS_FILE\n"
 

@@ -20,8 +20,7 @@ from starlette.websockets import WebSocket
 
 from twin.live.clients import POLICY_VIOLATION, TOO_BIG, Client, Desk, Goodbye
 from twin.live.computer import Computer
-from twin.live.connections import AT_ONCE, SILENCE, Connections, PageSocket, PatientServer
-from twin.live.guard import HEADERS, Guard
+from twin.live.guard import AT_ONCE, HEADERS, SILENCE, Connections, Guard, PageSocket, PatientServer
 from twin.live.messages import LARGEST_MESSAGE
 
 LINGER = 10.0

@@ -20,8 +20,8 @@ from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from scenes.yaml.yaml_file import YamlFile, read_yaml
+from twin.live.knobs import FactorKnob, base_with, factor_knobs
 from twin.live.messages import MOST_FRAMES
-from twin.live.study_factors import FactorKnob, base_with, factor_knobs
 from twin.run.owned_files import digest
 from twin.run.run_folder import Manifest, read_manifest
 from twin.study.runs.plan import Plan

@@ -23,7 +23,7 @@ from twin.run.artefact import (
     significant,
 )
 from twin.run.report import Section
-from twin.targets.edge_images import DIRECTION_NAMES, DIRECTIONS
+from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 
 WHEN = ("before", "after")

@@ -22,8 +22,7 @@ from twin.main_job.job_tables import (
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
-from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files
-from twin.run.netcdf_file import netcdf
+from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_result import TargetRun

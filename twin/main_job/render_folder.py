@@ -11,10 +11,9 @@ from twin.main_job.render_report import PICTURES, again_words, render_report
 from twin.main_job.render_results import PROGRAM, RenderRun
 from twin.main_job.verdict import judge
 from twin.pictures.light_paths import trace_light_paths
-from twin.run.further_sections import further_sections
 from twin.run.page import write_artefacts
 from twin.run.procedure import WRITE, Session
-from twin.run.report import Section
+from twin.run.report import Section, further_sections
 from twin.run.run_folder import write_manifest
 from twin.run.second_process import SecondProcess
 
@@ -77,8 +76,7 @@ def _deformed(run: RenderRun) -> Section | None:
 
 def _pictures(run: RenderRun, session: Session) -> str:
     """Render them; why they are not complete, else nothing."""
-    from twin.pictures.picture import write_pictures
-    from twin.pictures.picture_light import PictureError
+    from twin.pictures.picture import PictureError, write_pictures
 
     write = session.folder.write_with
     try:

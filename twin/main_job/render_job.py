@@ -22,9 +22,9 @@ from twin.main_job.job_tables import deformation_warnings
 from twin.main_job.render_results import RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.image_quality import image_quality
+from twin.monitor.monitor_beams import SpotFocus
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
-from twin.monitor.monitor_rays import SpotFocus
 from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
 from twin.path_tracing.stray_light import ghost_warnings, stray_light

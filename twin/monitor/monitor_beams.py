@@ -1,4 +1,4 @@
-"""The beams of the monitor: from every pinhole through the camera to the return face and back to the area CCD.
+"""The beams of the monitor from every pinhole through the camera and back to the area CCD, and their rays.
 
 A beam is limited by the return face's aperture. Rays are aimed at quadrature nodes of that aperture in every state,
 so that its edge is exact; at the CCD each ray is a plane wave. The face is taken as evenly lit.
@@ -7,6 +7,7 @@ so that its edge is exact; at the CCD each ray is a plane wave. The face is take
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,14 +19,99 @@ from optics.numerics.array_math import inverse, product
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import RayFan, aim, alive_along, transverse_axes
-from optics.raytrace.system import SystemBatch, assemble
+from optics.raytrace.system import SystemBatch, UploadedSystems, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
 from optics.waves.diffraction import Grid, PupilField
 from optics.waves.wavefront import eikonal
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import Channel
 from twin.monitor.image_sampling import UncertainImageError
-from twin.monitor.monitor_rays import Aimed, CcdRays, CoarseTrace, SpotFocus
+
+
+@dataclass(frozen=True, eq=False)
+class Aimed:
+    """Rays from the pinholes, aimed at the nodes, for C channels x S states (channel-major).
+
+    Attributes:
+        position, direction: world, (C*S, N, 3).
+        axes: transverse axes of the aim parameters, (C*S, 1, 2, 3).
+        parameters: aim parameters (C*S, N, 2); jacobian: d(node)/d(parameters), (C*S, N, 2, 2).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    axes: np.ndarray
+    parameters: np.ndarray
+    jacobian: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CoarseTrace:
+    """What a few rays say of C channels x S states (channel-major).
+
+    Attributes:
+        fan: of the rays from the pinholes.
+        outgoing, back: systems from the pinholes to the return face, and on to the CCDs.
+        uploaded: the latter where they are traced.
+        turn: change of the aim parameters against the nominal instrument, Zernike terms on the face, (2, C*S, T).
+        place: middle of the spots, (row, column) in pixels from the CCD's middle, (C, S, 2).
+        blur: distance of the farthest rays from there, estimated at the aperture's edge, pixels, (C, S).
+        aperture: numerical apertures of the beams, the largest half width, (C, S).
+    """
+
+    fan: RayFan
+    outgoing: SystemBatch
+    back: SystemBatch
+    uploaded: UploadedSystems
+    turn: np.ndarray
+    place: np.ndarray
+    blur: np.ndarray
+    aperture: np.ndarray
+
+    def take(self, states: np.ndarray, backend: Backend) -> CoarseTrace:
+        """The states of the given indices."""
+        channels, count = self.place.shape[:2]
+        if np.array_equal(states, np.arange(count)):
+            return self
+        own = (np.arange(channels)[:, None] * count + states).ravel()
+        fan = RayFan(self.fan.position[own], self.fan.direction[own], self.fan.axes[own])
+        outgoing, back = self.outgoing.take(own), self.back.take(own)
+        spots = (spot[:, states] for spot in (self.place, self.blur, self.aperture))
+        return CoarseTrace(fan, outgoing, back, back.upload(backend), self.turn[:, own], *spots)
+
+
+@dataclass(frozen=True, eq=False)
+class CcdRays:
+    """Rays at the CCDs in each CCD's frame.
+
+    Attributes:
+        position: on the chip, whose pixels grow with it: metres over ``size``, so that pixels have the nominal pitch,
+            (B, N, 3).
+        direction: unit, (B, N, 3).
+        path: optical path, metres, (B, N).
+        valid: (B, N).
+        size: of the CCD relative to nominal, (B,).
+    """
+
+    position: np.ndarray
+    direction: np.ndarray
+    path: np.ndarray
+    valid: np.ndarray
+    size: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class SpotFocus:
+    """Sharpness of the unperturbed instrument's spots, channel by channel.
+
+    Attributes:
+        error: rms wavefront error of the returned beam about its best plane tilt, waves, (C,).
+        defocus: how far the focal plane would have to move along its Z for the sharpest spots, metres, (C,).
+    """
+
+    error: np.ndarray
+    defocus: np.ndarray
+
 
 MAP_TERMS, ROUGH_TERMS = 15, 66
 """Zernike terms (to orders 4 and 10) of the map from the aperture to direction cosines. Beside the first the rest is

@@ -33,8 +33,7 @@ from twin.monitor.image_sampling import (
     disagreement,
     lost_or_gained,
 )
-from twin.monitor.monitor_beams import MonitorBeams
-from twin.monitor.monitor_rays import CcdRays, CoarseTrace
+from twin.monitor.monitor_beams import CcdRays, CoarseTrace, MonitorBeams
 
 MOST_RAYS = 400_000
 """Traced at once, to bound memory: blurred spots need many."""

@@ -21,14 +21,13 @@ from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel
+from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.monitor_rays import Aimed
 from twin.path_tracing.families import nominal_codes
-from twin.path_tracing.integrator import FAINT, Sampling
 from twin.path_tracing.path_result import Family, PathResult
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource
-from twin.path_tracing.tracer import CHUNK, PathTracer, Progress
+from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
 
 CONE_ROOM = 1.25
 """Half angle of the source's cone relative to that of the pupil seen from the focal plane."""

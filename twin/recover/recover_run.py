@@ -31,8 +31,13 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import pieces
 from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
-from twin.recover.frame_origin import order_warnings, repeated_frames
-from twin.recover.measured_frames import ChannelFrames, cannot_measure, read_measurement
+from twin.recover.measured_frames import (
+    ChannelFrames,
+    cannot_measure,
+    order_warnings,
+    read_measurement,
+    repeated_frames,
+)
 from twin.run.procedure import Advance, silent
 from twin.sensors.area_detector import EmvaDetector
 from twin.sensors.grey_steps import told_of_steps

@@ -41,9 +41,9 @@ from twin.run.cli import (
 )
 from twin.run.ending_signals import exit_on_terminate
 from twin.run.procedure import Advance, Session, performed
+from twin.run.provenance import program_digest
 from twin.run.reference_frames import described
 from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
-from twin.run.versions import program_digest
 
 if TYPE_CHECKING:
     from twin.run.report import Report

@@ -1,7 +1,7 @@
 """Memory that a command may take, and the refusal of a job that needs more before anything of it is computed.
 
 Each subject estimates what a job will take from its numbers of pixels, frames, rays and runs alone
-(`twin.monitor.monitor_memory`, `twin.study.runs.study_memory`). Estimates are of the largest resident memory above that
+(`twin.monitor.monitor_memory`, `twin.study.runs.plan`). Estimates are of the largest resident memory above that
 of the started program, and within a factor of 1.5 of what is used (tests/limits).
 """
 

@@ -1,10 +1,11 @@
-"""What the report of a test is made of, whichever test it was: tables, sections with figures, images."""
+"""What the report of a test is made of: tables, sections with figures, images; sections added from elsewhere."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -104,3 +105,16 @@ def numbers_only(title: str, file: str, error: Exception) -> Report:
 def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
     """The report with further warnings before its own."""
     return replace(report, warnings=(*given, *report.warnings))
+
+
+SECTIONS: dict[tuple[str, str], Callable[[Any], Section | None]] = {}
+"""(Kind of run, name of the section) -> the section, of what the run gave; None where it has nothing to say. The kind
+is ``render`` for the main job, and for a test the name of its numbers' file: ``focus``, ``angle``. A section
+stands before the one that says how to reproduce the run; its artefacts are in the run folder. A new one is added here.
+"""
+
+
+def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
+    """The sections for a run of that kind, in the order of SECTIONS."""
+    found = (section(run) for (of, _), section in SECTIONS.items() if of == kind)
+    return tuple(section for section in found if section is not None)

@@ -19,9 +19,8 @@ from twin.run.durable import make_folders, put_in_place, sync_folder, sync_tree
 from twin.run.ending_signals import ending_later
 from twin.run.owned_files import MANIFEST as MANIFEST
 from twin.run.owned_files import digest, every_file, foreign_files, remove_files
-from twin.run.provenance import Checksum, Provenance
+from twin.run.provenance import Checksum, Provenance, versions
 from twin.run.unfinished import OLD, PARTIAL, Unfinished, successor, sweep
-from twin.run.versions import versions
 
 NAMED = 5
 """Files that a message names at most."""

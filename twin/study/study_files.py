@@ -11,9 +11,8 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import NOISE
-from twin.run.data_files import csv_table
+from twin.run.data_files import csv_table, netcdf
 from twin.run.data_table import TABLE_FORMATS, DataColumn, DataTable, MissingPackage
-from twin.run.netcdf_file import netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.study.runs.base_job import one_line
 from twin.study.runs.block_result import BlockResult

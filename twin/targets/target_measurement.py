@@ -20,8 +20,7 @@ from scenes.specs.resolved import ResolvedJob, target_band
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
-from twin.targets.edge_images import DIRECTIONS
-from twin.targets.target_images import PLACES, BarDesign, TargetCamera, View, usable_pixels
+from twin.targets.target_images import DIRECTIONS, PLACES, BarDesign, TargetCamera, View, usable_pixels
 from twin.targets.target_path import TargetPath
 from twin.targets.target_result import (
     NYQUIST,

@@ -12,7 +12,7 @@ from typing import Any
 from optics.numerics.backend import Backend
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.artefact import Artefact
-from twin.run.versions import versions
+from twin.run.provenance import versions
 from twin.validation.checks.check import VERDICTS, CheckResult, Verdict
 from twin.validation.checks.group import CheckGroup, Context
 from twin.validation.registry import Selection

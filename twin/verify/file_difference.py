@@ -26,7 +26,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from twin.compare.run_differences import TOLD, Leaf, is_sigma, leaves, sigma_of
-from twin.run.netcdf_file import read_netcdf
+from twin.run.data_files import read_netcdf
 
 SAME, ROUNDED, DIFFERENT, LEFT_OUT = "same", "rounding", "different", "left out"
 REDRAWN = "drawn otherwise"

@@ -16,10 +16,9 @@ import numpy as np
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.input_file import why_unreadable
-from twin.run.netcdf_file import read_netcdf
-from twin.run.provenance import Provenance
+from twin.run.data_files import read_netcdf
+from twin.run.provenance import BEFORE, ROOT, Provenance, source_digest, versions
 from twin.run.run_folder import read_manifest
-from twin.run.versions import BEFORE, ROOT, source_digest, versions
 from twin.study.runs.block_result import BlockResult
 from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
 from twin.study.runs.plan import Plan

@@ -14,9 +14,9 @@ from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.angle.angle_flight import LEAST_SIGMA
 from twin.orbit.angle.angle_run import AngleRun, SimulatedAngleRun
 from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
-from twin.orbit.measured.measurement_files import CAMERA_FILE, campaign_files
+from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 TEST_FILE = "angle.yaml"

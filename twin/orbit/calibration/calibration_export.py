@@ -12,10 +12,10 @@ from scenes.specs.measured.orbit_data_setup import AnyCalibration, MeasuredCalib
 from scenes.yaml.yaml_file import dump_yaml
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineTimes
 from twin.orbit.flight.platform_table import PlatformTable
 from twin.orbit.images.imaged_ground import BEYOND
-from twin.orbit.measured.measurement_files import CAMERA_FILE, campaign_files
+from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 
 if TYPE_CHECKING:

@@ -26,10 +26,8 @@ from twin.orbit.calibration.field_images import FieldImages, Imager
 from twin.orbit.calibration.observations import FieldPoints, PassData, light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import NO_EFFECTS
-from twin.orbit.flight.line_camera import line_cameras
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.payload_changes import changed_payload, drifted_payload
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory

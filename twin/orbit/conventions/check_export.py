@@ -8,8 +8,8 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue
 from twin.orbit.conventions.check_run import Check
 from twin.orbit.conventions.reading_fit import line_of, line_times, pixel_of
-from twin.orbit.flight.line_times import LineTimes
-from twin.orbit.measured.measurement_files import campaign_files
+from twin.orbit.flight.line_camera import LineTimes
+from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table
 

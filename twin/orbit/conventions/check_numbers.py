@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
-from twin.orbit.conventions.possible_readings import QUESTIONS, Changes, changed
+from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, changed
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.run.plain_data import plain_data
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.orbit.conventions.check_numbers import changes_text, places_of
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
-from twin.orbit.conventions.possible_readings import QUESTIONS, Changes
+from twin.orbit.conventions.pass_readings import QUESTIONS, Changes
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, one_sentence
 

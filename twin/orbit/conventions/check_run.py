@@ -11,8 +11,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from scenes.yaml.errors import InputError, Issue
-from twin.orbit.conventions.pass_readings import PassConventions, PassReadings, read_pass
-from twin.orbit.conventions.possible_readings import QUESTIONS, Changes, asked, changed, singles_and_pairs
+from twin.orbit.conventions.pass_readings import (
+    QUESTIONS,
+    Changes,
+    PassConventions,
+    PassReadings,
+    asked,
+    changed,
+    read_pass,
+    singles_and_pairs,
+)
 from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, spread
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import line_cameras

@@ -21,8 +21,7 @@ from scenes.yaml.errors import InputError, Problem
 from twin.orbit.conventions.pass_readings import LineClock, PassConventions, PassReadings, RawPoints
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import LineCamera
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.earth_orientation import constant_orientation

@@ -1,4 +1,4 @@
-"""Line cameras in orbit: what every pixel of a line looks along, in the satellite's body frame.
+"""Line cameras in orbit: what every pixel looks along in the body frame, when lines are exposed, what drifts.
 
 Body frame (the instrument's base): X forward, Z toward the scene, Y = Z x X. A pixel's ray has an origin as well as a
 direction, because the chief rays of a mirror camera do not meet in one exact point. Both are smooth functions of the
@@ -8,15 +8,19 @@ polynomial, and for a traced line as good as the trace.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from optics.geometry.pose import about_axis, rotation_matrix
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
@@ -24,6 +28,103 @@ from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE
 from scenes.specs.orbit.three_line_camera import CcdSpec, LineCameraSpec, ThreeLineCameraSpec
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+    from scenes.specs.orbit.simulate import OrbitSimulateSpec
+
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LineTimes:
+    """Times at lines of an image, linear between them and as far as half a line beyond the first and the last.
+
+    Attributes:
+        line: (K,) image coordinates, increasing; the middle of the first line is 0.
+        time: (K,) middle of the exposure, seconds of the trajectory, increasing.
+    """
+
+    line: Array
+    time: Array
+
+    @classmethod
+    def of(cls, line: ArrayLike, time: ArrayLike) -> LineTimes:
+        """The table, checked.
+
+        Args:
+            line: (K,), at least two.
+            time: (K,), seconds.
+
+        Raises:
+            ValueError: shapes that do not match, fewer than two rows, values that are not finite or do not increase.
+        """
+        at, moment = np.array(line, np.float64), np.array(time, np.float64)
+        if at.ndim != 1 or at.shape != moment.shape or len(at) < 2:
+            raise ValueError("line times: two lines or more, with a time for each")
+        if not (np.all(np.isfinite(at)) and np.all(np.isfinite(moment))):
+            raise ValueError("line times: a value is not finite")
+        if not (np.all(np.diff(at) > 0.0) and np.all(np.diff(moment) > 0.0)):
+            raise ValueError("line times: lines and times must increase")
+        return cls(at, moment)
+
+    @classmethod
+    def even(cls, first_time: float, line_time: float, lines: int) -> LineTimes:
+        """Of lines that follow one another evenly, from line 0 on; times in seconds."""
+        last = float(max(lines - 1, 1))
+        return cls.of([0.0, last], [first_time, first_time + last * line_time])
+
+    @property
+    def line_time(self) -> float:
+        """Mean time from one line to the next, seconds."""
+        return float((self.time[-1] - self.time[0]) / (self.line[-1] - self.line[0]))
+
+    def at(self, line: ArrayLike) -> np.ndarray:
+        """Times of lines (...), seconds; beyond the ends by the slope there."""
+        x = np.asarray(line, dtype=np.float64)
+        k = np.clip(np.searchsorted(self.line, x, side="right") - 1, 0, len(self.line) - 2)
+        slope = (self.time[k + 1] - self.time[k]) / (self.line[k + 1] - self.line[k])
+        return np.asarray(self.time[k] + (x - self.line[k]) * slope)
+
+
+def changed_payload(
+    spec: OrbitCalibrationSpec | OrbitSimulateSpec, payload: ThreeLineCameraSpec
+) -> ThreeLineCameraSpec:
+    """The camera as it is after launch.
+
+    Args:
+        spec: a test, whose ``changes`` name lines.
+        payload: as the laboratory has measured it.
+    """
+    lines = {}
+    for name, line in payload.lines.items():
+        if name in spec.changes:
+            change = spec.changes[name]
+            point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
+            focal = line.focal_length + change.focal_length
+            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
+        lines[name] = line
+    return payload.model_copy(update={"lines": FrozenMap(lines)})
+
+
+def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray]) -> ThreeLineCameraSpec:
+    """The camera with each line turned in its own axes, Rx(d_beta) Ry(d_alpha) Rz(d_gamma), and with f + d_f.
+
+    Args:
+        payload: the camera.
+        drift: line -> (4,) d_alpha, d_beta, d_gamma (radians) and d_f (metres).
+    """
+    lines = dict(payload.lines)
+    for name, (alpha, beta, gamma, longer) in drift.items():
+        line = lines[name]
+        turn = (
+            rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
+        )
+        rotate = tuple(Rotation.from_matrix(turn).as_rotvec().tolist())
+        lines[name] = line.model_copy(update={"rotate": rotate, "focal_length": line.focal_length + float(longer)})
+    return payload.model_copy(update={"lines": FrozenMap(lines)})
+
 
 TRACED_POINTS = 49
 """Points of a traced line. An unperturbed line needs nine terms; the rest is for figure errors."""

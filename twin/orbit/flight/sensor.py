@@ -28,8 +28,7 @@ from twin.orbit.flight.light_effects import (
     turned_with_earth,
     unrefracted,
 )
-from twin.orbit.flight.line_camera import LineCamera
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineCamera, LineTimes
 
 _COUNTS = (8, 12, 16, 24, 32, 48)
 _TRIAL_LINES = 9

@@ -14,9 +14,8 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.yaml.errors import KeyPath
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import LineCamera, line_cameras
+from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
-from twin.orbit.flight.payload_changes import changed_payload
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points

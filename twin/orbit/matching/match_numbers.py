@@ -11,7 +11,7 @@ import numpy as np
 from twin.orbit.images.simulate_numbers import PointNumbers
 from twin.orbit.matching.match_run import Match, UserImage
 from twin.orbit.measured.map_part import MapPart
-from twin.orbit.measured.measurement_files import campaign_files
+from twin.orbit.measured.measurement_tables import campaign_files
 from twin.run.plain_data import plain_data
 
 

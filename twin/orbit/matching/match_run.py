@@ -20,8 +20,7 @@ from twin.orbit.conventions.pass_readings import LineClock, PassConventions, rea
 from twin.orbit.conventions.reading_fit import ImpossibleError, line_times
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import LineCamera, line_cameras
-from twin.orbit.flight.line_times import LineTimes
+from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame

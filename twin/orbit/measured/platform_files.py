@@ -20,7 +20,6 @@ from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
-from twin.orbit.measured.ccsds import message_kind, read_aem, read_oem
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
 from twin.orbit.measured.earth_orientation import (
     EarthOrientation,
@@ -29,8 +28,8 @@ from twin.orbit.measured.earth_orientation import (
     rate_of,
     read_earth_orientation,
 )
+from twin.orbit.measured.orbit_files import is_sp3, message_kind, read_aem, read_oem, read_sp3
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
-from twin.orbit.measured.sp3 import is_sp3, read_sp3
 from twin.orbit.measured.text_file import first_lines, require_rising
 
 if TYPE_CHECKING:

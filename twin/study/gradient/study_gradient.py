@@ -1,8 +1,8 @@
 """The Jacobian of a study's responses by its factors at the base's values.
 
 Spots and lines of sight are differentiated by automatic differentiation through the trace
-(``twin.monitor.spot_gradient`` backward, ``twin.study.gradient.gradient_chain`` forward); the estimators, formulas on
-these numbers, along the directions that come out of it. All else has differences only: traced ones, of everything that
+(``twin.monitor.monitor_derivative`` backward, ``twin.study.gradient.gradient_chain`` forward); the estimators, formulas
+on these numbers, along the directions that come out of it. All else has differences only: traced ones, of everything that
 needs no image and so has no noise, or those of the whole job with the noise of the base's seed.
 """
 
@@ -24,8 +24,8 @@ from scenes.specs.study import FactorSpec, ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.monitor.image_quality import quality_dicts
+from twin.monitor.monitor_derivative import spot_gradient
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.spot_gradient import spot_gradient
 from twin.run.cli import InputErrorText
 from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient

@@ -11,7 +11,7 @@ from typing import Any
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import KeyPath, Problem, key_text
 from twin.run.cli import InputErrorText
-from twin.run.versions import source_digest
+from twin.run.provenance import source_digest
 from twin.study.runs.block_result import check_response
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import ClusterError, Workers, killed

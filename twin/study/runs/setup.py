@@ -33,7 +33,7 @@ from scenes.yaml.yaml_file import (
     plain_scalar,
     read_yaml,
 )
-from twin.run.versions import source_digest, versions
+from twin.run.provenance import source_digest, versions
 from twin.study.runs.base_job import BaseJob
 from twin.study.runs.config_tree import Tree, with_place, with_values
 from twin.study.runs.jobs import base_job

@@ -29,6 +29,7 @@ from twin.run.owned_files import (
     remove_study,
     succeeds,
 )
+from twin.run.provenance import sources, versions
 from twin.run.run_folder import (
     NAMED,
     Numbered,
@@ -42,7 +43,6 @@ from twin.run.run_folder import (
     unlisted,
 )
 from twin.run.unfinished import OLD, Unfinished, successor, sweep
-from twin.run.versions import sources, versions
 from twin.study.runs.chunk_store import FOLDER, INDEX
 from twin.study.runs.setup import StudySetup
 

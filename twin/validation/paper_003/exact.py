@@ -22,8 +22,7 @@ from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass, line_model
 from twin.orbit.calibration.campaign_adjustment import GAUGE, calibrated_alone
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import line_cameras
-from twin.orbit.flight.payload_changes import changed_payload
+from twin.orbit.flight.line_camera import changed_payload, line_cameras
 from twin.orbit.flight.sensor import Platform, Sensor
 from twin.validation.checks.check import Chosen
 

@@ -25,7 +25,7 @@ from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_scan import NYQUIST
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.svg import AFTER, BEFORE, INK, LIGHT, look, new_figure, plain_axes, to_svg
-from twin.targets.edge_images import TRACK
+from twin.targets.target_images import TRACK
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
 from twin.validation.checks.group import Context, group_of, load_printed
 
