@@ -1,9 +1,9 @@
 """The Jacobian of a study's responses by its factors at the base's values.
 
 Spots and lines of sight are differentiated by automatic differentiation through the trace
-(``twin.monitor.monitor_derivative`` backward, ``twin.study.gradient.gradient_chain`` forward); the estimators, formulas
-on these numbers, along the directions that come out of it. All else has differences only: traced ones, of everything that
-needs no image and so has no noise, or those of the whole job with the noise of the base's seed.
+(``twin.monitor.monitor_derivative`` backward, ``twin.study.gradient.gradient_chain`` forward); the estimators,
+formulas on these numbers, along the directions that come out of it. All else has differences only: traced ones, of
+everything that needs no image and so has no noise, or those of the whole job with the noise of the base's seed.
 """
 
 from __future__ import annotations
