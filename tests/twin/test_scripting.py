@@ -345,8 +345,8 @@ def test_the_users_process_stays_as_it_is() -> None:
         "before = state()\n"
         "import twin\n"
         "for name in twin.__all__: getattr(twin, name)\n"
-        "from twin.scripting.procedures import TESTS\n"
-        "for load in TESTS.values(): load()\n"
+        "from scenes.specs.procedures import PROCEDURES\n"
+        "for one in PROCEDURES.values(): one.run.get(), one.numbers.get(), one.report.get()\n"
         "assert state() == before, (state(), before)\n"
         "assert 'typer' not in sys.modules and 'twin.run.cli' not in sys.modules\n"
     )

@@ -93,7 +93,7 @@ def main(
     place: list[StudyFolder] = []
     if gradient:
         # drawing libraries are not needed before
-        from twin.study.study_command import run_gradient
+        from twin.study.gradient_command import run_gradient
 
         run_gradient(file, options, as_json, quiet)
         return
