@@ -65,7 +65,8 @@ def why_unreadable(error: BaseException) -> str:
     """
     inside = isinstance(error, LookupError | AttributeError | TypeError | AssertionError | OverflowError | Warning)
     text = re.sub(r"\s+", " ", str(error)).strip()[:200]
-    return "it is damaged" if inside or not text or "broadcast" in text or "unpack" in text else text
+    inside = inside or any(word in text for word in ("broadcast", "unpack", "ufunc"))
+    return "it is damaged" if inside or not text else text
 
 
 MISSING = "no such file"
