@@ -19,7 +19,7 @@ from optics.waves.diffraction import Grid
 from optics.waves.transfer import TransferTable
 from scenes.specs.resolved import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_numbers import distortion_numbers
+from twin.laboratory.distortion_numbers import DISTORTION
 from twin.laboratory.distortion_report import distortion_report
 from twin.laboratory.distortion_run import CLOSED_FORMS, SimulatedDistortion, measure, reduce
 from twin.laboratory.turntable_bench import TurntableModel
@@ -146,7 +146,7 @@ def test_noise_of_the_spots_is_as_stated():
 
 
 def test_result_agrees_with_the_truth():
-    data = distortion_numbers(run())
+    data = DISTORTION(run())
     truth = data["truth"]
     assert len(data["points"]) == load_printed("004").whole("distortion.points")
     assert truth["error_rms_compensated_um"] < ACCURACY_UM

@@ -16,7 +16,7 @@ from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.laboratory.distortion_numbers import distortion_numbers
+from twin.laboratory.distortion_numbers import DISTORTION, POINTS
 from twin.laboratory.distortion_plots import COMPENSATED, RAW, curve_svg, spot_svg
 from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion, rms
 from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
@@ -32,7 +32,7 @@ ZERO_SHARE = 0.3
 
 def distortion_report(run: DistortionRun) -> Report:
     """Report of a distortion test."""
-    data = distortion_numbers(run)
+    data = DISTORTION(run)
     simulated = run if isinstance(run, SimulatedDistortion) else None
     frames, facts = _frames(simulated) if simulated is not None else ({}, {})
     sections = [_curve(run, data), _joint(data["joint"]), _estimates(run, data), _noise(run, data)]
@@ -252,13 +252,12 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
         )
         caption += " Line: by exact chief rays of the as-built camera."
-    keys = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
-    points = [(*(one[key] for key in keys), one["residual_compensated_um"], one["sets_kept"]) for one in data["points"]]
-    heads = ("point", "reading [deg]", "W [deg]", "L [mm]", "D [µm]", "sigma [µm]", "from smooth [µm]", "sets kept")
+    shown = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
+    further = ("residual_compensated_um", "sets_kept")
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("distortion-curve", "Distortion over the field", caption, curve_svg(run)),
-        Table(
-            "distortion-points", "Point by point", "Means of the sets kept.", heads, points, (None, 5, 5, 4, 2, 2, 2)
+        POINTS.table(
+            "distortion-points", "Point by point", "Means of the sets kept.", data["points"], (*shown, *further)
         ),
     )
     return Section("Distortion", tuple(text), artefacts, folded=1)

@@ -1,0 +1,165 @@
+"""Declared results: a number says once what it is called, its unit, what it means and how it is shown.
+
+A `Record` lists the quantities of one kind of result. What the JSON files of a run folder, the tables of reports, data
+tables for other programs and the reference say of them is read off this list. Sources are in SI units. The ending of a
+key names the unit in which files have the number, and the record converts it: a length under ``sigma_um`` is a million
+times the metres that its source has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from analysis.units import ARCMIN, ARCSEC
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.study import unit_of
+from twin.run.artefact import Cell, Table, shown_unit
+from twin.run.data_table import DataColumn, DataTable
+from twin.run.plain_data import plain_data
+
+S = TypeVar("S")
+_PER_SI: Mapping[str, float] = FrozenMap(
+    {"pm": 1e12, "nm": 1e9, "um": 1e6, "mm": 1e3, "m": 1.0, "km": 1e-3, "us": 1e6, "ms": 1e3, "mK": 1e3, "mW": 1e3}
+    | {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
+)
+"""Unit -> how many of it are one of SI; units that are missing here and below are those of the source."""
+_SI: Mapping[str, float] = FrozenMap({"arcsec": ARCSEC, "arcmin": ARCMIN, "mas": 1e-3 * ARCSEC})
+"""Unit -> its size in radians: a division keeps one rounding."""
+
+
+def in_unit(value: Any, unit: str) -> Any:
+    """A number or an array in SI units as so many of a unit; None and what has no unit stay as they are.
+
+    Args:
+        value: number, array, sequence or mapping of numbers, or None.
+        unit: as `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares.
+    """
+    if value is None or not unit:
+        return value
+    if isinstance(value, Mapping):
+        return {name: in_unit(one, unit) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [in_unit(one, unit) for one in value]
+    if unit == "deg":
+        return np.degrees(value)
+    if unit in _SI:
+        return value / _SI[unit]
+    factor = _PER_SI.get(unit.removesuffix("2"), 1.0) ** (2 if unit.endswith("2") else 1)
+    return value if factor == 1.0 else factor * value
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity(Generic[S]):
+    """One number, text or array of a result, or a record within it.
+
+    Attributes:
+        key: its name in files; the ending names the unit.
+        of: source -> value in SI units, or, with a record, what that record is of: one source, a list or a mapping of
+            sources; None where there is none.
+        meaning: what it is, for the reference and for the columns of other programs.
+        head: how tables of reports call it, without its unit; empty for the key's words.
+        decimals: that reports show, None for six significant digits.
+        record: of what stands below the key.
+        where_known: files have the key only where the value is not None.
+        converted: whether the source is in SI units; False where it already is in the unit of the key.
+    """
+
+    key: str
+    of: Callable[[S], Any]
+    meaning: str = ""
+    head: str = ""
+    decimals: int | None = None
+    record: Record[Any] | None = None
+    where_known: bool = False
+    converted: bool = True
+
+    @property
+    def unit(self) -> str:
+        """As the program writes it, empty for none."""
+        square = self.key.removesuffix("2") if self.key.endswith("m2") else ""
+        return f"{unit_of((square,))}2" if square else unit_of((self.key,))
+
+    @property
+    def shown_head(self) -> str:
+        """Head of a report's column, with its unit in brackets."""
+        words = self.head or self.key.removesuffix(f"_{self.unit}").replace("_", " ")
+        return f"{words} [{shown_unit(self.unit)}]" if self.unit else words
+
+    def value(self, source: S) -> Any:
+        """The value as files have it, before it is plain data."""
+        found = self.of(source)
+        if self.record is None or found is None:
+            return in_unit(found, self.unit) if self.converted else found
+        if isinstance(found, Mapping):
+            return {name: self.record(one) for name, one in found.items()}
+        if isinstance(found, list | tuple):
+            return [self.record(one) for one in found]
+        return self.record(found)
+
+
+class Record(Generic[S]):
+    """The quantities of one kind of result, in the order in which files have them.
+
+    Called with a source it gives the plain data of a file.
+
+    Attributes:
+        meaning: what the record is.
+        quantities: of it, their keys all different.
+    """
+
+    def __init__(self, meaning: str, *quantities: Quantity[S]) -> None:
+        keys = [one.key for one in quantities]
+        if twice := [key for key in keys if keys.count(key) > 1]:
+            raise ValueError(f"two quantities of one record are called {twice[0]}")
+        self.meaning, self.quantities = meaning, quantities
+
+    def __iter__(self) -> Iterator[Quantity[S]]:
+        """Its quantities."""
+        return iter(self.quantities)
+
+    def __getitem__(self, key: str) -> Quantity[S]:
+        """The quantity of that key."""
+        return next(one for one in self.quantities if one.key == key)
+
+    def __call__(self, source: S) -> dict[str, Any]:
+        """The numbers of one source, as JSON holds them."""
+        found = ((one, one.value(source)) for one in self.quantities)
+        return {one.key: plain_data(value) for one, value in found if not (one.where_known and value is None)}
+
+    def rows(self, source: S) -> list[dict[str, Any]]:
+        """The numbers of a source each of whose quantities is an array of one length, row by row."""
+        columns = self(source)
+        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+    def _chosen(self, keys: Sequence[str]) -> list[Quantity[S]]:
+        return [self[key] for key in keys] if keys else list(self.quantities)
+
+    def table(
+        self, name: str, title: str, caption: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()
+    ) -> Table:
+        """A table of a report.
+
+        Args:
+            name: of its file.
+            title: heading.
+            caption: what it shows.
+            rows: as this record gives them.
+            keys: of the columns, in their order; all if none are given.
+        """
+        shown = self._chosen(keys)
+        cells: list[list[Cell]] = [[row.get(one.key) for one in shown] for row in rows]
+        return Table(name, title, caption, [one.shown_head for one in shown], cells, [one.decimals for one in shown])
+
+    def data_table(
+        self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()
+    ) -> DataTable:
+        """A table for other programs, whose columns say their unit and meaning; arguments as for `table`."""
+        columns = (
+            DataColumn.of(one.key, [row.get(one.key) for row in rows], one.unit, one.meaning)
+            for one in self._chosen(keys)
+        )
+        return DataTable(name, title, tuple(columns))
