@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from twin.live.computer import BeforeKey, Computer, ComputerLost
+from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 from twin.live.messages import (
     LARGEST_SEED,
     AskedState,
@@ -317,8 +317,25 @@ class Desk:
                 self._tell_of("stopped", HALTED.format(pid=self.computer.pid, seconds=STOPPED))
             elif condition == "stopped" and time.monotonic() - since > STOPPED:
                 self.computer.kill()
-            elif condition == "runs" and known == "stopped":
-                self._tell_of("runs")
+            elif condition == "runs":
+                self._goes_on()
+
+    async def _ask(self, kind: Kind, question: Any) -> Any:
+        """The computer's answer. An answer that comes while the pages still believe the process stopped shows that it
+        goes on, and they are told so before they get it, however long the next look at the process is away.
+
+        Raises:
+            ComputerLost: the process ended.
+        """
+        answer = await self.computer.ask(kind, question)
+        if self.trouble and self.computer.condition == "runs":
+            self._goes_on()
+        return answer
+
+    def _goes_on(self) -> None:
+        """Tell the pages that the process runs, if what they know is that it was stopped."""
+        if self.trouble.get("state") == "stopped":
+            self._tell_of("runs")
 
     def _tell_of(self, state: str, problem: str = "") -> None:
         """Tell all pages, those that come later too, how it is with the process that computes; each news once."""
@@ -362,7 +379,7 @@ class Desk:
     async def _build(self, client: Client, asked: Factors) -> None:
         for one in self.clients:
             one.tell({"type": "building"})
-        found = await self.computer.ask("factors", asked.values)
+        found = await self._ask("factors", asked.values)
         if isinstance(found, str):
             client.tell({"type": "refused", "problem": found})
         else:
@@ -377,15 +394,15 @@ class Desk:
             await self._build(client, asked)
         elif wish.kind == "state":
             key = (asked.noise, asked.frames, asked.seed)
-            client.answer(await self.computer.ask("state", (asked, client.before)), key)
+            client.answer(await self._ask("state", (asked, client.before)), key)
             client.kept(asked)
             self.states += 1
         elif wish.kind == "reveal":
-            client.letter(await self.computer.ask("hidden", asked))
+            client.letter(await self._ask("hidden", asked))
         elif isinstance(asked, Save):
             if asked.what == "job":
-                client.letter(await self.computer.ask("job", asked.state))
+                client.letter(await self._ask("job", asked.state))
             else:
-                client.letter(await self.computer.ask("course", list(client.recorded or ())))
+                client.letter(await self._ask("course", list(client.recorded or ())))
         else:
-            client.picture(await self.computer.ask("view", asked))
+            client.picture(await self._ask("view", asked))
