@@ -381,7 +381,7 @@ class CameraOptics:
                     rms=float(np.sqrt(np.sum(spread))),
                     rms_along=np.sqrt(spread),
                     farthest=float(np.max(np.linalg.norm(hexapolar - centroid, axis=-1))),
-                    airy=1.22 * self.model.spec.wavelength * self._f_number(leaving[k, 1 + nodes.count :], rings),
+                    airy=0.61 * self.model.spec.wavelength / round_aperture(leaving[k, -len(rings[-1]) :, :2]),
                     place=self._place(rays, k),
                 )
             )
@@ -452,12 +452,17 @@ class CameraOptics:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
 
-    def _f_number(self, leaving: np.ndarray, rings: list[np.ndarray]) -> float:
-        """Of the round beam with the solid angle of the outermost ring's rays (N, 3)."""
-        u, v = leaving[-len(rings[-1]) :, :2].T
-        after_u, after_v = np.roll(u, -1), np.roll(v, -1)
-        sides = len(u)
-        # of the circle that has the polygon's corners on it
-        polygon = 0.5 * abs(float(np.sum(u * after_v - v * after_u)))
-        circle = polygon * np.pi / (0.5 * sides * np.sin(2.0 * np.pi / sides))
-        return float(0.5 / np.sqrt(circle / np.pi))
+
+def solid_angle(cosines: np.ndarray) -> float:
+    """Area in direction cosines, (N, 2), of a beam whose edge goes through evenly spread rays: that of the smooth curve
+    through the polygon's corners, which is larger by what a circle is larger than its own.
+    """
+    u, v = cosines.T
+    polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
+    step = 2.0 * np.pi / len(u)
+    return polygon * step / np.sin(step)
+
+
+def round_aperture(cosines: np.ndarray) -> float:
+    """Numerical aperture of the round beam with the solid angle of one whose edge has direction cosines (N, 2)."""
+    return float(np.sqrt(solid_angle(cosines) / np.pi))

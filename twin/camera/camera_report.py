@@ -16,6 +16,7 @@ from twin.camera.camera_plots import (
     distortion_figure,
     error_figure,
     focus_figure,
+    layout_figure,
     mtf_figure,
     refocus_figure,
     spot_figure,
@@ -23,7 +24,7 @@ from twin.camera.camera_plots import (
     zernike_figure,
 )
 from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
-from twin.camera.layout_plot import layout_figure
+from twin.camera.first_order_data import FIRST_ORDER
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import look, to_svg
@@ -64,12 +65,12 @@ def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> 
 
 
 def _first_order_text(run: CameraRun) -> str:
-    data, d = run.first_order, run.distortion
-    blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in data.obscuration.items())
+    n, d = FIRST_ORDER(run.first_order), run.distortion
+    blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
     return (
-        f"f {data.focal_length:.4g} m, F/{data.f_number:.3g}, field {np.degrees(data.field_line):.3g} by "
-        f"{np.degrees(data.field_track):.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
-        f"distortion at most {1e6 * np.max(np.abs(d.residual)):.3g} µm there; "
+        f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
+        f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
+        f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
         + (f"its own parts stand in the beam: {blocked}." if blocked else "nothing of its own stands in the beam.")
     )
 
@@ -92,37 +93,36 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 
 def first_order_table(run: CameraRun) -> Table:
     """First-order data, the report's first table."""
-    data, d = run.first_order, run.distortion
-    degrees = np.degrees
+    n = FIRST_ORDER(run.first_order)
 
     def far(value: float) -> str:
         return f"{value:.4g} m" if abs(value) < 1e4 else "infinite"
 
     rows: list[tuple[str, str]] = [
         ("worst wavefront error", f"{run.worst[0]:.4g} waves rms at {field_text(run.camera, run.worst[1])}"),
-        ("focal length", f"{data.focal_length:.5f} m (line {data.focal_length_line:.5f}, "
-         f"track {data.focal_length_track:.5f})"),
-        ("principal distance of the line", f"{d.line_distance:.6f} m"),
-        ("F-number", f"{data.f_number:.3f}"),
-        ("working F-number", f"{data.working_f_number:.3f} (line {data.working_f_number_line:.3f}, "
-         f"track {data.working_f_number_track:.3f})"),
-        ("entrance pupil", f"{1e3 * data.entrance_pupil:.1f} mm, {_before(data.entrance_pupil_distance)} the first "
-         "mirror"),
-        ("exit pupil", f"{far(data.exit_pupil)}, {_before(data.exit_pupil_distance)} the image"),
-        ("chief rays at the image", f"{degrees(data.chief_ray_angle[0]):.3f} deg from its normal in the middle, "
-         f"{degrees(data.chief_ray_angle[1]):.3f} at most"),
-        ("field of view", f"{degrees(data.field_line):.4g} × {degrees(data.field_track):.4g} deg"),
-        ("image", f"{1e3 * data.image_line:.2f} × {1e3 * data.image_track:.2f} mm"),
-        ("plate scale", f"{degrees(data.plate_scale) * 3.6:.4f} arcsec/mm"),
-        ("pixel", f"{1e6 * data.pitch:.4g} µm, {degrees(data.pixel_angle) * 3600:.4f} arcsec"),
-        ("Airy disk", f"{1e6 * data.airy:.3f} µm radius, {data.airy / data.pitch:.2f} pixels"),
-        ("sampling", f"λF / pixel {data.sampling:.3f} (2 samples the cut-off); Nyquist {1e-3 * data.nyquist:.2f}, "
-         f"cut-off {1e-3 * data.cutoff:.1f} cycles/mm"),
-        ("length along the axis", f"{data.length:.4f} m"),
+        ("focal length", f"{n['focal_length_m']:.5f} m (line {n['focal_length_along_line_m']:.5f}, "
+         f"track {n['focal_length_along_track_m']:.5f})"),
+        ("principal distance of the line", f"{run.distortion.line_distance:.6f} m"),
+        ("F-number", f"{n['f_number']:.3f}"),
+        ("working F-number", f"{n['working_f_number']:.3f} (line {n['working_f_number_along_line']:.3f}, "
+         f"track {n['working_f_number_along_track']:.3f})"),
+        ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.1f} mm, "
+         f"{_before(n['entrance_pupil_before_first_mirror_m'])} the first mirror"),
+        ("exit pupil", f"{far(n['exit_pupil_m'])}, {_before(n['exit_pupil_before_image_m'])} the image"),
+        ("chief rays at the image", "{:.3f} deg from its normal in the middle, {:.3f} at most".format(
+            *n["chief_ray_angle_deg"])),
+        ("field of view", "{:.4g} × {:.4g} deg".format(*n["field_deg"])),
+        ("image", "{:.2f} × {:.2f} mm".format(*n["image_mm"])),
+        ("plate scale", f"{n['plate_scale_arcsec_per_mm']:.4f} arcsec/mm"),
+        ("pixel", f"{n['pixel_um']:.4g} µm, {n['pixel_arcsec']:.4f} arcsec"),
+        ("Airy disk", f"{n['airy_radius_um']:.3f} µm radius, {n['airy_radius_um'] / n['pixel_um']:.2f} pixels"),
+        ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
+         f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),
+        ("length along the axis", f"{n['length_m']:.4f} m"),
         ("obscuration by its own parts",
-         ", ".join(f"{b} {100 * s:.2f}%" for b, s in data.obscuration.items()) or "none"),
+         ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
-    caption = f"In the middle of the field, at {1e9 * data.wavelength:.0f} nm, unless it says otherwise."
+    caption = f"In the middle of the field, at {1e9 * run.camera.wavelength:.0f} nm, unless it says otherwise."
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
 
@@ -278,12 +278,11 @@ def _through_focus(run: CameraRun) -> Section:
 def _field(run: CameraRun) -> Section:
     d, curves = run.distortion, run.curves
     half = float(np.max(np.abs(d.position)))
-    largest = float(np.max(np.abs(d.residual)))
     point, both = d.line_point
     text = (
         f"Along the line: principal distance {d.line_distance:.6f} m with the principal point in the line's middle, "
-        f"distortion {1e6 * np.sqrt(np.mean(d.residual**2)):.3g} µm rms and {1e6 * largest:.3g} µm at most, "
-        f"{100 * largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
+        f"distortion {1e6 * d.line_rms:.3g} µm rms and {1e6 * d.line_largest:.3g} µm at most, "
+        f"{100 * d.line_largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
         f"{fixed(1e3 * point, 3)} mm off.",
         f"Over the whole field: the nearest perfect camera has f {d.distance:.6f} m and its principal point at "
         f"({plain(1e3 * d.point[0], 4)}, {plain(1e3 * d.point[1], 6)}) mm from the line's middle, near the parent "

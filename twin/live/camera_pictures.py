@@ -18,9 +18,8 @@ from twin.run.random_streams import stream
 from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import DIRECTIONS, TargetCamera
-from twin.targets.target_measurement import read_edge
+from twin.targets.target_measurement import EdgeReading, read_edge
 from twin.targets.target_path import TargetPath
-from twin.targets.target_result import EdgeReading
 
 SIZE = (7.6, 3.5)
 """Inches."""

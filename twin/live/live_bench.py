@@ -31,7 +31,7 @@ from twin.monitor.state_reading import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7

@@ -24,7 +24,7 @@ from twin.run.artefact import (
 )
 from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
-from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
+from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 
 WHEN = ("before", "after")
 FREE = "the pupils are free: `obstruction: ignore`"

@@ -11,10 +11,9 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
-from twin.path_tracing.collect import Collector, Key, event_lists
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
-from twin.path_tracing.path_result import PathResult
+from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
 from twin.path_tracing.source import DiskSource, Source, draw, pieces, take
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload
