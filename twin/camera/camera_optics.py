@@ -46,10 +46,10 @@ TERMS = 37
 """Zernike terms (Noll's order) that are told of a wavefront: all to seventh order, and the spherical of eighth."""
 
 RINGS = 12
-"""Of the quadrature over the stop: exact for squares of wavefronts up to order 23."""
+"""Rings of the quadrature over the stop, which is exact for squares of wavefronts up to order 23."""
 
 MAP_POINTS = 65
-"""Of a wavefront's map on each axis."""
+"""Points of a wavefront's map on each axis."""
 
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
@@ -242,7 +242,7 @@ class CameraOptics:
         return cls(path, FrozenMap(state or {}))
 
     def perturbed(self, state: State) -> Self:
-        """The same camera in another state."""
+        """Return the camera in another state."""
         return replace(self, state=FrozenMap(state))
 
     @property
@@ -252,7 +252,7 @@ class CameraOptics:
 
     @property
     def assembly(self) -> Assembly:
-        """That holds the camera."""
+        """Assembly that holds the camera."""
         return self.path.assembly
 
     @cached_property
@@ -305,11 +305,9 @@ class CameraOptics:
         axis = np.linspace(-1.0, 1.0, points)
         x, y = np.meshgrid(axis, axis)
         inside = np.hypot(x, y) <= 1.0
-        angle = 2.0 * np.pi * np.arange(4 * RINGS) / (4 * RINGS)
-        parts = [np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]
-        parts += [INSIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
-        parts += [INSIDE * np.stack([x[inside], y[inside]], axis=-1)]
-        stop = np.concatenate(parts)
+        edge = rim(4 * RINGS)
+        within = np.stack([nodes.x, nodes.y], axis=-1)
+        stop = np.concatenate([[[0.0, 0.0]], within, edge, INSIDE * np.stack([x[inside], y[inside]], axis=-1)])
         rays = self.rays(fields, stop)
         wavelength = self.model.spec.wavelength
         error = -self._path(rays) / wavelength
@@ -322,7 +320,7 @@ class CameraOptics:
             flat = error[k] - zernike.basis(3, *stop.T) @ level
             fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
-            table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
+            table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(edge) :]
             # over a part of the disk the terms share tilt among them; what is level there was taken out above
             rms = float(fit.rms if np.all(lit) else np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
             phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
@@ -352,11 +350,7 @@ class CameraOptics:
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
         """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
-        rings = [
-            INSIDE * r / SPOT_RINGS * np.stack([np.cos(a), np.sin(a)], axis=-1)
-            for r in range(1, SPOT_RINGS + 1)
-            for a in [2.0 * np.pi * np.arange(6 * r) / (6 * r)]
-        ]
+        rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
         stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1), *rings])
         rays = self.rays(fields, stop)
         leaving = rays.direction
@@ -451,6 +445,12 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
+
+
+def rim(count: int) -> np.ndarray:
+    """Places evenly along the edge of the stop, within it by a rounding, in units of its radius, (count, 2)."""
+    turn = 2.0 * np.pi * np.arange(count) / count
+    return np.asarray(INSIDE * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
 
 
 def solid_angle(cosines: np.ndarray) -> float:

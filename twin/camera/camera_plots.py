@@ -254,7 +254,7 @@ def refocus_figure(run: CameraRun) -> Figure:
 
 
 _END_COLOURS = (BLUE, GREEN, VERMILION)
-"""Of the negative end of the field, its middle, its positive end."""
+"""Colours of the negative end of the field, its middle, its positive end."""
 
 _BEFORE = 0.16
 """Share of the layout's length that is drawn of the light before it."""

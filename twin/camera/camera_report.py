@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,19 +11,7 @@ from matplotlib.figure import Figure
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
-from twin.camera.camera_plots import (
-    curves_figure,
-    degrees_text,
-    distortion_figure,
-    error_figure,
-    focus_figure,
-    layout_figure,
-    mtf_figure,
-    refocus_figure,
-    spot_figure,
-    wavefront_figure,
-    zernike_figure,
-)
+from twin.camera import camera_plots as plots
 from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
 from twin.camera.first_order_data import FIRST_ORDER
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
@@ -54,14 +43,14 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
     )
 
 
-def new_name(run: CameraRun) -> str:
-    """Of the refocused camera and its file."""
+def _new_name(run: CameraRun) -> str:
+    """Name of the refocused camera and of its file."""
     return f"{run.setup.camera.name}_refocused"
 
 
-def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure:
+def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
     with look(name):
-        return SvgFigure(name, title, caption, to_svg(draw()))
+        return SvgFigure(name, title, caption, to_svg(draw(*drawn)))
 
 
 def _first_order_text(run: CameraRun) -> str:
@@ -137,7 +126,7 @@ def _layout(run: CameraRun) -> Section:
     caption = (
         "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
     )
-    figure = _figure("layout", "Layout with rays", caption, lambda: layout_figure(model, backend))
+    figure = _figure("layout", "Layout with rays", caption, plots.layout_figure, model, backend)
     return Section("Layout", (), (figure,))
 
 
@@ -145,7 +134,7 @@ def _refocus(run: CameraRun) -> Section:
     assert run.refocus is not None
     moved = run.refocus
     rows: list[list[Cell]] = [
-        [degrees_text(run, field), float(b), float(a)]
+        [plots.degrees_text(run, field), float(b), float(a)]
         for field, b, a in zip(FIELDS, moved.errors_before, moved.errors_after, strict=True)
     ]
     text = (
@@ -153,10 +142,10 @@ def _refocus(run: CameraRun) -> Section:
         + (", place and tilt" if moved.tilt else "")
         + ". All else here is of the refocused camera."
     )
-    name = new_name(run)
+    name = _new_name(run)
     file = file_with_plane(run.setup.camera, moved.after, name)
     artefacts: tuple[Artefact, ...] = (
-        _figure("refocus", "Before and after", "Waves rms, logarithmic.", lambda: refocus_figure(run)),
+        _figure("refocus", "Before and after", "Waves rms, logarithmic.", plots.refocus_figure, run),
         CameraFile(name.lower(), "The refocused camera", "Its file: other name and image, else as it was.", file),
         Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
               (None, 4, 4)),
@@ -165,7 +154,7 @@ def _refocus(run: CameraRun) -> Section:
 
 
 def _wavefronts(run: CameraRun) -> Section:
-    heads = ["", *(degrees_text(run, w.field) for w in run.waves)]
+    heads = ["", *(plots.degrees_text(run, w.field) for w in run.waves)]
     rows: list[list[Cell]] = [
         ["rms", *(w.rms for w in run.waves)],
         ["peak to valley", *(w.peak_to_valley for w in run.waves)],
@@ -187,17 +176,17 @@ def _wavefronts(run: CameraRun) -> Section:
                 "wavefront-field",
                 "Over the field",
                 "Rms wavefront error; the ring marks the worst field.",
-                lambda: error_figure(run),
+                plots.error_figure, run,
             ),
             _figure(
                 "wavefront-maps",
                 "Maps",
                 "Over the stop, x along the line to the right, y along the track upward; one scale of colours. "
                 "Positive where the wavefront is ahead.",
-                lambda: wavefront_figure(run),
+                plots.wavefront_figure, run,
             ),
             _figure(
-                "zernike-bars", "Zernike terms", "In the middle and at the worst field.", lambda: zernike_figure(run)
+                "zernike-bars", "Zernike terms", "In the middle and at the worst field.", plots.zernike_figure, run
             ),
             table,
         ),
@@ -206,7 +195,7 @@ def _wavefronts(run: CameraRun) -> Section:
 
 def _spots(run: CameraRun) -> Section:
     rows: list[list[Cell]] = [
-        [degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
+        [plots.degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
         for s in run.spots
     ]
     heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
@@ -218,7 +207,8 @@ def _spots(run: CameraRun) -> Section:
                 "spots",
                 "Spot diagrams",
                 "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk.",
-                lambda: spot_figure(run),
+                plots.spot_figure,
+                run,
             ),
             Table(
                 "spot-sizes",
@@ -246,7 +236,7 @@ def _mtf(run: CameraRun) -> Section:
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)
         limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
-        rows.append([degrees_text(run, mtf.field), *map(float, values), *limits])
+        rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
     heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
         f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
@@ -260,7 +250,8 @@ def _mtf(run: CameraRun) -> Section:
                 "mtf",
                 "MTF by field",
                 "Along the line and along the track; dashed what diffraction allows.",
-                lambda: mtf_figure(run),
+                plots.mtf_figure,
+                run,
             ),
             Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)),
         ),
@@ -272,7 +263,7 @@ def _through_focus(run: CameraRun) -> Section:
     where = f"{fixed(abs(best), 1)} µm {'downstream' if best > 0.0 else 'upstream'} of the focal plane"
     text = f"The least error over these fields is {where}." if np.isfinite(best) else "The light has no focus."
     caption = "The detector moves along its normal; positive is downstream, away from the optics."
-    return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, lambda: focus_figure(run)),))
+    return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, plots.focus_figure, run),))
 
 
 def _field(run: CameraRun) -> Section:
@@ -307,13 +298,13 @@ def _field(run: CameraRun) -> Section:
                 "distortion",
                 "Distortion",
                 "Left against the perfect camera with the best principal distance and point; right along the line.",
-                lambda: distortion_figure(run),
+                plots.distortion_figure, run,
             ),
             _figure(
                 "field-curves",
                 "Focus and illumination",
                 "Along the line. Illumination is the solid angle of the beam as the focal plane sees it.",
-                lambda: curves_figure(run),
+                plots.curves_figure, run,
             ),
             Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
             Table("distortion-line", "Distortion along the line", "", ("L [mm]", "W [deg]", "distortion [µm]"), line,

@@ -17,16 +17,8 @@ from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPla
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
 from scenes.specs.resolved import CameraSetup
+from twin.camera import field_maps
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
-from twin.camera.field_maps import (
-    Distortion,
-    FieldCurves,
-    ThroughFocus,
-    distortion,
-    field_curves,
-    field_grid,
-    through_focus,
-)
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.monitor.image_quality import CameraQuality, image_quality
 from twin.run.procedure import Advance, silent
@@ -49,10 +41,10 @@ ERROR_GRID = (25, 9)
 """Fields along the line and along the track of the map of wavefront errors."""
 
 MAP_POINTS = 129
-"""Of wavefront maps on each axis."""
+"""Points of a wavefront's map on each axis."""
 
 QUALITY_FIELDS = (-1.0, 0.0, 1.0)
-"""Of half the line: where bodies of an instrument are looked for in the beam."""
+"""Shares of half the line at which bodies of an instrument are looked for in the beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +94,9 @@ class CameraRun:
     mtfs: tuple[Mtf, ...]
     field: np.ndarray
     errors: np.ndarray
-    distortion: Distortion
-    curves: FieldCurves
-    focus: ThroughFocus
+    distortion: field_maps.Distortion
+    curves: field_maps.FieldCurves
+    focus: field_maps.ThroughFocus
     refocus: Refocus | None = None
     quality: CameraQuality | None = None
 
@@ -162,7 +154,7 @@ def run_camera(
         instrument = build_instrument(setup.instrument, cameras, backend)
         optics = CameraOptics.within(instrument, setup.mounted, backend)
         quality = image_quality(instrument, backend, [{}], QUALITY_FIELDS).cameras[setup.mounted]
-    field = field_grid(ERROR_GRID)
+    field = field_maps.field_grid(ERROR_GRID)
     errors = FieldBeams.field_errors(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5, optics.cut)
     errors = errors.reshape(field.shape[:2])
     # a pupil that edges cut has no smooth function, so no MTF
@@ -175,8 +167,8 @@ def run_camera(
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
     except RoughWavefrontError:  # a telescope that is not made for diffraction's limit: no smooth pupil, no MTF
         mtfs, sharp = (), False
-    focus = through_focus(optics, backend, MTF_FIELDS, sharp)
-    curves = field_curves(optics, sharp)
+    focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
+    curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     return CameraRun(
         setup=setup,
@@ -188,7 +180,7 @@ def run_camera(
         mtfs=mtfs,
         field=field,
         errors=errors,
-        distortion=distortion(optics),
+        distortion=field_maps.distortion(optics),
         curves=curves,
         focus=focus,
         refocus=moved,
@@ -266,7 +258,7 @@ _MTF: Record[Mtf] = Record(
     Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
     Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
 )
-_DISTORTION: Record[Distortion] = Record(
+_DISTORTION: Record[field_maps.Distortion] = Record(
     "Where the camera images directions, against the nearest perfect camera: over the field, and along its line.",
     Quantity("principal_distance_m", lambda d: d.distance, "of the nearest perfect camera"),
     Quantity("principal_point_mm", lambda d: d.point, "of the nearest perfect camera, from the line's middle"),

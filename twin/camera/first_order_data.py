@@ -19,7 +19,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
 from scenes.specs.camera import CameraSpec
-from twin.camera.camera_optics import CameraOptics, round_aperture
+from twin.camera.camera_optics import CameraOptics, rim, round_aperture
 from twin.run.quantity import Quantity, Record
 
 EARLIER = 6.0
@@ -245,9 +245,7 @@ def first_order_data(optics: CameraOptics) -> FirstOrderData:
     model, backend = optics.model, optics.path.backend
     first = model.first_order
     scale = np.abs(first.scale[0])
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    rim = (1.0 - 1e-9) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    rays = optics.rays(_FIELDS, np.concatenate([np.zeros((1, 2)), rim]))
+    rays = optics.rays(_FIELDS, np.concatenate([np.zeros((1, 2)), rim(_RIM)]))
     middle = _FIELDS.index((0.0, 0.0))
     cosines = rays.direction[middle, 1:, 1::-1]  # along the line, along the track
     slant = np.arccos(np.clip(np.abs(rays.direction[:, 0, 2]), 0.0, 1.0))

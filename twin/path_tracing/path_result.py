@@ -238,16 +238,9 @@ class Collector:
         def joined(name: str) -> np.ndarray:
             return np.concatenate([k[name] for k in self._kept]) if self._kept else np.empty(0)
 
+        names = ("path", "detector", "weight", "length", "signature", "kind")
         place = np.stack([joined("x"), joined("y")], axis=-1)
-        return Detections(
-            joined("path"),
-            joined("detector"),
-            place,
-            joined("weight"),
-            joined("length"),
-            joined("signature"),
-            joined("kind"),
-        )
+        return Detections(place=place, **{name: joined(name) for name in names})
 
 
 def event_lists(log: np.ndarray, paths: int) -> Iterable[tuple[int, ...]]:

@@ -29,10 +29,11 @@ from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import Event, Touch, family_name, nominal_codes
-from twin.path_tracing.path_result import Family, PathResult
+from twin.path_tracing.path_result import Balance, Family, PathResult
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource
 from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
+from twin.run.quantity import Quantity, Record
 
 CONE_ROOM = 1.25
 """Half angle of the source's cone relative to that of the pupil seen from the focal plane."""
@@ -103,12 +104,12 @@ def pinhole(
     place = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
     radius = 0.5 * instrument.spec.monitor.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
-    aimed = aimed or nominal_rays(instrument, backend)
+    aimed = aimed or _nominal_rays(instrument, backend)
     number = instrument.channels.index(channel)
     return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)
 
 
-def nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
+def _nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
     """Rays from every pinhole to its return face in the unperturbed instrument."""
     return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
 
@@ -157,7 +158,7 @@ def trace_stray(
     chosen = tuple(instrument.channels if channels is None else channels)
     scenery = build_scenery(instrument, state, finishes, baffles)
     tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
-    aimed = nominal_rays(instrument, backend)
+    aimed = _nominal_rays(instrument, backend)
     ccd = instrument.spec.monitor.area_ccd
     photons = {f"{c.key}/area_ccd": np.zeros((ccd.rows, ccd.columns)) for c in instrument.channels}
     runs: dict[str, PathResult] = {}
@@ -216,39 +217,58 @@ class StrayLight:
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of stray.json: by source, the families at any detector and where the light went."""
-        out: dict[str, Any] = {}
-        for channel, run in self.traced.runs.items():
-            families = sorted(self.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
-            balance = run.balance
-            nominal = run.nominal(f"{channel}/area_ccd").touches
-            out[channel] = {
-                "families": [_family(family, share, sigma, nominal) for family, share, sigma in families],
-                "balance": {
-                    "emitted": balance.emitted,
-                    "absorbed": dict(balance.absorbed),
-                    "detected": dict(balance.detected),
-                    "escaped": balance.escaped,
-                    "under_way": balance.under_way,
-                    "relative_error": balance.error,
-                },
-            }
-        return {"paths_per_source": self.paths, "sources": out}
+        return {"paths_per_source": self.paths, "sources": {name: _source(self, name) for name in self.traced.runs}}
 
 
-def _family(family: Family, share: float, sigma: float, nominal: tuple[Touch, ...]) -> dict[str, Any]:
-    return {
-        "detector": family.detector,
-        "kind": family.kind,
-        "name": family_name(family.touches, nominal),
-        "surfaces": [str(touch) for touch in family.touches],
-        "relative_to_nominal": share,
-        "relative_to_nominal_sigma": sigma,
-        "paths": family.count,
-        "x_um": 1e6 * family.centroid[0],
-        "y_um": 1e6 * family.centroid[1],
-        "rms_x_um": 1e6 * family.rms[0],
-        "rms_y_um": 1e6 * family.rms[1],
-    }
+@dataclass(frozen=True, eq=False)
+class _ListedFamily:
+    """A family beside the nominal one of its source, for files.
+
+    Attributes:
+        family: which.
+        share: its light over that of the nominal family at the source's own area CCD.
+        sigma: of this share, by the number of paths.
+        nominal: events of the nominal family.
+    """
+
+    family: Family
+    share: float
+    sigma: float
+    nominal: tuple[Touch, ...]
+
+
+_FAMILY: Record[_ListedFamily] = Record(
+    "All paths that reach a detector by the same events in the same order.",
+    Quantity("detector", lambda one: one.family.detector, "where the paths end"),
+    Quantity("kind", lambda one: one.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
+    Quantity("name", lambda one: family_name(one.family.touches, one.nominal), "in what it differs from nominal light"),
+    Quantity("surfaces", lambda one: list(map(str, one.family.touches)), "surface by surface"),
+    Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's own spot"),
+    Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "standard deviation by the number of paths"),
+    Quantity("paths", lambda one: one.family.count, "that were traced"),
+    Quantity("x_um", lambda one: one.family.centroid[0], "centroid from the detector's middle"),
+    Quantity("y_um", lambda one: one.family.centroid[1], "centroid from the detector's middle"),
+    Quantity("rms_x_um", lambda one: one.family.rms[0], "size about the centroid"),
+    Quantity("rms_y_um", lambda one: one.family.rms[1], "size about the centroid"),
+)
+_BALANCE: Record[Balance] = Record(
+    "Where the light of a source went, in shares of its power.",
+    Quantity("emitted", lambda balance: balance.emitted, "all paths at their start"),
+    Quantity("absorbed", lambda balance: balance.absorbed, "body -> light absorbed in it"),
+    Quantity("detected", lambda balance: balance.detected, "detector -> light detected by it"),
+    Quantity("escaped", lambda balance: balance.escaped, "light that left the instrument"),
+    Quantity("under_way", lambda balance: balance.under_way, "light of paths that were cut at the step limit"),
+    Quantity("relative_error", lambda balance: balance.error, "what is missing in the sum"),
+)
+
+
+def _source(light: StrayLight, channel: str) -> dict[str, Any]:
+    """The strongest families of a source, and its balance."""
+    run = light.traced.runs[channel]
+    nominal = run.nominal(f"{channel}/area_ccd").touches
+    strongest = sorted(light.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
+    families = [_FAMILY(_ListedFamily(*one, nominal)) for one in strongest]
+    return {"families": families, "balance": _BALANCE(run.balance)}
 
 
 def stray_light(

@@ -45,7 +45,7 @@ class NoiseTerm(FurtherNoise, Protocol):
     """
 
     def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray | None:
-        """The same in every frame: (..., H, W) electrons for detectors of that shape; None for nothing."""
+        """Electrons (..., H, W) that stay from frame to frame, for detectors of that shape; None for nothing."""
         ...
 
     def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
@@ -225,16 +225,16 @@ class EmvaDetector:
 
     @classmethod
     def _sheet_names(cls) -> list[str]:
-        """Of the numbers, as they are called in a data sheet."""
+        """Names of the numbers, as a data sheet has them."""
         return [field.name for field in fields(cls) if field.name != "noise"]
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """The same numbers as a data sheet, which knows their limits and what follows from them."""
+        """These numbers as a data sheet, which knows their limits and what follows from them."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
-        """As plain numbers, not numpy's."""
+        """The detector's numbers as Python's own, not numpy's."""
         values = {name: getattr(self, name) for name in self._sheet_names()}
         return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
@@ -462,7 +462,7 @@ def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
 
 
 def coarse_warnings(setup: Spec) -> tuple[str, ...]:
-    """The same for the area CCDs of an instrument among what a job or test refers to; none where it has no instrument.
+    """Warnings as of `told_of_steps` for the area CCDs of an instrument that a job or test refers to; none without one.
 
     Args:
         setup: a job or test with all it refers to.

@@ -29,40 +29,44 @@ from twin.targets.target_images import DIRECTIONS, PLACES, BarDesign, TargetCame
 from twin.targets.target_path import TargetPath
 
 NYQUIST = 0.5
-"""Of any pixel, cycles/pixel."""
+"""Nyquist frequency of any pixel, cycles/pixel."""
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeReading:
+class TargetReading:
+    """MTF from one target.
+
+    Attributes:
+        reason: why the frames cannot be measured; empty if they can.
+        true_nyquist: MTF of the traced pupil and the detector at ``at_nyquist``.
+        at_nyquist: frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel.
+        true_axis: what ``true_nyquist`` would be without the target's tilt, at the Nyquist frequency along the line or
+            along the track: that of image quality at this place.
+    """
+
+    reason: str
+    true_nyquist: float
+    at_nyquist: tuple[float, float]
+    true_axis: float
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeReading(TargetReading):
     """MTF from one knife edge.
 
     Attributes:
         measured: from the frames, None if they cannot be measured.
-        reason: why not.
         frequency: (F,) along the edge's normal, cycles/m.
         true: (F,) MTF of the traced pupil and the detector there.
-        true_nyquist: the same at the Nyquist frequency.
-        normal: of the edge on the image, (along, track), unit.
-        true_axis: what ``true_nyquist`` would be without the edge's tilt, at the Nyquist frequency along the line or
-            along the track: that of image quality at this place.
     """
 
     measured: EdgeMtf | None
-    reason: str
     frequency: np.ndarray
     true: np.ndarray
-    true_nyquist: float
-    normal: tuple[float, float]
-    true_axis: float
-
-    @property
-    def at_nyquist(self) -> tuple[float, float]:
-        """Frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel."""
-        return NYQUIST * self.normal[0], NYQUIST * self.normal[1]
 
     @property
     def nyquist(self) -> tuple[float, float] | None:
-        """Measured MTF at the Nyquist frequency, and its sigma."""
+        """Measured MTF at the Nyquist frequency and its sigma; None if the frames cannot be measured."""
         return None if self.measured is None else self.measured.at(NYQUIST)
 
     @property
@@ -73,26 +77,18 @@ class EdgeReading:
 
 
 @dataclass(frozen=True, eq=False)
-class BarReading:
+class BarReading(TargetReading):
     """MTF from one bar target near the Nyquist frequency.
 
     Attributes:
         measured: from the frames, None if they cannot be measured.
-        reason: why not.
-        true_nyquist: MTF of the traced pupil and the detector at the bars' frequency.
-        at_nyquist: that frequency, (along, track), cycles/pixel.
-        true_axis: what ``true_nyquist`` would be without the bars' tilt, as of ``EdgeReading``.
     """
 
     measured: BarMtf | None
-    reason: str
-    true_nyquist: float
-    at_nyquist: tuple[float, float]
-    true_axis: float
 
     @property
-    def reading(self) -> tuple[float, float] | None:
-        """Measured MTF and its sigma."""
+    def nyquist(self) -> tuple[float, float] | None:
+        """Measured MTF of the bars and its sigma; None if the frames cannot be measured."""
         return None if self.measured is None else (self.measured.mtf, self.measured.sigma)
 
 
@@ -165,7 +161,7 @@ class TargetRun:
     obstruction: bool = True
 
     def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
-        """Of every image the stem of its file, its name, the frames (N, H, W) and what is known of them."""
+        """Every image: the stem of its file, its name, the frames (N, H, W) and what is known of them."""
         for camera, found in self.cameras.items():
             for place, targets in found.places.items():
                 for when, shots in targets.shots.items():
@@ -240,7 +236,7 @@ def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, An
         out |= {"mtf_nyquist": value, "mtf_nyquist_sigma": sigma, "mtf_nyquist_noise_bias": edge.nyquist_bias}
         out["curve"] = None if found is None else {**_curve(edge, found.mtf), "mtf_sigma": found.sigma.tolist()}
     if bars is not None:
-        value, sigma = bars.reading or (None, None)
+        value, sigma = bars.nyquist or (None, None)
         out |= {"bars_mtf": value, "bars_mtf_sigma": sigma}
     return out
 
@@ -303,10 +299,9 @@ def check_targets(resolved: ResolvedJob) -> None:
             found=str(settings.frames),
             allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
         )
-    for mounted in resolved.instrument.cameras.values():
-        camera = resolved.cameras[mounted.camera]
-        name = target_band(camera)
-        pixels = camera.bands[name].pixels
+    for key, mounted in resolved.instrument.cameras.items():
+        name = _band(resolved, key)
+        pixels = resolved.cameras[mounted.camera].bands[name].pixels
         if usable_pixels(pixels, settings.region) <= 0.0:
             raise job.error(
                 f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
@@ -314,6 +309,28 @@ def check_targets(resolved: ResolvedJob) -> None:
                 found=f"{settings.region} pixels on a line of {pixels}",
                 allowed="a smaller region or a longer line",
             )
+
+
+def _band(resolved: ResolvedJob, name: str) -> str:
+    """Name of the band whose line CCD of a camera images targets."""
+    return target_band(resolved.cameras[resolved.instrument.cameras[name].camera])
+
+
+def target_camera(resolved: ResolvedJob, instrument: Instrument, name: str, backend: Backend) -> TargetCamera:
+    """A camera of an instrument before targets, with the line CCD, the windows and the obstruction that a job asks for.
+
+    Args:
+        resolved: the job, with the data sheets of its line CCDs.
+        instrument: as built from it.
+        name: of the camera.
+        backend: where to trace.
+    """
+    assert resolved.line_detectors is not None
+    model, sheet = instrument.cameras[name], resolved.line_detectors[resolved.instrument.cameras[name].camera]
+    shadows = imaging_shadows(instrument, name, backend) if resolved.job.render.obstructed else None
+    path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
+    ccd = LineCcd.from_specs(model.spec.bands[_band(resolved, name)], sheet)
+    return TargetCamera(path, ccd, resolved.targets.region)
 
 
 def render_targets(
@@ -338,17 +355,12 @@ def render_targets(
         TargetLostError: the perturbation moves the light off.
     """
     settings, images = resolved.targets, resolved.job.render.target_images
-    frames, obstructed = settings.frames or 1, resolved.job.render.obstructed
+    frames = settings.frames or 1
     total = len(instrument.cameras) * len(PLACES) * 2
     cameras, done = {}, 0
-    for number, (name, model) in enumerate(instrument.cameras.items()):
-        reference = resolved.instrument.cameras[name].camera
-        band = target_band(resolved.cameras[reference])
-        assert resolved.line_detectors is not None
-        ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
-        shadows = imaging_shadows(instrument, name, backend) if obstructed else None
-        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
-        camera = TargetCamera(path, ccd, settings.region)
+    for number, name in enumerate(instrument.cameras):
+        camera = target_camera(resolved, instrument, name, backend)
+        ccd = camera.ccd
         before = camera.views({})
         after = camera.views(state) if state else before
         pattern = ccd.pattern(stream(seed, _PATTERN, number))
@@ -361,9 +373,9 @@ def render_targets(
                 shots.append(shooter.shoot(view, stream(seed, _EXPOSURE, number, k, when)))
                 done += 1
             places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
-        cameras[name] = CameraTargets(band, ccd.band.pitch, places)
+        cameras[name] = CameraTargets(_band(resolved, name), ccd.band.pitch, places)
     advance(done, total)
-    return TargetRun(cameras, frames, obstructed)
+    return TargetRun(cameras, frames, resolved.job.render.obstructed)
 
 
 class _Shooter:
@@ -425,8 +437,9 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
         found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE)
     except EdgeError as error:
         reason = str(error)
-    way = float(normal[0]), float(normal[1])
-    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]), way, on_axis(view, direction))
+    at_nyquist = NYQUIST * float(normal[0]), NYQUIST * float(normal[1])
+    own = reason, float(true[-1]), at_nyquist, on_axis(view, direction)
+    return EdgeReading(*own, found, frequency, true[:-1])
 
 
 def read_bars(
@@ -455,4 +468,4 @@ def read_bars(
         )  # fmt: skip
     except BarError as error:
         reason = str(error)
-    return BarReading(found, reason, true, (along, track), on_axis(view, direction))
+    return BarReading(reason, true, (along, track), on_axis(view, direction), found)
