@@ -69,10 +69,14 @@ class LineCcd:
         """
         return cls(band, EmvaDetector.from_sheet(sheet, band.exposure))
 
+    def factors(self, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:
+        """Each effect's transfer, see ``band_factors``."""
+        return band_factors(self.band, fx, fy)
+
     def transfer(self, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
         """Product of all factors."""
         out: np.ndarray = np.ones(np.broadcast_shapes(np.shape(fx), np.shape(fy)))
-        for factor in band_factors(self.band, fx, fy).values():
+        for factor in self.factors(fx, fy).values():
             out = out * factor
         return out
 
