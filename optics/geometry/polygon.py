@@ -6,6 +6,7 @@ along (the corner in space, say). A polygon of fewer corners repeats one; a poly
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 
 import numpy as np
@@ -159,13 +160,18 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     return polygons
 
 
-def difference(polygons: np.ndarray, holes: np.ndarray) -> list[np.ndarray]:
+def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | None = None) -> list[np.ndarray]:
     """What is left of each convex polygon (N, V, D) outside of a counterclockwise convex one (N, W, D): some convex
     pieces, (N, ., D) each, many of them empty.
+
+    Args:
+        polygons: convex.
+        holes: counterclockwise, convex.
+        order: in which the holes' sides are cut along, one piece for each; from the first to the last if not given.
     """
     normal, limit = sides(holes)
     out = []
-    for w in range(limit.shape[1]):
+    for w in range(limit.shape[1]) if order is None else order:
         out.append(clip(polygons, -normal[:, w], -limit[:, w]))
         polygons = clip(polygons, normal[:, w], limit[:, w])
     return out

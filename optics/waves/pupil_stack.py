@@ -415,7 +415,7 @@ class PupilFunction:
         """Direction cosines (u, v, w) at p, of p's shape; w > 0 along the detector's normal, downstream."""
         u = self.centre[0] + self.axes[0, 0] * p.real + self.axes[0, 1] * p.imag
         v = self.centre[1] + self.axes[1, 0] * p.real + self.axes[1, 1] * p.imag
-        return u, v, np.sqrt(1.0 - u * u - v * v)
+        return u, v, np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
 
     def values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eikonal (metres) and amplitude density at p, of p's shape."""
