@@ -15,7 +15,7 @@ import numpy as np
 
 from optics.geometry.tree import State
 from optics.waves.diffraction import Grid, image
-from scenes.models.scene_surface import Finishes
+from scenes.models.scenery_parts import Finishes
 from scenes.specs.instrument import Channel, prism_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.families import Event, Touch, family_name

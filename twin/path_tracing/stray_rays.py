@@ -17,8 +17,8 @@ from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
 from scenes.models.instrument_model import Instrument
-from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
+from scenes.models.scenery_parts import Finishes
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel
 from twin.monitor.monitor_beams import Aimed
