@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Generic, Self, TypeVar
+from typing import Annotated, Any, Generic, Self, TypeVar, cast
 
 from pydantic import Field
 
@@ -354,8 +354,7 @@ def _measured(setup: type[MeasuredSetup], model: type[Spec], path: str | Path) -
     again = read_setup(setup, path)
     test: Spec = load.load_named(model, load.LAB, path) if again is None else again.test
     measured = _absolute(getattr(test, MEASURED), Path(test.source.file).parent.absolute())
-    whole: MeasuredSetup = setup.model_construct(test=test.model_copy(update={MEASURED: measured}))
-    return whole
+    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update={MEASURED: measured})))
 
 
 def _absolute(files: Spec, folder: Path) -> Spec:
