@@ -15,7 +15,7 @@ from scenes.specs import job_tables
 from scenes.specs.course import DEFAULT_PIVOT, NO_MOTION, CourseSpec, Rotation, ScaleChange, Shift, Term, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, unknown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
@@ -210,7 +210,7 @@ def pivot_problem(
         own = perturb.get(path)
         if own is not None and (any(own.rotate) or own.scale) and own.pivot != moves.pivot:
             text = "another pivot than under perturb, to which the course is added"
-            return Problem(text, moves.pivot, own.pivot, within=(*within, "motion", path, "pivot"))
+            return Problem(text, shown(moves.pivot), own.pivot, within=(*within, "motion", path, "pivot"))
     return None
 
 

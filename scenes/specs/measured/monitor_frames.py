@@ -263,8 +263,8 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
         frames = dict(spec.frames)
         for name, files in frames.items():
             _known(spec, ("frames", name), name, channels)
-            after = tuple(_paths(spec, ("frames", name, AFTER, k), one, base) for k, one in enumerate(files.after))
             before = _paths(spec, ("frames", name, BEFORE), files.before, base)
+            after = tuple(_paths(spec, ("frames", name, AFTER, k), one, base) for k, one in enumerate(files.after))
             frames[name] = files.model_copy(update={"before": before, "after": after})
     missing = [name for name in channels if name not in frames]
     if missing:
