@@ -15,10 +15,11 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from analysis.focal_plane.through_focus import QUARTIC
-from scenes.specs.load import SCENES, load_turntable_test
+from scenes.specs.load import LAB, SCENES, load_named
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.distortion_run import DistortionRun, measure_files
@@ -146,7 +147,7 @@ def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
 
 
 def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
-    spec = load_turntable_test(JOBS / "turntable.yaml")
+    spec = load_named(TurntableTestSpec, LAB, JOBS / "turntable.yaml")
     done = run_turntable(spec, 7, names=("cubic_spline",))
     for name, content in export_turntable(done).items():
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())

@@ -18,7 +18,6 @@ from scenes.models.monitor_layout import (
     Beam,
     ImagingBeams,
     MonitorDesignSetup,
-    instrument_file,
     layout_spec,
     prism_mass,
     pupil_share,
@@ -230,7 +229,7 @@ def test_a_layout_whose_prisms_collide_is_refused_with_both_bodies_and_the_line(
 ) -> None:
     near = replace(SECOND, prism_180_distance=2.42, pupil_x=0.2)
     file = tmp_path / "hand.yaml"
-    file.write_text(instrument_file(layout_spec(setup, (FIRST, near)), "made by hand"), "utf-8")
+    file.write_text(layout_spec(setup, (FIRST, near)).file_text("made by hand"), "utf-8")
     design = written(tmp_path, DESIGN.replace("instrument: gf7_pair", "instrument: hand.yaml"))
     result = CliRunner().invoke(app, ["monitor", str(design), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2
