@@ -27,7 +27,7 @@ from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in ALL if group.prefix.startswith("000"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

@@ -32,7 +32,7 @@ from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 SEED = 2
 D_ALPHA, D_BETA, D_GAMMA, D_F = range(4)

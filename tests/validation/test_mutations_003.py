@@ -30,7 +30,7 @@ from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_l
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix in ("003.model", "003.fields"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

@@ -29,7 +29,7 @@ from twin.validation.paper_004 import distortion_checks, equations_004, focus_ch
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}
