@@ -5,7 +5,7 @@ Not listed, for nothing can be seen of them: the sign of all third differences (
 stepwise solution at half their length (they end at the same place, later), and the sign of pitch in the open
 combination (the rank is the same).
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 from dataclasses import replace

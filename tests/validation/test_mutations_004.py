@@ -4,7 +4,7 @@ them is broken.
 Not listed, for nothing can be seen of them: the two edges' vertices swapped (best focus is their mean), the sign of an
 MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 import dataclasses
