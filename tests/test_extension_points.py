@@ -79,7 +79,7 @@ from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
 from twin.run.data_files import FrameFacts
@@ -166,7 +166,7 @@ def test_nothing_that_is_added_here_stays() -> None:
 
 # --- a detector's noise -----------------------------------------------------------------------------------------------
 
-NOISE = "twin.sensors.noise_terms.NOISE_TERMS"
+NOISE = "twin.sensors.area_detector.NOISE_TERMS"
 
 
 @dataclass(frozen=True)

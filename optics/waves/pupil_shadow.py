@@ -49,6 +49,10 @@ _TURNED = 1e-12
 _ROUND = 1e-10
 """Term of an edge's radius, below which it is none."""
 
+_ROOM = 1e-5
+"""By which the area of a part of a polygon may leave what is possible, of a pupil of radius 1: arcs are integrated by
+Gauss' rule."""
+
 SMALLEST = 1e-9
 """Area of a piece, of a pupil of radius 1, below which it is nothing."""
 
@@ -357,10 +361,6 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     size, slope = _radius_and_slope(radius, turn)
     arc = turn * size
     arc_rise = 0.5 * weight * angle[..., None] * (turn * (slope + 1j * size)).imag
-    every, rises = (
-        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
-        for both in ((place, arc), (rise, arc_rise))
-    )
     # the region's box: of both ends of straight pieces, and of nodes on arcs
     corners = np.concatenate([first, last, arc.reshape(len(arc), arc.shape[1] * arc.shape[2])], axis=1)
     counted = np.concatenate([straight, straight, np.repeat(bent, len(share), axis=1)], axis=1)
@@ -370,7 +370,20 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     )
     none = ~np.any(counted, axis=1)
     low[none], high[none] = 0.0, 0.0
-    return from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    # What only fills the rows must not lie on the pupil's edge: in units of a narrow box that is millions away, where
+    # polynomials make of a rounding error in its angle, 1e-17, any number.
+    middle = 0.5 * (low + high) @ np.array([1.0, 1j])
+    used = np.concatenate([np.repeat(kept, len(share), axis=1) for kept in (straight, bent)], axis=1)
+    every, rises = (
+        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
+        for both in ((place, arc), (rise, arc_rise))
+    )
+    every, rises = np.where(used, every, middle[:, None]), np.where(used, rises, 0.0)
+    points, weights = from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    total = np.sum(weights, axis=-1)
+    if not np.all((total > -_ROOM) & (total < np.abs(area(polygons)) + _ROOM)):
+        raise ArithmeticError("a part of a shadow within the pupil came out larger than the whole of it")
+    return points, weights
 
 
 def _some(pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from tests.benchmarks.workbench import Workbench
 from tests.twin.path_bench import scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.source import DiskSource
-from twin.path_tracing.stray_rays import monitor_families, pinhole
+from twin.path_tracing.stray_light import monitor_families, pinhole
 from twin.path_tracing.tracer import PathTracer
 
 INSTRUMENTS = ("gf7_pair", "monitor_pair")

@@ -19,7 +19,7 @@ from tests.scenes import monitor_layouts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import build_scene

@@ -231,9 +231,11 @@ def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
 
     squares, count = 0.0, 0
     for seed in range(40):
-        for one in bench.hidden_amounts(BlindState(**{**first.model_dump(), "blind": seed})):
-            squares += one**2
-            count += 1
+        drawn = bench._drawn(BlindState(**{**first.model_dump(), "blind": seed}))
+        for value, part in zip(drawn, bench.twin.experiment.stated.components, strict=True):
+            if part.sigma:
+                squares += (value / part.sigma) ** 2
+                count += 1
     low, high = chi2.ppf([0.5e-4, 1 - 0.5e-4], count)
     assert low < squares < high
 
@@ -314,7 +316,7 @@ def test_the_picture_of_a_knife_edge(bench):
 def test_a_course_is_played_with_the_main_jobs_states(backend):
     """A time of the job's course: the truth of the main job's series."""
     bench = LiveBench(twin.load("scenes/examples/orbit.yaml"))
-    course = bench.course
+    course = bench.twin.resolved.job.course
     assert course is not None
     from twin.monitor.time_series import series_states
 

@@ -132,8 +132,7 @@ def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
     run = render_job(resolve(written(tmp_path, COURSE)), backend, experiment=bench_experiment(pair, tmp_path))
     folder = run_folder(tmp_path / "run", "twin.render", config_text(run.resolved))
     bench = bench_of(read_source(str(folder)), pair)
-    assert bench.course is not None
-    assert bench.course.names[bench.at_rest.time or 0] == "12 min"
+    assert bench.greeting()["course"]["names"][bench.at_rest.time or 0] == "12 min"
     shown, after = bench.state(bench.at_rest)
     assert shown["readings"] == stated(run.recovered_dict())
     assert shown["truth"] == run.truth_dict()

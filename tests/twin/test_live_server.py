@@ -482,6 +482,26 @@ def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
     assert computer.started == 1
 
 
+def test_a_computer_that_goes_on_is_told_before_its_answer_comes():
+    class GoesOn(StandIn):
+        async def ask(self, kind: str, question: Any) -> Any:
+            self.condition = "runs"
+            return await super().ask(kind, question)
+
+    computer = GoesOn()
+    with serving(computer) as (port, _), connect(port) as ws, connect(port) as other:
+        for one in (ws, other):
+            one.recv(5)
+        computer.condition = "stopped"
+        for one in (ws, other):
+            assert told(one)["state"] == "stopped"
+        ws.send(state(1))
+        # the next look at the process is a quarter of a second away, the answer some milliseconds
+        for one in (ws, other):
+            assert told(one) == {"type": "computing", "state": "runs", "problem": ""}
+        assert numbered(ws.recv(5)) == 1
+
+
 def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason():
     class Gone(StandIn):
         async def start_again(self) -> None:

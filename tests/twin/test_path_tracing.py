@@ -24,7 +24,7 @@ from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes, signature
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.stray_rays import monitor_families, trace_stray
+from twin.path_tracing.stray_light import monitor_families, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,

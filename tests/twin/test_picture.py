@@ -27,12 +27,12 @@ from twin.pictures.picture import (
     SHOTS,
     PictureError,
     Shot,
+    Studio,
     colour_variant,
     displayed,
     render_shot,
     staged,
     still_patches,
-    which_body,
     without_grain,
     write_pictures,
 )
@@ -60,6 +60,14 @@ def seen(backend, gf7_pair, paths):
         half = Shot(shot.name, shot.width // 2, shot.height // 2, 2, 2, shot.shows)
         out[shot.shows] = (*which_body(gf7_pair, paths, backend, half), staged(gf7_pair, paths, half)[0])
     return out
+
+
+def which_body(instrument, paths, backend, shot: Shot) -> tuple[np.ndarray, list[str]]:
+    """What the middle of every pixel shows first: (height, width) number into the list of bodies, -1 for nothing."""
+    view, parts = staged(instrument, paths, shot)
+    with colour_variant(backend) as mi:
+        index, _ = Studio(mi, parts, view).first_hits(0.0, 0.0)
+    return index, [part.body for part in parts]
 
 
 def pixels_of(index: np.ndarray, bodies: list[str], wanted: str) -> np.ndarray:

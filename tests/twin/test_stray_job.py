@@ -16,8 +16,14 @@ from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.stray_light import REACH, diffraction_spots, ghost_warnings, stray_light
-from twin.path_tracing.stray_rays import NominalPathLost, trace_stray
+from twin.path_tracing.stray_light import (
+    REACH,
+    NominalPathLost,
+    diffraction_spots,
+    ghost_warnings,
+    stray_light,
+    trace_stray,
+)
 from twin.render import app
 
 PATHS = 20_000

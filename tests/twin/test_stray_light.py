@@ -17,7 +17,7 @@ from scenes.models.scenery import build_scenery, focal_plane_housing
 from twin.path_tracing.families import Event
 from twin.path_tracing.path_result import Family
 from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
-from twin.path_tracing.stray_rays import NominalPathLost, StrayResult, monitor_families, pinhole, trace_stray
+from twin.path_tracing.stray_light import NominalPathLost, StrayResult, monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import BALANCED, FAINT, PathTracer, Sampling
 
 CCD = "forward/left/area_ccd"

@@ -352,8 +352,8 @@ def bar_readings(
                         for each, stream in zip((share, 0.0 * share, 0.0 * share + 1.0), noise, strict=True)
                     ]
                     found = read_bars(view, direction, design, *means, frames)
-                    assert found.reading is not None, found.reason
-                    value, sigma = found.reading
+                    assert found.nyquist is not None, found.reason
+                    value, sigma = found.nyquist
                     assert sigma < 2e-3 / np.sqrt(frames)
                     out.append((value - found.true_nyquist) / sigma)
     return np.array(out)
