@@ -117,6 +117,7 @@ PERTURBED = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("state", [{}, PERTURBED], ids=["nominal", "perturbed"])
 def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> None:
     """Pixels that were not traced: directions below 1e-6 pixel; and light sent in along the ray arrives at the pixel,

@@ -99,6 +99,7 @@ def told(*arguments: object) -> tuple[int, str]:
 # --- what was saved ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkeypatch):
     """State, seed and number of frames, the command's own --frames and --seed among them; all frames and readings to
     the bit, however the folder is named.
@@ -285,6 +286,7 @@ def test_a_study_folder_opens_its_base_with_factors_as_knobs(studied):
     assert "base of the study choices" in source.about
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("number", range(8))
 def test_a_run_of_a_study_opens_as_it_was_run(studied, number):
     """Everything that its factors set, texts and ratios among it, and its seed."""

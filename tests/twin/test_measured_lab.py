@@ -191,6 +191,7 @@ def in_unit(path: Path, old: str, new: str, factor: float) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
     kinds: list[Callable[[], np.ndarray]] = [
         lambda: turntable_of(folder).series.mean,
@@ -218,6 +219,7 @@ def renumbered(path: Path, name: str, seed: int) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     before, run = distortion_of(folder), turntable_of(folder)
     for k, (name, column) in enumerate((("comparisons", "position"), ("held_out", "position"), ("spots", "point"))):
@@ -231,6 +233,7 @@ def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
 
 
+@pytest.mark.second
 def test_units_change_nothing_but_rounding(folder: Path) -> None:
     turntable, distortion, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
     in_unit(folder / "comparisons.csv", "difference [arcsec]", "difference [urad]", ARCSEC * 1e6)
@@ -244,6 +247,7 @@ def test_units_change_nothing_but_rounding(folder: Path) -> None:
     assert np.all(np.abs(focus_of(folder).defocus - focus.defocus) < ROUNDING * focus.defocus_sigma)
 
 
+@pytest.mark.second
 def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     fit = distortion_of(folder).compensated.fit
     in_unit(folder / "spots.csv", "along [mm]", "column", 1e3 / 7.0)
@@ -306,6 +310,7 @@ def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
     assert less.repeatability == pytest.approx(whole.repeatability, rel=0.01)
 
 
+@pytest.mark.second
 def test_missing_spots_are_no_spots(folder: Path) -> None:
     whole = distortion_of(folder)
     head, *body = rows_of(folder / "spots.csv")
@@ -406,6 +411,7 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
 # --- more data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_more_data_never_raise_a_sigma(folder: Path) -> None:
     """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
     head, *body = rows_of(folder / "mtf.csv")

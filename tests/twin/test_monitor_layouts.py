@@ -153,6 +153,7 @@ def posterior(found: Information) -> np.ndarray:
     return np.asarray(found.disturbances.misfit(found.gain) + found.gain @ found.noise @ found.gain.T)
 
 
+@pytest.mark.second
 def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
     even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     # rounding falls with the number of frames where read noise spreads over its steps
@@ -196,6 +197,7 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
     assert np.all(sigma < 1.35 * np.sqrt(2.0) * airy[:, None])
 
 
+@pytest.mark.second
 def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
     # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
     start = path.instrument

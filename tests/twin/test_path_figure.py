@@ -68,6 +68,7 @@ def scene(assembly: Assembly, state: State) -> Scenery:
     return Scenery((mirror, detector_surface(grid, placed.pose("screen"), IDEAL, ("screen",))), (grid,))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "aperture",
     [Circle(0.2), Circle(0.2, (0.01, 0.0), 0.05), Rectangle(0.2, 0.1), Ellipse(0.2, 0.1)],

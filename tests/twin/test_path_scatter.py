@@ -53,6 +53,7 @@ def check(counts: np.ndarray, expected: np.ndarray) -> None:
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, counts.size - 1)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("index", [1.0, 1.5], ids=["air", "glass"])
 @pytest.mark.parametrize(
     "scatter",
@@ -103,6 +104,7 @@ def test_diffused_directions_follow_lambert(backend) -> None:
     check(counts, np.full(counts.size, N / counts.size))
 
 
+@pytest.mark.second
 def test_a_scattering_mirror_in_a_scene(backend) -> None:
     """Share and pattern of the light that a mirror scatters onto a small screen, against the BSDF's integral."""
     scatter = ABg(2e-2, 3e-2, 2.0)
