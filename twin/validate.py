@@ -33,7 +33,7 @@ from twin.run.cli import (
     result_table,
     time_text,
 )
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 from twin.run.provenance import program_digest
 from twin.run.run_folder import RunFolder
 from twin.validation.checks.check import (

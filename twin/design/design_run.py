@@ -14,15 +14,7 @@ from optics.design.starts import SAME, Attempt, Search, search
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from scenes.models.camera_design import (
-    CameraDesignSetup,
-    beams_of,
-    camera_file,
-    camera_of,
-    operands_of,
-    prescription_of,
-    variables_of,
-)
+from scenes.models import camera_design
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import BLURRED
 from twin.run.procedure import Advance, BenchError, silent
@@ -50,7 +42,7 @@ class DesignRun:
         warnings: what its user should know.
     """
 
-    setup: CameraDesignSetup
+    setup: camera_design.CameraDesignSetup
     searched: Search
     text: str
     warnings: tuple[str, ...] = ()
@@ -61,7 +53,9 @@ class DesignRun:
         return self.searched.best
 
 
-def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> DesignRun:
+def run_design(
+    setup: camera_design.CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent
+) -> DesignRun:
     """Optimise the camera; the seed is that of the starts that are drawn.
 
     Raises:
@@ -69,18 +63,18 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         BenchError: the constraints cannot be held.
     """
     test, camera = setup.test, setup.camera
-    start, beams = prescription_of(camera), beams_of(camera)
+    start, beams = camera_design.prescription_of(camera), camera_design.beams_of(camera)
     try:
         first = MeritFunction.of(backend, start, beams, Operands(camera.wavelength)).evaluate(start)
     except (AimError, BeamMissedError) as error:
         problem = f"no beams to design with come through: {str(error).partition(';')[0]}"
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
-    operands = operands_of(setup, first.principal_distance, first.envelope)
+    operands = camera_design.operands_of(setup, first.principal_distance, first.envelope)
     try:
         searched = search(
             backend,
             start,
-            variables_of(test),
+            camera_design.variables_of(test),
             beams,
             operands,
             test.steps,
@@ -98,7 +92,7 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         remark += (
             f"\nIts extent along z is {100 * found.after.envelope / found.before.envelope:.2f} % of {camera.name}'s."
         )
-    spec = camera_of(camera, found.prescription, test.name, test.description)
+    spec = camera_design.camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
     warnings = []
     worst = float(found.after.errors.max())
@@ -107,7 +101,7 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         warnings.append(f"camera {spec.name} is blurred: {told}")
     if not found.converged:
         warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
-    return DesignRun(setup, searched, camera_file(spec, remark), tuple(warnings))
+    return DesignRun(setup, searched, camera_design.camera_file(spec, remark), tuple(warnings))
 
 
 def design_numbers(run: DesignRun) -> dict[str, Any]:

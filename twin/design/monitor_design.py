@@ -9,12 +9,7 @@ from typing import Any
 
 from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
-from scenes.models.monitor_layout import (
-    Beam,
-    MonitorDesignSetup,
-    instrument_file,
-    layout_spec,
-)
+from scenes.models import monitor_layout
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
 from scenes.specs.job import JobSpec
@@ -61,7 +56,7 @@ class MonitorDesignRun:
         points: on the front of merit, pupil share and mass, the best first; empty where none is as good as the start.
     """
 
-    setup: MonitorDesignSetup
+    setup: monitor_layout.MonitorDesignSetup
     bench: LayoutBench
     found: Found
     points: tuple[Point, ...]
@@ -76,7 +71,7 @@ class MonitorDesignRun:
 
 
 def run_monitor_design(
-    setup: MonitorDesignSetup,
+    setup: monitor_layout.MonitorDesignSetup,
     backend: Backend,
     seed: int = 0,
     advance: Advance = silent,
@@ -113,14 +108,14 @@ def run_monitor_design(
     points = []
     for k, facts in enumerate(clean):
         name = setup.test.name if k == 0 else f"{setup.test.name}_{chr(ord('a') + k)}"
-        spec = layout_spec(setup, facts.beams).model_copy(update={"name": name})
+        spec = monitor_layout.layout_spec(setup, facts.beams).model_copy(update={"name": name})
         lines = [f"{GOAL_NAMES[goal]} {text}" for goal, text in _texts(facts, bench).items()]
         remark = REMARK.format(start=setup.instrument.name, sigmas="; ".join(lines))
-        points.append(Point(name, facts, instrument_file(spec, remark)))
+        points.append(Point(name, facts, monitor_layout.instrument_file(spec, remark)))
     return MonitorDesignRun(setup, bench, found, tuple(points))
 
 
-def _check_start(setup: MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
+def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
     """Refuse a start with ghosts, where they are to be traced: every layout has its prisms' tilts.
 
     Raises:
@@ -135,15 +130,15 @@ def _check_start(setup: MonitorDesignSetup, backend: Backend, seed: int, advance
 
 
 def _ghosts(
-    setup: MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
+    setup: monitor_layout.MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
 ) -> tuple[Ghost, ...]:
     """A layout's ghosts; none where they are not to be traced."""
     detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
-    return _traced_ghosts(setup, layout_spec(setup, facts.beams), detector, backend, seed, advance)
+    return _traced_ghosts(setup, monitor_layout.layout_spec(setup, facts.beams), detector, backend, seed, advance)
 
 
 def _traced_ghosts(
-    setup: MonitorDesignSetup,
+    setup: monitor_layout.MonitorDesignSetup,
     spec: InstrumentSpec,
     detector: DetectorSpec,
     backend: Backend,
@@ -224,7 +219,7 @@ def limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
     return cause, shares[cause] / sum(shares.values())
 
 
-def beam_numbers(beam: Beam) -> dict[str, Any]:
+def beam_numbers(beam: monitor_layout.Beam) -> dict[str, Any]:
     """A beam as plain data with units in the keys."""
     out: dict[str, Any] = {}
     for item in fields(beam):
@@ -308,6 +303,3 @@ def monitor_design_numbers(run: MonitorDesignRun) -> dict[str, Any]:
         },
         "optima": [[end.name for end in group] for group in optima(found, run.bench)],
     }
-
-
-__all__ = ["MonitorDesignRun", "monitor_design_numbers", "run_monitor_design", "verdict"]

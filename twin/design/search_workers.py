@@ -21,7 +21,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import LIMIT, one_blas_thread
 from scenes.models.monitor_layout import Beam
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of
-from twin.design.layout_gradient import LayoutNumber, Slope, slope_of
+from twin.design.layout_refinement import LayoutNumber, Slope, slope_of
 from twin.run.durable import make_folders
 from twin.run.procedure import Advance
 from twin.run.provenance import source_digest

@@ -56,7 +56,7 @@ def main(
 
     def read() -> Manifest:
         from twin.export.export_run import FRAMES, NONE, read_source
-        from twin.run.data_table import TABLE_FORMATS
+        from twin.run.data_files import TABLE_FORMATS
 
         for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
             if value not in allowed:

@@ -12,16 +12,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
+from rich import box, progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    ProgressColumn,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from optics.numerics.backend import NAMES, BackendUnavailable
@@ -171,15 +163,15 @@ def time_text(seconds: float | None) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def progress_columns(width: int) -> tuple[ProgressColumn, ...]:
+def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
     """Columns of a progress display: what is done, in ``width`` letters, how far, since when and for how long."""
     return (
-        SpinnerColumn(),
-        TextColumn(f"{{task.description:{width}}}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        progress.SpinnerColumn(),
+        progress.TextColumn(f"{{task.description:{width}}}", markup=False),
+        progress.BarColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
     )
 
 

@@ -19,27 +19,8 @@ from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import (
-    AsJson,
-    BackendName,
-    Export,
-    File,
-    Force,
-    Heartbeat,
-    Options,
-    Out,
-    Quiet,
-    Seed,
-    Standing,
-    check_backend,
-    explained,
-    print_place,
-    print_verdict,
-    print_whole,
-    progress_columns,
-    result_table,
-)
-from twin.run.ending_signals import exit_on_terminate
+from twin.run import cli
+from twin.run.durable import exit_on_terminate
 from twin.run.procedure import Advance, Session, performed
 from twin.run.provenance import program_digest
 from twin.run.reference_frames import described
@@ -70,7 +51,7 @@ Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str, options: Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -84,20 +65,20 @@ def run_command(
         typer.Exit: with the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(options.backend)
+    with cli.explained(errors):
+        cli.check_backend(options.backend)
         given = resolve()
         folder = RunFolder(chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
         program_digest()  # of the files that compute, which may be others when the run ends
-        silent, standing = options.as_json or options.quiet, Standing()
+        silent, standing = options.as_json or options.quiet, cli.Standing()
         hidden = silent or not errors.is_terminal
         with (
             exit_on_terminate(),
             folder,
-            Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-            Heartbeat(errors, standing.__str__, silent),
+            Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+            cli.Heartbeat(errors, standing.__str__, silent),
         ):
             result = work(given, Session(folder, tracer, _advance(bar, standing), started, clock))
     with to_stdout(errors, f"the run is complete in {folder.target}"):
@@ -106,7 +87,7 @@ def run_command(
         elif not options.quiet:
             console = Terminal()
             result.show(console)
-            print_place(console, folder.target)
+            cli.print_place(console, folder.target)
     if result.problem:
         print_error(errors, f"{result.problem}; all else is in {folder.target}")
         raise typer.Exit(FAILURE)
@@ -114,7 +95,7 @@ def run_command(
         raise typer.Exit(result.code)
 
 
-def _advance(bar: Progress, standing: Standing) -> Advance:
+def _advance(bar: Progress, standing: cli.Standing) -> Advance:
     """Shows every part of the work as a line, from its beginning on."""
     parts: dict[str, TaskID] = {}
 
@@ -146,16 +127,16 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
     """
 
     def test(
-        file: File,
-        out: Out = None,
-        seed: Seed = None,
-        export_to: Export = None,
-        backend: BackendName = "llvm",
-        force: Force = False,
-        as_json: AsJson = False,
-        quiet: Quiet = False,
+        file: cli.File,
+        out: cli.Out = None,
+        seed: cli.Seed = None,
+        export_to: cli.Export = None,
+        backend: cli.BackendName = "llvm",
+        force: cli.Force = False,
+        as_json: cli.AsJson = False,
+        quiet: cli.Quiet = False,
     ) -> None:
-        run_test(program, command, procedure, file, Options(out, seed, backend, force, as_json, quiet, export_to))
+        run_test(program, command, procedure, file, cli.Options(out, seed, backend, force, as_json, quiet, export_to))
 
     if procedure.export is None:
         # Typer makes the options from the signature
@@ -165,7 +146,7 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
     app.command(command, help=procedure.about)(test)
 
 
-def run_test(program: str, command: str, procedure: Procedure, file: Path, options: Options) -> None:
+def run_test(program: str, command: str, procedure: Procedure, file: Path, options: cli.Options) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
     Args:
@@ -232,15 +213,15 @@ def print_report(report: Report, console: Console) -> None:
     """The verdict, the main table of a report, and what else was found."""
     from twin.run.artefact import cell_text
 
-    print_verdict(console, report.verdict)
+    cli.print_verdict(console, report.verdict)
     summary = report.summary
-    table = result_table(report.title)
+    table = cli.result_table(report.title)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(escape(head), justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
         table.add_row(*(escape(cell_text(cell)) for cell in row))  # [m] is a unit
-    print_whole(console, table)
+    cli.print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     print_warnings(console, report.warnings)

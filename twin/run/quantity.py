@@ -18,7 +18,7 @@ from analysis.units import ARCMIN, ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from twin.run.artefact import Cell, Table, shown_unit
-from twin.run.data_table import DataColumn, DataTable
+from twin.run.data_files import DataColumn, DataTable
 from twin.run.plain_data import plain_data
 
 S = TypeVar("S")

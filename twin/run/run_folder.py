@@ -15,15 +15,21 @@ from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from twin.run.durable import make_folders, put_in_place, sync_folder, sync_tree
-from twin.run.ending_signals import ending_later
+from twin.run.durable import ending_later, make_folders, put_in_place, sync_folder, sync_tree
 from twin.run.owned_files import MANIFEST as MANIFEST
-from twin.run.owned_files import digest, every_file, foreign_files, remove_files
+from twin.run.owned_files import (
+    OLD,
+    PARTIAL,
+    Unfinished,
+    digest,
+    every_file,
+    first_names,
+    foreign_files,
+    remove_files,
+    successor,
+    sweep,
+)
 from twin.run.provenance import Checksum, Provenance, versions
-from twin.run.unfinished import OLD, PARTIAL, Unfinished, successor, sweep
-
-NAMED = 5
-"""Files that a message names at most."""
 
 
 class RunFolderError(Exception):
@@ -393,8 +399,7 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
         return
     manifest = read_manifest(folder)
     changed = set(manifest.sha256 if manifest is not None else ())
-    shown = [f"{name} (changed since)" if name in changed else name for name in others[:NAMED]]
-    named = ", ".join(shown) + (f" and {len(others) - NAMED} more" if len(others) > NAMED else "")
+    named = first_names([f"{name} (changed since)" if name in changed else name for name in others])
     raise RunFolderError(
         f"output folder {folder} also holds what the run did not write: {named}; --force removes only the run's own "
         "files, so move these away or choose another folder with --out"

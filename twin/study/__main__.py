@@ -16,19 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import (
-    AsJson,
-    BackendName,
-    Force,
-    Heartbeat,
-    Standing,
-    explained,
-    print_place,
-    print_verdict,
-    print_whole,
-    result_table,
-    time_text,
-)
+from twin.run import cli
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
@@ -57,14 +45,14 @@ def main(
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
-    force: Force = False,
+    force: cli.Force = False,
     gradient: Annotated[
         bool,
         typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Run more runs than the study's limit.")] = False,
-    backend: BackendName = "llvm",
-    as_json: AsJson = False,
+    backend: cli.BackendName = "llvm",
+    as_json: cli.AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
@@ -93,11 +81,11 @@ def main(
     place: list[StudyFolder] = []
     if gradient:
         # drawing libraries are not needed before
-        from twin.study.gradient_command import run_gradient
+        from twin.study.gradient.gradient_report import run_gradient
 
         run_gradient(file, options, as_json, quiet)
         return
-    with explained(errors):
+    with cli.explained(errors):
         display = _Display(errors, quiet or as_json)
         try:
             with display:
@@ -128,7 +116,7 @@ def main(
         raise typer.Exit(FAILURE)
     if run.fault is not None:
         # everything is written: only what the file says of a response is wrong
-        with explained(errors):
+        with cli.explained(errors):
             raise run.fault
 
 
@@ -157,8 +145,8 @@ class _Display:
         )
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
-        self._standing = Standing("start the workers and a pilot")
-        self._heartbeat = Heartbeat(console, lambda: str(self._standing), silent)
+        self._standing = cli.Standing("start the workers and a pilot")
+        self._heartbeat = cli.Heartbeat(console, lambda: str(self._standing), silent)
 
     def __enter__(self) -> _Display:
         self.bar.start()
@@ -184,7 +172,7 @@ class _Display:
         there = f" ({estimate.there} are there already)" if estimate.there else ""
         self._say(
             f"{estimate.runs} runs{there} in {estimate.blocks} blocks and {estimate.chunks} chunks on "
-            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {time_text(estimate.seconds)}, "
+            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {cli.time_text(estimate.seconds)}, "
             f"{1e-9 * estimate.memory:.1f} GB; {1e3 * estimate.state_seconds:.3g} ms a run"
         )
 
@@ -206,15 +194,15 @@ def _print_result(run: StudyRun) -> None:
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
-    table = result_table(title)
+    table = cli.result_table(title)
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():
         table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
     console = Terminal()
-    print_verdict(console, run.verdict)
-    print_whole(console, table)
-    print_place(console, run.folder)
+    cli.print_verdict(console, run.verdict)
+    cli.print_whole(console, table)
+    cli.print_place(console, run.folder)
 
 
 if __name__ == "__main__":

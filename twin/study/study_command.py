@@ -16,9 +16,9 @@ from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.errors import InputError
 from twin.run.cli import InputErrorText, check_backend
-from twin.run.ending_signals import ending_signals
+from twin.run.durable import ending_signals
 from twin.run.provenance import inputs_in, program_digest
-from twin.run.run_folder import RunFolderError, chosen, write_manifest
+from twin.run.run_folder import chosen, write_manifest
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
 from twin.study.runs.engine import Engine, Progress, fit_workers
@@ -153,9 +153,9 @@ def run_study(
             else:
                 progress.done(store.runs, plan.runs)
             # drawing libraries and the like are not needed before
-            from twin.study.report.stated_noise import impossible
             from twin.study.report.study_report import write_report
             from twin.study.report.study_runs import StudyRuns
+            from twin.study.report.study_statistics import impossible
             from twin.study.study_files import write_data
 
             result = store.result()
@@ -238,6 +238,3 @@ def broken_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
     if got:
         raise Broken(got[0])
-
-
-__all__ = ["Broken", "RunFolderError", "StudyOptions", "StudyRun", "run_study"]

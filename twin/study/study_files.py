@@ -11,11 +11,9 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import NOISE
-from twin.run.data_files import csv_table, netcdf
-from twin.run.data_table import TABLE_FORMATS, DataColumn, DataTable, MissingPackage
+from twin.run.data_files import TABLE_FORMATS, DataColumn, DataTable, MissingPackage, csv_table, netcdf
 from twin.run.reference_frames import described, frames_text
-from twin.study.runs.base_job import one_line
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import StudyFolder
 

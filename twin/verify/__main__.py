@@ -15,11 +15,11 @@ from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run.cli import AsJson, InputErrorText, Quiet, explained, print_verdict
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 
 if TYPE_CHECKING:  # what computes is imported when it is needed
     from twin.verify.folder_state import FolderState
-    from twin.verify.repetition import Repetition
+    from twin.verify.verification import Repetition
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -67,8 +67,7 @@ def main(
     silent = as_json or quiet
     with explained(errors), exit_on_terminate():
         from twin.verify.folder_state import folder_state
-        from twin.verify.repetition import CannotRepeat, obstacle, repeat_chunk
-        from twin.verify.verification import Verification, expected_time
+        from twin.verify.verification import CannotRepeat, Verification, expected_time, obstacle, repeat_chunk
 
         if files and (every or keep is not None):
             raise InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
@@ -101,8 +100,8 @@ def main(
 
 
 def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
-    from twin.run.unfinished import scratch
-    from twin.verify.repetition import repeat
+    from twin.run.owned_files import scratch
+    from twin.verify.verification import repeat
 
     if keep is not None:
         return repeat(state, keep, silent)

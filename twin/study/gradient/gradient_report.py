@@ -1,27 +1,38 @@
-"""The Jacobian of a study as figures, tables and a report."""
+"""``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from rich.console import Console
 
+from scenes.kinds.file_kinds import read_for
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.yaml.errors import key_text
 from twin.run.artefact import Cell, SvgFigure, Table, plain, significant
+from twin.run.cli import InputErrorText, Options, print_verdict, print_whole, result_table
+from twin.run.command import Result, print_warnings, run_command
 from twin.run.page import links, report_page, write_artefacts
+from twin.run.procedure import WRITE, Session
+from twin.run.provenance import inputs_in
+from twin.run.reference_frames import described
 from twin.run.report import Report, Section, one_sentence
-from twin.run.run_folder import RunFolder
+from twin.run.run_folder import RunFolder, write_manifest
 from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
-from twin.study.gradient.gradient_numbers import doubtful, unit_text
-from twin.study.gradient.study_gradient import AD, Gradient
+from twin.sensors.grey_steps import coarse_warnings
+from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
 from twin.study.report.study_plots import finish
 from twin.study.report.study_runs import typeset
-from twin.study.runs.setup import StudySetup
+from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM
+from twin.study.study_command import StudyOptions
 
 DOUBTFUL_TEXT = (
     "Differences that are not good to 1% of the response's largest change (their step crosses a bend, or the job "
@@ -239,3 +250,137 @@ def _bars(axes: Axes, found: Gradient, i: int, order: np.ndarray) -> None:
     axes.set_ylim(-0.7, max(len(order), 2) - 0.3)
     finish(axes, 5, None)
     axes.grid(False, axis="y")
+
+
+DOUBTFUL = 0.01
+"""Differences that Richardson's extrapolation moved by more than this share of a response's largest change are told."""
+
+
+def unit_text(response: str, factor: str) -> str:
+    """Unit of a derivative."""
+    if not factor:
+        return response or "1"
+    return f"{response or '1'}/{factor}" if "/" not in factor else f"{response or '1'}/({factor})"
+
+
+def gradient_numbers(found: Gradient) -> dict[str, Any]:
+    """Contents of gradient.json; rows are responses, columns factors."""
+    units = [[unit_text(unit, factor.unit) for factor in found.factors] for unit in found.units]
+    return {
+        "responses": list(found.responses),
+        "factors": [factor.name for factor in found.factors],
+        "response_units": list(found.units),
+        "factor_units": [factor.unit for factor in found.factors],
+        "base": [factor.value for factor in found.factors],
+        "spread": [factor.spread for factor in found.factors],
+        "spread_of": [factor.spread_of for factor in found.factors],
+        "units": units,
+        "ad": _rows(found.ad),
+        "differences": _rows(found.differences),
+        "difference_error": _rows(found.error),
+        "step": _rows(found.step),
+        "relative": _rows(found.relative),
+        "worst_relative": found.worst,
+        "change": _rows(found.change),
+        "method": found.method.tolist(),
+    }
+
+
+def _rows(table: np.ndarray) -> list[list[float | None]]:
+    return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in table]
+
+
+HEADS = (
+    "response",
+    "factor",
+    "unit",
+    "method",
+    "AD",
+    "differences",
+    "relative deviation",
+    "extrapolated by",
+    "step",
+    "change per spread",
+)
+
+
+def whole_table(found: Gradient) -> Table:
+    """Every entry of the Jacobian, a row each."""
+    rows: list[list[Cell]] = []
+    numbers = (found.ad, found.differences, found.relative, found.error, found.step, found.change)
+    for i, response in enumerate(found.responses):
+        for k, factor in enumerate(found.factors):
+            cells = [None if np.isnan(table[i, k]) else float(table[i, k]) + 0.0 for table in numbers]
+            unit = unit_text(found.units[i], factor.unit)
+            rows.append([response, factor.name, unit, str(found.method[i, k]), *cells])
+    return Table("gradient", "Jacobian", "All entries.", HEADS, rows)
+
+
+def doubtful(found: Gradient) -> list[str]:
+    """Responses some of whose differences are not to be trusted to 1%: noise, or a step over a kink or a bend."""
+    spread = np.array([factor.spread for factor in found.factors])
+    largest = np.max(np.abs(found.change), axis=1, initial=0.0, keepdims=True)
+    bad = (found.method != AD) & (found.error * spread > DOUBTFUL * largest)
+    return [
+        f"{found.responses[i]}: by {', '.join(found.factors[k].name for k in np.flatnonzero(bad[i]))}"
+        for i in np.flatnonzero(bad.any(axis=1))
+    ]
+
+
+def run_gradient(file: Path, options: StudyOptions, as_json: bool, quiet: bool) -> None:
+    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, print what they say.
+
+    Args:
+        file: of the study, or a config.yaml.
+        options: what the user chose.
+        as_json: print the numbers as JSON.
+        quiet: print nothing.
+
+    Raises:
+        typer.Exit: with the exit code of a failure, which has been told.
+    """
+
+    def resolve() -> StudySetup:
+        for given, name in (
+            (options.workers is not None, "--workers"),
+            (options.scheduler is not None, "--scheduler"),
+            (options.resume, "--resume"),
+            (options.confirmed, "--yes"),
+        ):
+            if given:
+                raise InputErrorText(f"--gradient differentiates at the base in this process, so {name} has no meaning")
+        return read_for(PROGRAM, file, resolve_study)
+
+    shared = Options(options.out, None, options.backend, options.force, as_json, quiet)
+    run_command(f"{file.stem}-gradient", shared, resolve, _work)
+
+
+def _work(setup: StudySetup, session: Session) -> Result:
+    found = study_gradient(setup, session.backend, session.advance)
+    session.advance(WRITE, 0, 1)
+    folder = session.folder
+    numbers = described("gradient", {**gradient_numbers(found), "verdict": verdict(found)})
+    folder.write_text("config.yaml", setup.to_yaml())
+    folder.write_json("gradient.json", numbers)
+    folder.write_bytes("gradient.csv", whole_table(found).content())
+    base = base_of(setup)
+    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base))
+    write_report(setup, found, folder, warnings)
+    entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    entries["again"] = [PROGRAM, "config.yaml", "--gradient", "--backend", session.backend.name]
+    entries["inputs"] = inputs_in(setup.tree)
+    write_manifest(folder, PROGRAM, session.started, session.seconds, warnings=list(warnings), **entries)
+    return Result(numbers, lambda console: _print_result(found, warnings, console))
+
+
+def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
+    print_verdict(console, verdict(found))
+    table = result_table(f"{len(found.responses)} responses by {len(found.factors)} factors")
+    picked = [0, 1, 2, 3, 4, 5, 8]
+    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
+    for head, k in zip(heads, picked, strict=True):
+        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
+    for row in response_table(found).rows:
+        table.add_row(*(str(row[k]) for k in picked))
+    print_whole(console, table)
+    print_warnings(console, warnings)

@@ -13,9 +13,8 @@ import numpy as np
 from scipy import stats
 from scipy.special import roots_legendre
 
-from twin.study.report.stated_noise import noise_share
 from twin.study.report.study_runs import Factor, Response, StudyRuns
-from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate
+from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate, noise_share
 
 MOST_LEVELS = 20
 """Texts with more values are not taken apart."""

@@ -12,22 +12,10 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
+from twin.study.report import study_statistics as statistics
 from twin.study.report.linear_model import LinearModel, MainEffect, linear_model, main_effects
 from twin.study.report.sensitivity_indices import Indices, NoIndices, sensitivity_indices
-from twin.study.report.stated_noise import NoiseShare, noise_share
 from twin.study.report.study_runs import Factor, Response, StudyRuns
-from twin.study.report.study_statistics import (
-    CONFIDENCE,
-    Description,
-    Estimate,
-    Interval,
-    describe,
-    mean_interval,
-    quantile_interval,
-    runs_for_quantile,
-    share_interval,
-    std_interval,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +112,7 @@ class Requirement:
     count: int
     runs: int
     interval: tuple[float, float] | None
-    judged: Description | None
+    judged: statistics.Description | None
     unit: str
 
     @property
@@ -151,7 +139,7 @@ class Requirement:
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        return share_interval(self.met, self.runs)[0], share_interval(self.most, self.runs)[1]
+        return statistics.share_interval(self.met, self.runs)[0], statistics.share_interval(self.most, self.runs)[1]
 
 
 def is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
@@ -178,7 +166,9 @@ def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
         judged &= response.good
         values = np.abs(response.values) if spec.magnitude else response.values
         out.append(
-            _counted(runs, name, _text(spec), good, response.good, describe(values, runs.sampled), response.unit)
+            _counted(
+                runs, name, _text(spec), good, response.good, statistics.describe(values, runs.sampled), response.unit
+            )
         )
     if len(out) > 1:
         out.append(_counted(runs, "", "all of them", everything, judged, None, ""))
@@ -186,10 +176,16 @@ def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
 
 
 def _counted(
-    runs: StudyRuns, name: str, text: str, good: np.ndarray, known: np.ndarray, judged: Description | None, unit: str
+    runs: StudyRuns,
+    name: str,
+    text: str,
+    good: np.ndarray,
+    known: np.ndarray,
+    judged: statistics.Description | None,
+    unit: str,
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = share_interval(met, count) if runs.sampled and count else None
+    interval = statistics.share_interval(met, count) if runs.sampled and count else None
     return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
@@ -238,18 +234,20 @@ def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
         return ()
     counts = np.unique(np.rint(np.geomspace(10, n, POINTS)).astype(int))
     sigma = float(np.std(values, ddof=1))
-    rows: dict[str, list[tuple[float, Interval]]] = {name: [] for name in GOALS}
+    rows: dict[str, list[tuple[float, statistics.Interval]]] = {name: [] for name in GOALS}
     for count in counts:
         part = values[:count]
         ordered = np.sort(part)
-        rows["mean"].append((float(np.mean(part)), mean_interval(part)))
-        rows["sigma"].append((float(np.std(part, ddof=1)), std_interval(part)))
+        rows["mean"].append((float(np.mean(part)), statistics.mean_interval(part)))
+        rows["sigma"].append((float(np.std(part, ddof=1)), statistics.std_interval(part)))
         for name, q in QUANTILES.items():
-            rows[name].append((float(np.quantile(ordered, q)), quantile_interval(ordered, q)))
+            rows[name].append((float(np.quantile(ordered, q)), statistics.quantile_interval(ordered, q)))
     return tuple(_convergence(name, counts, row, sigma) for name, row in rows.items())
 
 
-def _convergence(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], sigma: float) -> Convergence:
+def _convergence(
+    name: str, counts: np.ndarray, row: list[tuple[float, statistics.Interval]], sigma: float
+) -> Convergence:
     low = np.array([math.nan if ends[0] is None else ends[0] for _, ends in row])
     high = np.array([math.nan if ends[1] is None else ends[1] for _, ends in row])
     half = 0.5 * (high[-1] - low[-1]) / sigma
@@ -258,7 +256,7 @@ def _convergence(name: str, counts: np.ndarray, row: list[tuple[float, Interval]
     enough = relative is not None and relative <= goal
     needed = n if enough else None if relative is None else math.ceil(n * (relative / goal) ** 2)
     if relative is None and name in QUANTILES:
-        needed = runs_for_quantile(QUANTILES[name])
+        needed = statistics.runs_for_quantile(QUANTILES[name])
     return Convergence(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
 
 
@@ -280,10 +278,10 @@ class StudyAnalysis:
     """
 
     runs: StudyRuns
-    descriptions: Mapping[str, Description]
+    descriptions: Mapping[str, statistics.Description]
     linear: Mapping[str, LinearModel | None]
     effects: Mapping[str, tuple[MainEffect, ...]]
-    noise: Mapping[str, NoiseShare]
+    noise: Mapping[str, statistics.NoiseShare]
     indices: Mapping[str, Indices | NoIndices]
     convergences: Mapping[str, tuple[Convergence, ...]]
     requirements: tuple[Requirement, ...]
@@ -305,10 +303,14 @@ class StudyAnalysis:
                 fronts.append(pareto_front(spec, x.values, y.values))
         return cls(
             runs=runs,
-            descriptions={r.name: describe(r.values, runs.sampled) for r in everything},
+            descriptions={r.name: statistics.describe(r.values, runs.sampled) for r in everything},
             linear={r.name: linear_model(runs.factors, r) for r in everything},
             effects={r.name: () if runs.sampled else main_effects(runs.factors, r) for r in everything},
-            noise={share.response: share for r in runs.responses if (share := noise_share(r, runs.study)) is not None},
+            noise={
+                share.response: share
+                for r in runs.responses
+                if (share := statistics.noise_share(r, runs.study)) is not None
+            },
             indices={r.name: sensitivity_indices(runs, r) for r in indexed},
             convergences={
                 r.name: convergences(r.known) if runs.sampled and not r.constant else () for r in runs.responses
@@ -340,7 +342,7 @@ class StudyAnalysis:
         return dict(sorted(out.items(), key=lambda item: -item[1]))
 
 
-def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
+def _swing_in_sigmas(effect: Any, std: statistics.Estimate | None) -> float:
     return float(effect.swing.value) / (2.0 * std.value) if std is not None and std.value > 0.0 else 0.0
 
 
@@ -357,7 +359,7 @@ def plain_data(found: StudyAnalysis) -> dict[str, Any]:
         "design": runs.kind,
         "runs": runs.count,
         "failed": int(runs.failed.sum()),
-        "confidence": CONFIDENCE,
+        "confidence": statistics.CONFIDENCE,
         "responses": {
             r.name: {
                 "unit": r.unit,
@@ -405,13 +407,13 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _estimate(value: Estimate | None) -> dict[str, Any] | None:
+def _estimate(value: statistics.Estimate | None) -> dict[str, Any] | None:
     if value is None:
         return None
     return {"value": _number(value.value), "interval": [_number(end) for end in value.interval]}
 
 
-def _description(d: Description) -> dict[str, Any]:
+def _description(d: statistics.Description) -> dict[str, Any]:
     return {
         "count": d.count,
         **{name: _estimate(getattr(d, name)) for name in ("mean", "std", "median", "p95", "p997")},
@@ -425,7 +427,7 @@ def _description(d: Description) -> dict[str, Any]:
     }
 
 
-def _noise(found: NoiseShare | None) -> dict[str, Any]:
+def _noise(found: statistics.NoiseShare | None) -> dict[str, Any]:
     return {} if found is None else {"noise_share": found.share, "noise_share_possible": found.possible}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from twin.run.durable import PARTIAL, make_folders, sync_folder, write_safely
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan
 
 FOLDER, INDEX = "chunks", "index.txt"

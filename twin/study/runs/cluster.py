@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from twin.run.cli import InputErrorText
-from twin.run.ending_signals import ending_later
+from twin.run.durable import ending_later
+from twin.run.owned_files import scratch
 from twin.run.provenance import source_digest, versions
-from twin.run.unfinished import scratch
 from twin.study.runs.task import ONE_THREAD
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started

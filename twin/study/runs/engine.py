@@ -10,12 +10,10 @@ from typing import Any
 
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import KeyPath, Problem, key_text
-from twin.run.cli import InputErrorText
 from twin.run.provenance import source_digest
-from twin.study.runs.block_result import check_response
+from twin.study.runs.base_job import check_response, leaf
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import ClusterError, Workers, killed
-from twin.study.runs.config_tree import leaf
+from twin.study.runs.cluster import Workers, killed
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 from twin.study.runs.task import OtherProgramError, Pilot, Task, evaluate, pilot
@@ -292,6 +290,3 @@ def _fault(future: Any) -> Exception:
         return IncompleteError(text)
     trace = "".join(traceback.format_exception(type(error), error, future.traceback()))
     return ProgramFault(f"the program failed: {text}", trace)
-
-
-__all__ = ["ClusterError", "Engine", "Estimate", "IncompleteError", "InputErrorText", "ProgramFault", "Progress"]

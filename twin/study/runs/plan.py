@@ -15,8 +15,7 @@ from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
-from twin.study.runs.base_job import Run
-from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.base_job import Run, leaf, with_values
 from twin.study.runs.sampling import Scaling, draw, extremes, number_of, ratios, run_count, scaled
 from twin.study.runs.setup import StudySetup
 

@@ -12,7 +12,7 @@ from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 from scenes.specs.study import GRID, FactorSpec, StudySpec, unit_cube
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
-from twin.study.runs.config_tree import Tree, leaf
+from twin.study.runs.base_job import Tree, leaf
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:

@@ -14,8 +14,7 @@ from optics.numerics.backend import Backend, load_backend
 from optics.numerics.threads import LIMIT, kernel_threads
 from scenes.yaml.errors import InputError
 from twin.run.provenance import source_digest
-from twin.study.runs.base_job import Failure, Run
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult, Failure, Run
 from twin.study.runs.setup import StudySetup, study_from_text
 
 ONE_THREAD = {
