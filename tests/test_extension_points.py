@@ -445,9 +445,7 @@ def write_toy(folder: Path) -> Report:
     frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
     result = Report("A test", "It is one.", (), (), summary, (Section("Own section"),), {"edge": frames})
     with RunFolder(folder, False) as made:
-        write_test(
-            "focus", {"x": 21}, result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made
-        )
+        write_test("focus", {"x": 21}, result, RunFacts("", "twin.lab", 0.0, 0.0, "llvm", 1, "focus"), made)
     return result
 
 

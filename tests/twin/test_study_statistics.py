@@ -14,8 +14,9 @@ from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report.linear_model import linear_model
 from twin.study.report.sensitivity_indices import axis_functions, sensitivity_indices
 from twin.study.report.study_analysis import convergences, pareto_front, ranks_of, summary
-from twin.study.report.study_runs import Factor, StudyRuns
 from twin.study.report.study_statistics import (
+    Factor,
+    StudyRuns,
     describe,
     impossible,
     noise_share,

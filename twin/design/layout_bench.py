@@ -82,7 +82,7 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Of the faces of its prisms, (F, 4) each."""
+        """Planes of the faces of each of its prisms, (F, 4) each."""
         return [ConvexHull(corners).equations for corners in self.bodies]
 
 
@@ -135,12 +135,12 @@ class LayoutBench:
 
     @cached_property
     def imaging(self) -> monitor_layout.ImagingBeams:
-        """Of the cameras, which all layouts have."""
+        """Imaging beams of the cameras, which all layouts have."""
         return monitor_layout.ImagingBeams.of(self.start, self.backend)
 
     @property
     def imaging_shape(self) -> tuple[int, int, int]:
-        """Of the bits that ``BeamFacts.taken`` packs."""
+        """Shape of the bits that ``BeamFacts.taken`` packs."""
         return len(self.setup.instrument.cameras), 3, monitor_layout.RAYS
 
     @cached_property
@@ -149,7 +149,7 @@ class LayoutBench:
         return quantity_rows(self.start, ground_of(self.start))
 
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
-        """Of the area CCD that a beam names."""
+        """Detector of the area CCD that a beam names."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.monitor.area_ccd.exposure)
 
@@ -175,7 +175,7 @@ class LayoutBench:
             self._check_limits(monitor_layout.pupil_share(taken), mass)
             information = self.information(instrument, beam, alike=True)
             self._check_spots(information, instrument)
-        except (InputError, AimError, BeamMissedError, OutsideLimitsError, ValueError) as error:
+        except (InputError, AimError, BeamMissedError, _OutsideLimitsError, ValueError) as error:
             return BeamFacts(beam, refused=_reason(error))
         bodies = convex_bodies(instrument)
         return BeamFacts(
@@ -195,7 +195,7 @@ class LayoutBench:
                 monitor_layout.layout_spec(self.setup, beams), self.setup.cameras, self.backend
             )
             return self.judged(beams, instrument)
-        except (InputError, AimError, BeamMissedError, OutsideLimitsError, ValueError) as error:
+        except (InputError, AimError, BeamMissedError, _OutsideLimitsError, ValueError) as error:
             return LayoutFacts(beams, refused=_reason(error))
 
     def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
@@ -208,7 +208,7 @@ class LayoutBench:
 
         Raises:
             BeamMissedError, AimError: light does not come to its area CCDs.
-            OutsideLimitsError: it does not keep a limit.
+            _OutsideLimitsError: it does not keep a limit.
         """
         share, mass = monitor_layout.pupil_share(self.imaging.taken(instrument)), monitor_layout.prism_mass(instrument)
         if limited:
@@ -256,22 +256,22 @@ class LayoutBench:
     def _check_limits(self, share: float, mass: float) -> None:
         limits = self.setup.test.limits
         if limits.pupil_share is not None and share > limits.pupil_share:
-            raise OutsideLimitsError(f"its prisms take {100.0 * share:.3g} percent of the imaging pupil")
+            raise _OutsideLimitsError(f"its prisms take {100.0 * share:.3g} percent of the imaging pupil")
         if limits.mass is not None and mass > limits.mass:
-            raise OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
+            raise _OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
 
     def _check_spots(self, information: Mapping[str, Information], instrument: Instrument) -> None:
         ccd = instrument.spec.monitor.area_ccd
         room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
         reach = self.setup.test.limits.spot_sigmas * max(float(one.spot_sigma.max()) for one in information.values())
         if reach > room:
-            raise OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
+            raise _OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
         fullest = max(float(one.brightest.max()) for one in information.values())
         if fullest > FULLEST:
-            raise OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
+            raise _OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
 
 
-class OutsideLimitsError(Exception):
+class _OutsideLimitsError(Exception):
     """A layout does not keep a limit of its design."""
 
 
@@ -292,11 +292,7 @@ def _seen(information: Information) -> Seen:
     own = np.array([is_own(body) for body in stated.bodies])
     root = stated.root[np.ix_(~own, ~own)]
     mine = stated.spots[:, own] @ stated.root[np.ix_(own, own)]
-    return Seen(
-        stated.spots[:, ~own] @ root,
-        mine @ mine.T + information.noise,
-        stated.parameters[:, ~own] @ root,
-    )
+    return Seen(stated.spots[:, ~own] @ root, mine @ mine.T + information.noise, stated.parameters[:, ~own] @ root)
 
 
 def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
@@ -324,6 +320,10 @@ def _facets(instrument: Instrument) -> np.ndarray:
 def touching(one: BeamFacts, other: BeamFacts) -> bool:
     """Whether two beams cannot stand together: prisms stand in each other or in the other's light, or one's facet
     reaches over the edge of the other's.
+
+    Args:
+        one: a beam that was tried alone.
+        other: another one.
     """
     # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
     away = one.facets - other.facets

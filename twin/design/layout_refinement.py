@@ -39,7 +39,7 @@ from twin.monitor.information import Information
 FIRST_BOX = 0.1
 """Half of its side at first, relative to the range of each number."""
 LEAST_BOX = 2e-3
-"""The same below which nothing more is sought."""
+"""Half of the box's side below which nothing more is sought."""
 WORTH = 1e-3
 """Share of the largest ratio that a number has to be worth over its whole range to be moved for its own sake."""
 ROOM, ROOM_STEP = 8, 0.06
@@ -195,7 +195,7 @@ def _one_by_one(
 STEP = 0.01
 """Step of a number, relative to the range in which it may vary: A is smooth over all of it, and aimed to 1e-9 of it."""
 ORDER = 6
-"""Of the central differences, where nothing else is asked for."""
+"""Order of the central differences, where nothing else is asked for."""
 _WEIGHTS = {
     2: {1: 1.0 / 2.0},
     4: {1: 8.0 / 12.0, 2: -1.0 / 12.0},
@@ -271,7 +271,7 @@ def numbers_of(bench: LayoutBench, beams: Layout, order: int = ORDER) -> tuple[L
 
 @lru_cache(maxsize=2)
 def _known_here(bench: LayoutBench, beams: Layout) -> dict[str, Information]:
-    """As ``known_of``, of the layout that all its numbers are differentiated at."""
+    """Result of ``known_of``, kept for the layout at which all numbers are differentiated."""
     return known_of(bench, beams)
 
 

@@ -22,7 +22,7 @@ from twin.design.search_workers import Journal, Workers
 from twin.run.procedure import Advance
 
 FIRST_STEP = 0.15
-"""Of the first change of a beam, relative to the range of each number."""
+"""Size of the first change of a beam, relative to the range of each number."""
 _BATCHES = 4  # of layouts that are built until one stands
 KEPT = 2
 """Layouts of each number of beams whose beams the next round changes."""

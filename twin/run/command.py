@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,12 +19,8 @@ from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run import cli
-from twin.run.durable import exit_on_terminate
+from twin.run import cli, durable, provenance, reference_frames, run_folder
 from twin.run.procedure import Advance, Session, performed
-from twin.run.provenance import program_digest
-from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -45,6 +41,26 @@ class Result:
     show: Callable[[Console], None]
     problem: str = ""
     code: int = 0
+
+
+def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, Any], **facts: Any) -> Result:
+    """Write the run folder of a command that shows a report, and what it tells in the terminal.
+
+    Args:
+        session: the command at work.
+        kind: of the numbers, which stand in KIND.json.
+        report: of the run, with the exit code that it asks for.
+        numbers: of the run; the report's verdict is added to them.
+        facts: how it was run, as `twin.run.page.RunFacts` takes them, beside what the session knows.
+    """
+    from twin.run.page import RunFacts, write_test
+
+    told = {**numbers, "verdict": report.verdict}
+    known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
+    write_test(kind, told, report, RunFacts(**{**known, **facts}), session.folder)
+    return Result(
+        reference_frames.described(kind, told), lambda console: print_report(report, console), code=report.code
+    )
 
 
 Given = TypeVar("Given")
@@ -68,17 +84,17 @@ def run_command(
     with cli.explained(errors):
         cli.check_backend(options.backend)
         given = resolve()
-        folder = RunFolder(chosen(options.out, stem), options.force)
+        folder = run_folder.RunFolder(run_folder.chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
-        program_digest()  # of the files that compute, which may be others when the run ends
+        provenance.program_digest()  # of the files that compute, which may be others when the run ends
         silent, standing = options.as_json or options.quiet, cli.Standing()
         hidden = silent or not errors.is_terminal
         with (
-            exit_on_terminate(),
+            durable.exit_on_terminate(),
             folder,
             Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-            cli.Heartbeat(errors, standing.__str__, silent),
+            cli.heartbeat(errors, standing.__str__, silent),
         ):
             result = work(given, Session(folder, tracer, _advance(bar, standing), started, clock))
     with to_stdout(errors, f"the run is complete in {folder.target}"):
@@ -161,7 +177,6 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
     """
 
     def work(setup: Any, session: Session) -> Result:
-        from twin.run.page import RunFacts, write_test
         from twin.run.report import numbers_only, with_warnings
 
         # a folder that cannot be made is told before the run
@@ -173,27 +188,24 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
                 for name, content in procedure.export(run).items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
-                write_manifest(folder, program, session.started, session.seconds, **said)
+                run_folder.write_manifest(folder, program, session.started, session.seconds, **said)
         try:
             made, problem = procedure.report(run), ""
         except Exception as error:  # minutes or hours of computing are not thrown away for a figure
             problem = "the report could not be made"
             made = numbers_only(f"{program} {command}", f"{procedure.kind}.json", error)
             Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
-        shown = with_warnings(made, given)
-        numbers = {**procedure.numbers(run), "verdict": shown.verdict}
-        seeded, name = setup.with_seed(number), session.backend.name
+        seeded = setup.with_seed(number)
         drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
-        times = session.started, session.seconds
-        facts = RunFacts(seeded.to_yaml(), str(file), name, drawn, *times, program, command, named=seeded.plain())
-        write_test(procedure.kind, numbers, shown, facts, session.folder)
-        told = described(procedure.kind, numbers)
-        return Result(told, lambda console: print_report(shown, console), problem, shown.code)
+        facts = {"config": seeded.to_yaml(), "named": seeded.plain(), "seed": drawn, "command": command}
+        shown, numbers = with_warnings(made, given), procedure.numbers(run)
+        done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
+        return replace(done, problem=problem)
 
     run_command(file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work)
 
 
-def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
+def _export_folder(setup: Any, target: Path, force: bool) -> run_folder.RunFolder:
     """The folder of ``--export``, checked before anything is computed.
 
     Raises:
@@ -204,9 +216,9 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
         text = "measurements are files already; --export writes those of a simulated bench"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
     try:
-        return RunFolder(target, force)
-    except RunFolderError as error:
-        raise RunFolderError(str(error).replace("--out", "--export")) from None
+        return run_folder.RunFolder(target, force)
+    except run_folder.RunFolderError as error:
+        raise run_folder.RunFolderError(str(error).replace("--out", "--export")) from None
 
 
 def print_report(report: Report, console: Console) -> None:

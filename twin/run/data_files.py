@@ -122,7 +122,7 @@ class Placed(Protocol):
     """What says where on the ground the pixels of an image lie."""
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """As tifffile takes tags: code, type, count, value, only once in the file."""
+        """Tags as tifffile takes them: code, type, count, value, only once in the file."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +193,10 @@ def tiff(frames: np.ndarray, facts: FrameFacts) -> bytes:
 
     ImageDescription holds all as JSON; XResolution and YResolution are pixels per centimetre; Model is the camera,
     ExposureTime in seconds as in Exif. Row 0 is the first of the CCD.
+
+    Args:
+        frames: uint16 or float (N, H, W).
+        facts: what is known of them.
     """
     # made in memory: on a full disk NumPy's writer does not say why it failed
     stream = io.BytesIO()
@@ -300,7 +304,7 @@ class DataColumn:
 
     @classmethod
     def of(cls, name: str, values: Sequence[Any], unit: str, description: str) -> DataColumn:
-        """Of plain values: numbers, whole where all are, or texts; None where there is none."""
+        """Make a column of plain values: numbers, whole where all are, or texts; None where there is none."""
         there = [value for value in values if value is not None]
         whole = bool(there) and all(isinstance(value, bool | int) for value in there)
         if whole and len(there) == len(values) and all(-(2**63) <= value < 2**63 for value in there):
@@ -315,7 +319,7 @@ class DataColumn:
 
     @property
     def plain(self) -> list[Any]:
-        """Its values, None for none."""
+        """The values as plain data, None where there is none."""
         values = self.values.tolist()
         return [None if isinstance(value, float) and math.isnan(value) else value for value in values]
 

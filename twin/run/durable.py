@@ -28,7 +28,7 @@ _NOT_FOR_FOLDERS = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF)
 """What file systems that know no fsync of a folder answer, those of a network for instance."""
 
 
-def sync_file(place: Path) -> None:
+def _sync_file(place: Path) -> None:
     """Write a file's content through to the disk. Raises OSError."""
     file = os.open(place, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
@@ -56,7 +56,7 @@ def sync_tree(place: Path) -> None:
         folders.append(Path(folder))
         files += [path for path in (Path(folder) / name for name in names) if not path.is_symlink()]
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        for _ in pool.map(sync_file, files):
+        for _ in pool.map(_sync_file, files):
             pass
         for _ in pool.map(sync_folder, folders[1:]):
             pass
@@ -86,6 +86,10 @@ def write_safely(place: Path, content: bytes) -> None:
 
     Until then it is a hidden file beside its place that ends in ``PARTIAL``.
 
+    Args:
+        place: of the file; its folder is there.
+        content: of the file.
+
     Raises:
         OSError: the disk is full, or gone.
     """
@@ -93,7 +97,7 @@ def write_safely(place: Path, content: bytes) -> None:
 
 
 def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
-    """As ``write_safely``, for several files with their contents, whose folders are there.
+    """Write several files with their contents as ``write_safely`` does; their folders are there.
 
     Raises:
         OSError: the disk is full, or gone; some may be there.

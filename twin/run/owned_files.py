@@ -51,7 +51,12 @@ _LAST = (MANIFEST, STUDY_STATE, WRITTEN)
 
 
 def first_names(names: Sequence[str], most: int = NAMED) -> str:
-    """A list of names for a message: the first of them, and how many more there are."""
+    """A list of names for a message: the first of them, and how many more there are.
+
+    Args:
+        names: all of them.
+        most: how many are named.
+    """
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
@@ -144,7 +149,12 @@ def manifest_digest(folder: Path) -> str:
 
 
 def succeeds(new: Path, old: Path) -> bool:
-    """Whether a study's folder is to take, or has just taken, the place of that other one as it is. Raises OSError."""
+    """Whether a study's folder is to take, or has just taken, the place of that other one as it is. Raises OSError.
+
+    Args:
+        new: folder of the study.
+        old: the folder whose place it takes.
+    """
     place = new / SUCCEEDS
     return place.exists() and place.read_text("utf-8") == manifest_digest(old)
 

@@ -80,29 +80,23 @@ def main(
     options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
     place: list[StudyFolder] = []
     if gradient:
+        _refuse_with_gradient(errors, options)
         # drawing libraries are not needed before
         from twin.study.gradient.gradient_report import run_gradient
 
-        run_gradient(file, options, as_json, quiet)
+        run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet))
         return
     with cli.explained(errors):
         display = _Display(errors, quiet or as_json)
         try:
-            with display:
+            with display.bar, display.heartbeat:
                 run = run_study(file, options, display.progress(), place.append)
-        except Broken as broken:
-            print_error(errors, f"{broken}{_how_to_go_on(file, place)}")
-            raise typer.Exit(broken.code) from None
-        except ProgramFault as fault:
-            errors.print(fault.trace, markup=False, highlight=False, soft_wrap=True)
-            print_error(errors, f"{fault}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
-        except (IncompleteError, ClusterError) as error:
-            print_error(errors, f"{error}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
-        except OSError as error:
-            print_error(errors, f"{error.strerror or error}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
+        except (Broken, ProgramFault, IncompleteError, ClusterError, OSError) as error:
+            if isinstance(error, ProgramFault):
+                errors.print(error.trace, markup=False, highlight=False, soft_wrap=True)
+            said = (error.strerror or error) if isinstance(error, OSError) else error
+            print_error(errors, f"{said}{_how_to_go_on(file, place)}")
+            raise typer.Exit(error.code if isinstance(error, Broken) else FAILURE) from None
     with to_stdout(errors, f"the study is complete in {run.folder}"):
         if as_json:
             print_json(run.numbers)
@@ -118,6 +112,18 @@ def main(
         # everything is written: only what the file says of a response is wrong
         with cli.explained(errors):
             raise run.fault
+
+
+def _refuse_with_gradient(errors: Console, options: StudyOptions) -> None:
+    """Refuse options that mean nothing with --gradient."""
+    words = ("--workers", "--scheduler", "--resume", "--yes")
+    given = (options.workers, options.scheduler, options.resume or None, options.confirmed or None)
+    with cli.explained(errors):
+        for name, value in zip(words, given, strict=True):
+            if value is not None:
+                raise cli.InputErrorText(
+                    f"--gradient differentiates at the base in this process, so {name} has no meaning"
+                )
 
 
 def _how_to_go_on(file: Path, place: list[StudyFolder]) -> str:
@@ -146,16 +152,7 @@ class _Display:
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
         self._standing = cli.Standing("start the workers and a pilot")
-        self._heartbeat = cli.Heartbeat(console, lambda: str(self._standing), silent)
-
-    def __enter__(self) -> _Display:
-        self.bar.start()
-        self._heartbeat.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._heartbeat.__exit__()
-        self.bar.stop()
+        self.heartbeat = cli.heartbeat(console, lambda: str(self._standing), silent)
 
     def progress(self) -> EngineProgress:
         """What the engine calls."""

@@ -35,7 +35,7 @@ class Perturbed(Protocol):
         """The job that it stands for."""
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
-        """The same with these bodies perturbed; InputError where that cannot be."""
+        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Spread:
 
     @property
     def name(self) -> str:
-        """Of the factor: ``forward_M2_shift_z``."""
+        """Name of the factor: ``forward_M2_shift_z``."""
         node, *rest = (str(part) for part in self.key)
         parts = [node.removeprefix("base/").replace("/", "_"), *rest]
         if self.key[1] in ("shift", "rotate") or parts[-2:-1] == ["gradient"]:
@@ -141,7 +141,7 @@ def config_text(
 
 
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Of every camera what is read, with its sigma, and what is true: by the estimator that a run is judged by."""
+    """Readings of every camera with their sigmas, and true values, by the estimator that a run is judged by."""
     out: Tree = {}
     own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:

@@ -199,7 +199,7 @@ def _kernels(where: Provenance) -> dict[str, str]:
 
 
 def _that_round(settings: Mapping[str, str]) -> dict[str, str]:
-    """Of the environment what changes how numbers are rounded."""
+    """Variables of the environment that change how numbers are rounded."""
     return {name: value for name, value in settings.items() if not name.endswith("THREADS")}
 
 

@@ -20,16 +20,11 @@ import numpy as np
 
 from scenes.yaml.errors import InputError
 from scenes.yaml.input_file import why_unreadable
-from twin.run.cli import time_text
-from twin.run.data_files import read_netcdf
-from twin.run.provenance import BEFORE, ROOT, Provenance, source_digest, versions
-from twin.run.report import one_sentence
-from twin.run.run_folder import read_manifest
+from twin.run import cli, data_files, provenance, report, run_folder
+from twin.study.runs import setup, task
 from twin.study.runs.base_job import BlockResult
 from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
 from twin.study.runs.plan import Plan
-from twin.study.runs.setup import resolve_study
-from twin.study.runs.task import Task, evaluate
 from twin.study.study_files import make_dataset, summary
 from twin.verify import file_difference as difference
 from twin.verify.folder_state import Elsewhere, FolderState, elsewhere
@@ -75,7 +70,7 @@ class Verification:
             if names
         ]
         first = "; ".join(told) if told else f"All {count} files are as the run wrote them"
-        return one_sentence(first, *self._repeated())
+        return report.one_sentence(first, *self._repeated())
 
     def _repeated(self) -> list[str]:
         if self.obstacle:
@@ -110,7 +105,7 @@ class Verification:
         return out
 
     def numbers(self) -> dict[str, Any]:
-        """As plain data, for ``--json``."""
+        """What was found as plain data, for ``--json``."""
         state, made = self.state, self.repetition
         manifest = state.manifest
         return {
@@ -161,7 +156,7 @@ class Verification:
 
 def expected_time(state: FolderState) -> str:
     """How long making a run again will take, as one says it."""
-    return time_text(state.manifest.wall_time_s)
+    return cli.time_text(state.manifest.wall_time_s)
 
 
 def _plain(one: difference.FileDifference) -> dict[str, Any]:
@@ -263,9 +258,13 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
     if not Path(started_in).is_dir():
         raise CannotRepeat(f"the folder in which it was started is gone: {started_in}")
     # modules are those of this program, whatever lies in the folder where it starts
-    command = [sys.executable, "-P", "-m", f"{BEFORE}{words[0]}", *words[1:], "--out", str(place.absolute())]
+    command = [sys.executable, "-P", "-m", f"{provenance.BEFORE}{words[0]}", *words[1:], "--out", str(place.absolute())]
     command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
-    paths = os.pathsep.join(filter(None, (str(ROOT.parent if BEFORE else ROOT), os.environ.get("PYTHONPATH"))))
+    paths = os.pathsep.join(
+        filter(
+            None, (str(provenance.ROOT.parent if provenance.BEFORE else provenance.ROOT), os.environ.get("PYTHONPATH"))
+        )
+    )
     with subprocess.Popen(
         command,
         cwd=started_in,
@@ -281,7 +280,7 @@ def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
             process.send_signal(signal.SIGTERM)
             process.wait()
             raise
-    made = read_manifest(place)
+    made = run_folder.read_manifest(place)
     if made is None:
         told = " ".join((said or "").split()[-60:])
         raise CannotRepeat(f"{' '.join(words)} ended with exit code {process.returncode}{': ' if told else ''}{told}")
@@ -320,7 +319,7 @@ def repeat_chunk(state: FolderState) -> Repetition:
     """
     began, folder = time.monotonic(), state.folder
     try:
-        plan = Plan.of(resolve_study(folder / CONFIG))
+        plan = Plan.of(setup.resolve_study(folder / CONFIG))
         store = ChunkStore(folder, plan)
         store.entries.update({entry.first: entry for entry in examined(folder).whole})
         whole = store.result() if not store.missing else None
@@ -332,8 +331,10 @@ def repeat_chunk(state: FolderState) -> Repetition:
     runs = [number for block in entry.range for number in plan.block(block)]
     config, backend = plan.setup.to_yaml(), state.manifest.backend or "llvm"
     blocks = tuple(tuple(some) for some in plan.runs_of(entry.range))
-    made = BlockResult.joined(evaluate(Task(config, source_digest(), backend, entry.first, blocks)))
-    where = elsewhere(state.manifest, Provenance.here(), versions())
+    made = BlockResult.joined(
+        task.evaluate(task.Task(config, provenance.source_digest(), backend, entry.first, blocks))
+    )
+    where = elsewhere(state.manifest, provenance.Provenance.here(), provenance.versions())
     chunk = _chunk_difference(f"{FOLDER}/{entry.file}", store.read(entry), made, plan)
     files = (chunk, *_data_difference(folder, plan, whole))
     what = f"runs {runs[0]} to {runs[-1]} of {plan.runs}"
@@ -357,7 +358,7 @@ def _data_difference(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[d
     """study.nc and study.json against what the chunks hold."""
     name = "study.nc"
     try:
-        data = read_netcdf((folder / name).read_bytes())
+        data = data_files.read_netcdf((folder / name).read_bytes())
         kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
         told = json.loads((folder / "study.json").read_bytes())
     # readers of spoilt files fail in ways that cannot be foreseen

@@ -10,8 +10,7 @@ from twin.run.artefact import decimals_for, fixed, significant
 from twin.run.report import one_sentence
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
-from twin.study.report.study_runs import Response, typeset
-from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, impossible
+from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
 
 MANY_FAILED = 0.05
 BAD_MODEL = 0.8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,36 +11,26 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
+from twin.run import svg
 from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION, gridded, new_figure, plain_axes
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
 from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
-from twin.study.report.study_runs import Factor, Response, typeset
-from twin.study.report.study_statistics import Description, mean_interval
+from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 MARKS = ("o", "s", "^", "D", "v", "P")
 MOST_POINTS = 500
-"""Of a scatter: more would make the page heavy and the picture black."""
+"""Points in a scatter plot at most: more would make the page heavy and the picture black."""
 STEPS = (1, 2, 2.5, 5, 10)
 """Ticks are these times a power of ten apart."""
 LONGEST = 18
 """Characters of a text on an axis."""
 
 
-def panels(count: int, wide: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, ``wide`` beside each other, each ``height`` inches high."""
-    rows = -(-count // wide)
-    figure = new_figure(height * rows)
-    grid = figure.subplots(rows, wide, squeeze=False).ravel()
-    for axes in grid[count:]:
-        axes.set_axis_off()
-    return figure, list(grid[:count])
-
-
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
     """The look of all panels; None leaves the ticks of an axis as they are."""
-    gridded(axes)
+    svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
         _plain_numbers(axes, "x")
@@ -60,16 +51,16 @@ def short(text: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
-def positions(thing: Factor | Response) -> np.ndarray:
+def positions(thing: Series) -> np.ndarray:
     """(runs,) where the values stand on an axis: numbers where they are, texts at 0, 1, ..."""
-    if isinstance(thing, Factor) and not thing.numeric:
+    if not thing.numeric:
         return np.array([np.flatnonzero(thing.levels == value)[0] for value in thing.values], np.float64)
     return thing.values
 
 
-def name_texts(axes: Axes, thing: Factor | Response, which: str) -> None:
+def name_texts(axes: Axes, thing: Series, which: str) -> None:
     """Names of the texts at an axis with ``positions``; nothing for numbers."""
-    if not isinstance(thing, Factor) or thing.numeric:
+    if thing.numeric:
         return
     places, names = np.arange(len(thing.levels)), [short(str(level)) for level in thing.levels]
     if which == "x":
@@ -87,9 +78,9 @@ def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]
 
 
-def jitter(thing: Factor | Response, seed: int) -> np.ndarray:
+def jitter(thing: Series, seed: int) -> np.ndarray:
     """(runs,) what is added to ``positions`` so that points of one text do not hide each other."""
-    if isinstance(thing, Factor) and not thing.numeric:
+    if not thing.numeric:
         return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(thing.values))
     return np.zeros(len(thing.values))
 
@@ -109,7 +100,7 @@ def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
 def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
     """A panel for each of the named responses."""
     things = [r for r in found.runs.responses if r.name in names]
-    figure, grid = panels(len(things), min(len(things), 2), 3.0)
+    figure, grid = svg.panels([3.0] * len(things), min(len(things), 2))
     for axes, response in zip(grid, things, strict=True):
         _histogram(axes, response, found.descriptions[response.name], found.runs.sampled)
     return figure
@@ -157,7 +148,7 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
     """Mean, sigma and the upper quantiles of the first n runs, each with its interval."""
     convergences = found.convergences[response.name]
-    figure, grid = panels(len(convergences), len(convergences), 2.8)
+    figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
         both = np.isfinite(convergence.low) & np.isfinite(convergence.high)
         axes.fill_between(convergence.counts, convergence.low, convergence.high, where=both, color=SKY, alpha=0.4, lw=0)
@@ -185,7 +176,7 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
     if not factors:
         factors = list(found.runs.factors[:1])
     wide = min(len(factors), 3)
-    figure, grid = panels(len(factors), wide, 3.5 if wide < 3 else 3.0)
+    figure, grid = svg.panels([3.5 if wide < 3 else 3.0] * len(factors), wide)
     for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
         other = _partner(factor, factors) if not found.runs.sampled else None
         if not factor.numeric:
@@ -220,11 +211,10 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
     x = np.array([factor.values[group].mean() for group in groups])
     parts = [response.values[group] for group in groups]
     low, high = np.array([np.quantile(part, (0.1587, 0.8413)) for part in parts]).T
-    ends = np.array([mean_interval(part) for part in parts], np.float64)
     mean = np.array([part.mean() for part in parts])
     axes.fill_between(x, low, high, color=SKY, alpha=0.35, lw=0, label="middle 68%")
-    error = np.abs(ends.T - mean)
-    axes.errorbar(x, mean, error, fmt="o-", color=BLUE, ms=3, lw=1.2, capsize=2, label="mean, 95%")
+    style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
+    svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
@@ -278,7 +268,7 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
 def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
     """The pairs that the study asks for."""
     wide = min(len(pairs), 3)
-    figure, grid = panels(len(pairs), wide, 3.5)
+    figure, grid = svg.panels([3.5] * len(pairs), wide)
     for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
         x, y = found.runs.find(x_name), found.runs.find(y_name)
         _points(axes, x, y, found.runs.study.design.seed)
@@ -289,7 +279,7 @@ def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Fi
     return figure
 
 
-def _points(axes: Axes, x: Factor | Response, y: Factor | Response, seed: int, size: float = 3.0) -> None:
+def _points(axes: Axes, x: Series, y: Series, seed: int, size: float = 3.0) -> None:
     places, heights = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
     shown = some(np.isfinite(places) & np.isfinite(heights))
     axes.plot(places[shown], heights[shown], ".", color=BLUE, ms=size, alpha=0.6)
@@ -300,7 +290,7 @@ _WAYS = {"min": "small is good", "max": "large is good"}
 
 def pareto_figure(found: StudyAnalysis) -> Figure:
     """A panel for each pair: all runs, the front, its knee."""
-    figure, grid = panels(len(found.fronts), min(len(found.fronts), 2), 3.9)
+    figure, grid = svg.panels([3.9] * len(found.fronts), min(len(found.fronts), 2))
     for axes, front in zip(grid, found.fronts, strict=True):
         x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
         shown = some(front.ranks > 0, 1000)
@@ -324,16 +314,9 @@ def pareto_figure(found: StudyAnalysis) -> Figure:
 MOST_BARS = 10
 
 
-def _columns(rows: Sequence[int], wide: int = 2) -> tuple[Figure, list[Axes]]:
-    """Panels as high as their bars need."""
-    wide = min(wide, len(rows))
-    heights = [max(rows[k : k + wide]) for k in range(0, len(rows), wide)]
-    inches = [0.95 + 0.3 * max(h, 2) for h in heights]
-    figure = new_figure(sum(inches))
-    grid = figure.subplots(len(inches), wide, squeeze=False, height_ratios=inches).ravel()
-    for axes in grid[len(rows) :]:
-        axes.set_axis_off()
-    return figure, list(grid[: len(rows)])
+def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
+    """Panels as high as their bars need, two beside each other."""
+    return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
 
 
 def with_tornado(found: StudyAnalysis) -> list[Response]:
@@ -345,7 +328,7 @@ def tornado_figure(found: StudyAnalysis) -> Figure:
     """Swing of each response over each factor, the largest first."""
     things = with_tornado(found)
     rows = [min(len(found.effects[r.name]) or _effects(found, r.name), MOST_BARS) for r in things]
-    figure, grid = _columns(rows)
+    figure, grid = _bar_panels(rows)
     for axes, response in zip(grid, things, strict=True):
         if found.runs.sampled:
             _swings(axes, found, response)
@@ -368,8 +351,8 @@ def _swings(axes: Axes, found: StudyAnalysis, response: Response) -> None:
     texts = np.array([e.coefficient is None for e in shown])
     colours = [GREY if text else BLUE if v >= 0 else VERMILION for v, text in zip(values, texts, strict=True)]
     axes.barh(y, values, 0.66, color=colours)
-    ends = np.array([[e.swing.value if end is None else end for end in e.swing.interval] for e in shown])
-    axes.errorbar(values, y, xerr=np.abs(ends.T - values), fmt="none", ecolor=INK, elinewidth=1.0, capsize=2.5)
+    ends = [[e.swing.value if end is None else end for end in e.swing.interval] for e in shown]
+    svg.interval_bars(axes, values, y, ends, "x", capsize=2.5)
     _name_bars(axes, [e.factor for e in shown], f"change of {response.label}")
 
 
@@ -408,7 +391,7 @@ def indices_figure(found: StudyAnalysis) -> Figure:
     things = with_indices(found)
     parts = [found.indices[r.name] for r in things]
     rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
-    figure, grid = _columns([int(0.7 * row) + 1 for row in rows])
+    figure, grid = _bar_panels([int(0.7 * row) + 1 for row in rows])
     for axes, response, part in zip(grid, things, parts, strict=True):
         assert isinstance(part, Indices)
         shown = part.axes[:MOST_BARS][::-1]
@@ -420,9 +403,7 @@ def indices_figure(found: StudyAnalysis) -> Figure:
             values = np.array([e.value for e in estimates])
             axes.barh(y + shift, values, 0.36, color=colour, label=label)
             if part.method == "chaos":
-                ends = np.array([e.interval for e in estimates], np.float64)
-                error = np.abs(ends.T - values)
-                axes.errorbar(values, y + shift, xerr=error, fmt="none", ecolor=INK, elinewidth=1.0, capsize=2.0)
+                svg.interval_bars(axes, values, y + shift, [e.interval for e in estimates], "x", capsize=2.0)
         _name_bars(axes, [index.name for index in shown], f"share of the variance of {response.name}")
         axes.set_xlim(0.0, 1.08)
         axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
@@ -433,7 +414,7 @@ def indices_figure(found: StudyAnalysis) -> Figure:
 MOST_RESPONSES, MOST = 3, 6
 
 
-def chosen(found: StudyAnalysis) -> list[Factor | Response]:
+def chosen(found: StudyAnalysis) -> list[Series]:
     """The first three responses that vary, and as many factors as have room, by their influence on these."""
     responses = [r for r in found.runs.responses if not r.constant][:MOST_RESPONSES]
     weight = {factor.name: 0.0 for factor in found.runs.factors}
@@ -450,7 +431,7 @@ def matrix_figure(found: StudyAnalysis) -> Figure:
     """Points below the diagonal, rank correlations above it, distributions on it."""
     things = chosen(found)
     n = len(things)
-    figure = new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
+    figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
     grid = figure.subplots(n, n, squeeze=False)
     seed = found.runs.study.design.seed
     for i, row in enumerate(things):
@@ -464,7 +445,7 @@ def matrix_figure(found: StudyAnalysis) -> Figure:
                 count = len(row.levels) if isinstance(row, Factor) and len(row.levels) < 20 else 20
                 axes.hist(values[np.isfinite(values)], bins=count, color=SKY, edgecolor="white", linewidth=0.3)
                 axes.set_yticks([])
-                plain_axes(axes)
+                svg.plain_axes(axes)
                 axes.xaxis.set_major_locator(MaxNLocator(3))
             else:
                 x, y = positions(column) + jitter(column, seed), positions(row) + jitter(row, seed + 1)
@@ -486,11 +467,11 @@ def matrix_figure(found: StudyAnalysis) -> Figure:
     return figure
 
 
-def _correlation(axes: Axes, x: Factor | Response, y: Factor | Response) -> None:
+def _correlation(axes: Axes, x: Series, y: Series) -> None:
     axes.set_xticks([])
     axes.set_yticks([])
     axes.spines[:].set_color(LIGHT)
-    if any(isinstance(thing, Factor) and not thing.numeric for thing in (x, y)):
+    if any(not thing.numeric for thing in (x, y)):
         axes.set_axis_off()
         return
     good = np.isfinite(x.values) & np.isfinite(y.values)

@@ -13,18 +13,15 @@ from matplotlib.text import Text
 
 from scenes.specs.study import FactorSpec, StudySpec
 from scenes.yaml.errors import key_text
+from twin.run import owned_files, page, run_folder, svg
 from twin.run.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
-from twin.run.owned_files import every_file
-from twin.run.page import links, report_page
 from twin.run.report import Report, Section
-from twin.run.run_folder import json_text
-from twin.run.svg import look, to_svg
 from twin.study.report import conclusions as words
+from twin.study.report import study_analysis
 from twin.study.report import study_plots as plots
 from twin.study.report.sensitivity_indices import Indices
-from twin.study.report.study_analysis import StudyAnalysis, plain_data
-from twin.study.report.study_runs import Factor, StudyRuns, typeset
-from twin.study.report.study_statistics import Estimate
+from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_statistics import Estimate, Factor, StudyRuns, typeset
 from twin.study.runs.base_job import one_line
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
@@ -65,17 +62,16 @@ def write_report(
     made = report_files(data, plan.setup.study, files, given)
     contents = made.contents
     # what an earlier report showed may not be there any more
-    there = [name for name in every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents]
+    there = [
+        name for name in owned_files.every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents
+    ]
     folder.remove(there)
     folder.write_all(contents)
     return made
 
 
 def report_files(
-    data: xr.Dataset,
-    study: StudySpec,
-    files: Sequence[str] = ("study.nc", "study.csv"),
-    given: Sequence[str] = (),
+    data: xr.Dataset, study: StudySpec, files: Sequence[str] = ("study.nc", "study.csv"), given: Sequence[str] = ()
 ) -> StudyReport:
     """The report with all its files; arguments as of ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
@@ -89,16 +85,16 @@ def report_files(
         said,
         (*([study.description] if study.description else ()), about),
         (),
-        response_table(found),
-        (Section("Factors", (), (factor_table(runs),)), *sections(found)),
+        _response_table(found),
+        (Section("Factors", (), (_factor_table(runs),)), *sections(found)),
         conclusions=tuple(words.conclusions(found)),
     )
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
     report = replace(report, warnings=(*given, *undrawn, *words.warnings(found)))
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
-    contents[STATISTICS] = json_text({**plain_data(found), "verdict": said}).encode()
-    numbers = links((*files, "study.json", STATISTICS, "config.yaml"))
-    contents["report.html"] = report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
+    contents[STATISTICS] = run_folder.json_text({**study_analysis.STATISTICS(found), "verdict": said}).encode()
+    numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
+    contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
     return StudyReport(said, contents, undrawn)
 
 
@@ -107,7 +103,7 @@ STATISTICS = "statistics.json"
 """Holds all digits of tables whose cells are texts, which have no file of their own."""
 
 
-def factor_table(runs: StudyRuns) -> Table:
+def _factor_table(runs: StudyRuns) -> Table:
     """Name, where it acts, distribution and the values that were run."""
     rows: list[list[Cell]] = []
     for factor in runs.factors:
@@ -165,7 +161,7 @@ def sections(found: StudyAnalysis) -> list[Section]:
     return [section for section in made if section is not None]
 
 
-def response_table(found: StudyAnalysis) -> Table:
+def _response_table(found: StudyAnalysis) -> Table:
     """Statistics of the responses and of the stated sigmas."""
     heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
     rows: list[list[Cell]] = []
@@ -190,12 +186,12 @@ def response_table(found: StudyAnalysis) -> Table:
 def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
     """A figure; what cannot be drawn must not cost the numbers beside it, and is told in its place."""
     try:
-        with look(f"study-{name}"):
+        with svg.look(f"study-{name}"):
             figure = draw()
             for text in figure.findobj(Text):
                 if "$" in text.get_text():  # somebody's unit or name, and no formula
                     text.set_parse_math(False)
-            return SvgFigure(name, title, caption, to_svg(figure))
+            return SvgFigure(name, title, caption, svg.to_svg(figure))
     except Exception as error:
         return Undrawn(name, title, caption, one_line(error))
 

@@ -202,7 +202,12 @@ def _is_model(annotation: Any) -> bool:
 
 
 def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
-    """The tree with other values at places that are there; what is not changed is shared with ``tree``."""
+    """The tree with other values at places that are there; what is not changed is shared with ``tree``.
+
+    Args:
+        tree: plain data; not changed.
+        values: (place, value) of all that changes.
+    """
     out = dict(tree)
     own = {id(out)}
     for key, value in values:
@@ -220,6 +225,10 @@ def with_values(tree: Tree, values: Iterable[tuple[KeyPath, Any]]) -> Tree:
 
 def leaf(tree: Any, key: KeyPath) -> Any:
     """What stands at ``key`` of results.
+
+    Args:
+        tree: plain data.
+        key: keys and list indices from its root.
 
     Raises:
         Problem: nothing does; ``within`` is the part that does not fit.

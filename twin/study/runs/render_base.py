@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
@@ -76,10 +76,6 @@ def monitor_results(
     return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
 
 
-Given = TypeVar("Given")
-Made = TypeVar("Made")
-
-
 @dataclass(frozen=True, eq=False)
 class MonitorRun:
     """One run.
@@ -96,7 +92,7 @@ class MonitorRun:
     seed: int
 
 
-def run_together(
+def _run_together(
     experiment: MonitorExperiment, runs: Sequence[MonitorRun], before: Callable[[int, int], np.ndarray]
 ) -> list[Outcome]:
     """Results of runs of one instrument with one number of frames, as truth.json and recovered.json hold them.
@@ -156,7 +152,7 @@ class RenderBase:
 
     @property
     def block(self) -> int:
-        """As many states as are done together."""
+        """Number of states that are done together."""
         return BLOCK
 
     def resolve(self, file: Path | str) -> Spec:
@@ -185,7 +181,7 @@ class RenderBase:
                 resolved = maker.job(run.values)
                 if run.seed is not None:
                     resolved = resolved.with_render(resolved.frames, run.seed)
-                if needs_more(resolved.job):
+                if _needs_more(resolved.job):
                     out[k] = _alone(resolved, backend)
                     continue
                 name, experiment = shared or self._experiment(resolved, backend)
@@ -203,7 +199,9 @@ class RenderBase:
             def before(frames: int, seed: int, name: str = name, one: MonitorExperiment = experiment) -> np.ndarray:
                 return self._frames_before(name, one, frames, seed)
 
-            for (k, _), outcome in zip(members, run_together(experiment, [w for _, w in members], before), strict=True):
+            for (k, _), outcome in zip(
+                members, _run_together(experiment, [w for _, w in members], before), strict=True
+            ):
                 out[k] = outcome
             renders = [(k, work.state, work.resolved.job.render) for k, work in members]
             asked = [(k, state, render.obstructed) for k, state, render in renders if render.quality]
@@ -408,6 +406,6 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
     )
 
 
-def needs_more(job: JobSpec) -> bool:
+def _needs_more(job: JobSpec) -> bool:
     """Whether a job asks for what is not done for many states at once: a course, stray light or test targets."""
     return job.course is not None or job.render.stray is not None or bool(job.render.target_images)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
-from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
+from scenes.specs.load import find_named
 from scenes.specs.procedures import PROCEDURES, studied
 from scenes.specs.study import FactorSpec, Scalar, StudySpec
 from scenes.yaml import yaml_file
@@ -27,8 +27,6 @@ from scenes.yaml.spec import Source, Spec, validate
 from twin.run.provenance import source_digest, versions
 from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, with_place, with_values
 
-WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
-"""First word of a base's command -> folder of the library with its files."""
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
 """
@@ -53,7 +51,7 @@ class StudySetup:
     @cached_property
     def job(self) -> BaseJob:
         """What runs the base."""
-        return base_job(self.study.base.command)
+        return _job(self.study.base.command)
 
     def to_yaml(self) -> str:
         """Text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
@@ -81,10 +79,13 @@ class StudySetup:
         """Something wrong at ``key`` of the study."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
+        told = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
+        return InputError(self._placed(told, (*key, *problem.within)))
+
+    def _placed(self, issue: Issue, key: KeyPath) -> Issue:
+        """The issue told at ``key`` of the study."""
         source = self.study.source
-        full = (*key, *problem.within)
-        issue = Issue(problem.problem, source.file, source.line(full), (*source.prefix, *full))
-        return InputError(_with(issue, problem.found, problem.allowed, problem.suggestion))
+        return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
         """Name of the factor that changes ``place`` of the base, or something around or below it, and its key."""
@@ -101,18 +102,11 @@ class StudySetup:
         issues = []
         for issue in error.issues:
             found = self.factor_at((*prefix, *issue.key))
-            if found is None:
-                issues.append(issue)
-                continue
-            source = self.study.source
-            text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
-            restated = Issue(text, source.file, source.line(found[1]), (*source.prefix, *found[1]))
-            issues.append(_with(restated, issue.found, issue.allowed, issue.suggestion))
+            if found is not None:
+                text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
+                issue = self._placed(replace(issue, problem=text), found[1])
+            issues.append(issue)
         return InputError(*issues)
-
-
-def _with(issue: Issue, found: str | None, allowed: str | None, suggestion: str | None) -> Issue:
-    return Issue(issue.problem, issue.file, issue.line, issue.key, found, allowed, suggestion)
 
 
 def resolve_study(path: str | Path) -> StudySetup:
@@ -147,7 +141,7 @@ def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
         return _again(yaml)
     study = validate(StudySpec, yaml)
     study = _with_tables(study)
-    job = base_job(study.base.command)
+    job = _job(study.base.command)
     tree = job.resolve(_base_file(study)).plain()
     setup = _placed(study, tree)
     size = len(setup.to_yaml().encode())
@@ -167,8 +161,8 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
-            issue = Issue("unknown key", yaml.file, yaml.lines.get((key,)), (key,), None, names_text(known))
-            raise InputError(_with(issue, None, names_text(known), nearest(key, known)))
+            line, allowed = yaml.lines.get((key,)), names_text(known)
+            raise InputError(Issue("unknown key", yaml.file, line, (key,), None, allowed, nearest(key, known)))
     if not isinstance(yaml.data.get("base"), dict):
         raise InputError(Issue("the resolved base is missing", yaml.file, 1, ("base",), None, "a study's config.yaml"))
     lines = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("study",)}
@@ -179,7 +173,7 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
     placed = study.with_source(Source(yaml.file, yaml.lines, ("study",)))
     assert isinstance(placed, StudySpec)
     study = placed
-    model = base_job(study.base.command).model
+    model = _job(study.base.command).model
     below = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("base",)}
     validate(model, yaml_file.YamlFile(yaml.file, yaml.data["base"], below))
     return _placed(study, yaml.data["base"])
@@ -187,20 +181,8 @@ def _again(yaml: yaml_file.YamlFile) -> StudySetup:
 
 def _base_file(study: StudySpec) -> Path:
     """The base's file: a path relative to the study's, or a name in the library."""
-    text, folder = study.base.file, WHERE[study.base.command.split()[0]]
-    if "/" in text or text.endswith((".yaml", ".yml")):
-        path = Path(study.source.file).parent / text
-        if not is_file(path):
-            raise study.error(unusable(path), ("base", "file"))
-        return path
-    names = sorted(path.stem for path in folder.glob("*.yaml"))
-    if text not in names:
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        suggestion = nearest(text, names)
-        raise study.error(
-            "no such file in the library", ("base", "file"), found=text, allowed=allowed, suggestion=suggestion
-        )
-    return folder / f"{text}.yaml"
+    kind = study.base.command.split()[0]
+    return find_named("examples" if kind == "render" else kind, study.base.file, study, ("base", "file"))
 
 
 def _placed(study: StudySpec, tree: Tree) -> StudySetup:
@@ -283,7 +265,7 @@ def _with_tables(study: StudySpec) -> StudySpec:
 LARGEST_TABLE = 100_000_000
 """Bytes of a table's file, of which a study takes some columns."""
 MOST_CELLS = 90_000
-"""Of all tables together: the study's config.yaml holds them, and has room for 100 000 keys and values in 1 MB."""
+"""Cells of all tables together: config.yaml of the study holds them, and has room for 100 000 keys and values."""
 
 
 def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, KeyPath]) -> dict[str, list[Any]]:
@@ -349,7 +331,7 @@ def _cell(text: str) -> Any:
         return text
 
 
-def base_job(command: str) -> BaseJob:
+def _job(command: str) -> BaseJob:
     """The job of that name: ``render``, or a test of `PROCEDURES` that can be varied.
 
     Raises:

@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -22,7 +21,7 @@ from twin.study.runs.setup import StudySetup
 PROGRAM = "twin.study"
 
 
-class StudyState(BaseModel):
+class _StudyState(BaseModel):
     """What the folder of a study says of it from its beginning.
 
     Attributes:
@@ -44,8 +43,8 @@ class StudyState(BaseModel):
     sources: dict[str, str]
 
     @classmethod
-    def of(cls, setup: StudySetup) -> StudyState:
-        """Of a study run by this program."""
+    def of(cls, setup: StudySetup) -> _StudyState:
+        """State of a study that this program runs."""
         return cls(
             program="twin.study",
             name=setup.study.name,
@@ -125,9 +124,7 @@ class StudyFolder:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Unlock; a complete study is put in place, one of which nothing has been done is removed."""
         self._leave()
 
@@ -277,13 +274,13 @@ class StudyFolder:
     def _check_identity(self) -> None:
         """Refuse to go on with what another study, or another program, has begun: their numbers do not mix."""
         try:
-            found = StudyState.model_validate_json((self.path / owned_files.STUDY_STATE).read_bytes())
+            found = _StudyState.model_validate_json((self.path / owned_files.STUDY_STATE).read_bytes())
         except ValidationError:
             raise RunFolderError(
                 f"{self.path / owned_files.STUDY_STATE} cannot be read, or is of an older version; start again with "
                 "--force"
             ) from None
-        own = StudyState.of(self.setup)
+        own = _StudyState.of(self.setup)
         remedy = "start again in another folder with --out, or replace this one with --force"
         if found.content != own.content:
             text = f"{self.path} holds another study: its factors, design or base differ; {remedy}"
@@ -301,14 +298,14 @@ class StudyFolder:
 
     def _begin(self) -> None:
         self.write("config.yaml", self.setup.to_yaml().encode())
-        self.write(owned_files.STUDY_STATE, (StudyState.of(self.setup).model_dump_json(indent=2) + "\n").encode())
+        self.write(owned_files.STUDY_STATE, (_StudyState.of(self.setup).model_dump_json(indent=2) + "\n").encode())
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file so that under its name it is whole or not there."""
         self.write_all({name: content})
 
     def write_all(self, files: Mapping[str, bytes]) -> None:
-        """As ``write``, several at once, by their paths in the folder.
+        """Write several files at once, each whole or not there, by their paths in the folder.
 
         Raises:
             OSError: the disk is full, or gone; some may be there.
