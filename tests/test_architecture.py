@@ -54,7 +54,6 @@ RUNS = {
     "twin.main_job.render_job",
     "twin.main_job.render_files",
     "twin.study.gradient.study_gradient",
-    "twin.study.gradient.gradient_numbers",
     "twin.study.study_files",
     "twin.uncertainty.uncertainty_numbers",
 }

@@ -90,8 +90,7 @@ from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
 from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
-from twin.study.runs.base_job import Run
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult, Run
 from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
@@ -447,9 +446,7 @@ def write_toy(folder: Path) -> Report:
     frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
     result = Report("A test", "It is one.", (), (), summary, (Section("Own section"),), {"edge": frames})
     with RunFolder(folder, False) as made:
-        write_test(
-            "focus", {"x": 21}, result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made
-        )
+        write_test("focus", {"x": 21}, result, RunFacts("", "twin.lab", 0.0, 0.0, "llvm", 1, "focus"), made)
     return result
 
 
@@ -904,12 +901,12 @@ def test_an_unknown_name_is_told_as_one_of_a_fixed_list_is(model: Any, text: str
     assert str(caught.value).endswith(said)
 
 
-@extends("twin.run.data_table.TABLE_FORMATS")
+@extends("twin.run.data_files.TABLE_FORMATS")
 def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names and units of the columns alone: chosen by its name, written for every table and listed."""
     text = "; ".join
     form: Callable[[Any], bytes] = lambda table: text(f"{c.name} in {c.unit}" for c in table.columns).encode()  # noqa: E731
-    add(monkeypatch, "twin.run.data_table.TABLE_FORMATS", "heads", form)
+    add(monkeypatch, "twin.run.data_files.TABLE_FORMATS", "heads", form)
     study_folder(tmp_path, "monte_carlo")
     done = invoke(twin.export.__main__.app, tmp_path / "run", "--tables", "heads", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output

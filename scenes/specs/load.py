@@ -31,7 +31,7 @@ LAB, BUDGETS, ORBIT, PAYLOADS, DISTURBANCES = "lab", "budgets", "orbit", "payloa
 
 def _folder(name: str) -> Path:
     """Where the files of one kind stand."""
-    return (SCENES if name in (LAB, ORBIT) else LIBRARY) / name
+    return (SCENES if name in (LAB, ORBIT, "examples") else LIBRARY) / name
 
 
 def library_names(folder: str) -> tuple[str, ...]:

@@ -364,17 +364,29 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.models.camera_design:CameraDesignSetup",
         resolve="scenes.models.camera_design:resolve_design",
         run="twin.design.design_run:run_design",
-        numbers="twin.design.design_run:design_numbers",
+        numbers="twin.design.design_run:DESIGN",
         report="twin.design.design_report:design_report",
         files=(FileKind("camera_design", "scenes.specs.camera:CameraDesignSpec", "an optimisation of a camera"),),
         judged=False,
+        about="""
+    Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
+    the field is made least, with the focal length, the envelope, the anamorphism and free beams as constraints.
+    It is done from several starts (``starts:``), and said whether they agree.
+
+    Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
+
+    The run folder gets the new camera's file in artefacts/,
+    design.json, config.yaml and a report.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """,
     ),
     "design monitor": Procedure(
         "layouts",
         setup="scenes.models.monitor_layout:MonitorDesignSetup",
         resolve="scenes.models.monitor_layout:resolve_monitor_design",
         run="twin.design.monitor_design:run_monitor_design",
-        numbers="twin.design.monitor_design:monitor_design_numbers",
+        numbers="twin.design.monitor_design:LAYOUTS",
         report="twin.design.monitor_report:monitor_design_report",
         files=(FileKind("monitor_design", "scenes.specs.camera:MonitorDesignSpec", "a search for a monitor's layout"),),
         judged=False,

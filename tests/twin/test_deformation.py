@@ -25,7 +25,7 @@ from tests.twin.path_bench import scene_beam
 from twin.main_job.job_tables import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.render import app
-from twin.study.runs.perturbed_job import JobMaker
+from twin.study.runs.render_base import JobMaker
 from twin.study.runs.setup import resolve_study
 
 M1, M2 = "base/forward/M1", "base/forward/M2"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -64,10 +64,7 @@ HEADS = (
 class PointListing(Data):
     """Rows under `HEADS`, kept as CSV and named in the report."""
 
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "csv"
+    kind: ClassVar[str] = "csv"
 
     def content(self) -> bytes:
         """The rows with all their digits; what there is not is empty."""
