@@ -96,7 +96,7 @@ def export(
 
     def work(given: tuple[ExportSource, tuple[float, float] | None], session: Session) -> Result:
         from scenes.yaml.errors import InputError
-        from twin.orbit.export.export_report import export_files, export_numbers, export_report
+        from twin.orbit.export import export_report
         from twin.orbit.export.export_run import run_export
         from twin.run.page import RunFacts, write_test
         from twin.run.procedure import BenchError
@@ -106,9 +106,9 @@ def export(
             run = run_export(read, session.backend, heights, truth, session.advance)
         except BenchError as error:
             raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
-        shown = export_report(run)
-        numbers = {**export_numbers(run), "verdict": shown.verdict}
-        for name, content in export_files(run).items():
+        shown = export_report.export_report(run)
+        numbers = {**export_report.EXPORT(run), "verdict": shown.verdict}
+        for name, content in export_report.export_files(run).items():
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
