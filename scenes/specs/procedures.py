@@ -203,7 +203,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
         report="twin.orbit.angle.angle_report:angle_report",
-        export="twin.orbit.angle.angle_export:angle_exported",
+        export="twin.orbit.angle.measured_angle:angle_exported",
         files=(
             FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),
             FileKind(
@@ -264,9 +264,9 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_numbers:check_numbers",
+        numbers="twin.orbit.conventions.check_numbers:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
-        export="twin.orbit.conventions.check_export:exported",
+        export="twin.orbit.conventions.check_run:exported",
         files=(
             FileKind(
                 "orbit_check", "scenes.specs.measured.orbit_data:OrbitCheckSpec", "a check of the conventions of a pass"
@@ -292,9 +292,9 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
         run="twin.orbit.matching.match_run:run_match",
-        numbers="twin.orbit.matching.match_numbers:match_numbers",
+        numbers="twin.orbit.matching.match_run:MATCH",
         report="twin.orbit.matching.match_report:match_report",
-        export="twin.orbit.matching.match_numbers:exported",
+        export="twin.orbit.matching.match_run:exported",
         files=(
             FileKind(
                 "orbit_match", "scenes.specs.measured.orbit_data:OrbitMatchSpec", "points to be measured in line images"
@@ -338,7 +338,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:SimulateSetup",
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_numbers:simulate_numbers",
+        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
         files=(

@@ -95,7 +95,7 @@ def export(
 
     def work(given: tuple[ExportSource, tuple[float, float] | None], session: Session) -> Result:
         from scenes.yaml.errors import InputError
-        from twin.orbit.export.export_report import export_files, export_numbers, export_report
+        from twin.orbit.export import export_report
         from twin.orbit.export.export_run import run_export
         from twin.run.procedure import BenchError
 
@@ -104,14 +104,15 @@ def export(
             run = run_export(read, session.backend, heights, truth, session.advance)
         except BenchError as error:
             raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
-        for name, content in export_files(run).items():
+        for name, content in export_report.export_files(run).items():
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
         options = (*ends, *(("--truth",) if truth else ()), "--seed", str(read.seed))
         again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
         facts = {"config": read.config, "seed": read.seed, "again": again, "given": (source,)}
-        return finished(session, "export", export_report(run), export_numbers(run), program=PROGRAM, **facts)
+        shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if source.is_dir() else source.stem
     run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)

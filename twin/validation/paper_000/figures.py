@@ -7,7 +7,7 @@ at most a quarter of the largest, and a slope that grows as one that grows by 5 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -327,7 +327,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
 
     def moved(strip: Strip) -> float:
         other = {**m.strips, "forward": strip}
-        planes = planes_of(Measurement(m.station, other, m.tangent, m.along, m.look, m.offset, m.bow), "corrected")
+        planes = planes_of(replace(m, strips=other), "corrected")
         return float(intersection_angles(*planes).values[0] - base)
 
     forward = m.strips["forward"]
