@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from analysis.orientation.interior import LINE_TERMS, InteriorOrientation, LineOrientation
 from analysis.turntable.dividing_error import DividingCompensation, expected_rejections
 from analysis.units import ARCSEC, MM_PER_M
+from twin.laboratory import turntable_numbers
 from twin.laboratory.distortion_run import DistortionRun, Estimate, SimulatedDistortion
 from twin.laboratory.measured_readings import DataFile, SpotReadings
-from twin.laboratory.turntable_numbers import COMPENSATION as MISFITS
-from twin.laboratory.turntable_numbers import DATA_FILE, rejected_rows
 from twin.laboratory.turntable_run import rms
 from twin.run.quantity import Quantity, Record
 
@@ -83,7 +82,7 @@ COMPENSATION: Record[DividingCompensation] = Record(
     "The turntable's dividing error, as it is compensated.",
     Quantity("fit", lambda table: table.fit.name, "fit that cross-validation chooses"),
     Quantity("repeatability_arcsec", lambda table: table.repeatability, "standard deviation of one comparison"),
-    *MISFITS,
+    *turntable_numbers.COMPENSATION,
 )
 _Pair: TypeAlias = tuple[Estimate, Estimate]
 TRUE_ESTIMATE: Record[_Pair] = Record(
@@ -188,7 +187,12 @@ DISTORTION: Record[DistortionRun] = Record(
     Quantity("stated_exposure_um", lambda r: np.sqrt(np.mean(r.spots.temporal**2, where=r.present)), "noise of a spot"),
     Quantity("across_range_um", _across, "range of the spots across the line"),
     Quantity("rejected_readings", lambda r: r.readings and REJECTED.rows(r), "of spots", where_known=True),
-    Quantity("rejected_comparisons", lambda r: r.readings and rejected_rows(r.tables), "in files", where_known=True),
-    Quantity("files", _files, "that were read", record=DATA_FILE, where_known=True),
+    Quantity(
+        "rejected_comparisons",
+        lambda r: r.readings and turntable_numbers.rejected_rows(r.tables),
+        "in files",
+        where_known=True,
+    ),
+    Quantity("files", _files, "that were read", record=turntable_numbers.DATA_FILE, where_known=True),
     Quantity("truth", lambda r: r if isinstance(r, SimulatedDistortion) else None, record=TRUTH, where_known=True),
 )

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.units import ARCMIN
-from analysis.units import UM_PER_M as UM
+from analysis.units import ARCMIN, UM_PER_M
 from scenes.specs.camera_tests import MeasuredFocusSpec
 from scenes.yaml.units import LENGTH, format_quantity
 from twin.laboratory import focus_plots
@@ -104,7 +103,7 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
     setup = run.bench.setup
     test, camera = setup.test, setup.camera
     bands = ", ".join(
-        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM * b.pitch:g} µm"
+        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM_PER_M * b.pitch:g} µm"
         for name, b in camera.bands.items()
     )
     level = test.white
@@ -127,7 +126,7 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
         (
             "Mount",
             f"{len(test.mount.holes)} holes, surface inclined by {np.degrees(test.mount.tilt):g}° against the focal "
-            f"plane, shims ground in steps of {UM * test.mount.step:g} µm",
+            f"plane, shims ground in steps of {UM_PER_M * test.mount.step:g} µm",
         ),
     )
 
@@ -158,7 +157,7 @@ def _rounds(data: Mapping[str, Any]) -> Table:
 
 def _verdict(run: FocusRun, data: Mapping[str, Any]) -> str:
     plane = data["plane"]
-    chips, noise = plane["chips_um_rms"], UM * float(np.sqrt(np.mean(run.states[0].defocus_sigma ** 2)))
+    chips, noise = plane["chips_um_rms"], UM_PER_M * float(np.sqrt(np.mean(run.states[0].defocus_sigma ** 2)))
     limit = (
         f"by the CCDs, which do not stand in one plane by {chips:.1f} µm rms, and no shim takes that away"
         if chips > noise
@@ -230,10 +229,11 @@ def _shims(run: FocusRun) -> Section:
         title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
         caption = (
             "Changes of thickness under each hole; their sigma holds noise, the error that all vertices share, and "
-            f"that the CCDs do not stand in one plane ({UM * done.plane.extra_sigma:.1f} µm rms: chips, curvature of "
-            f"field). The turn in the mounting surface of {fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; "
-            f"without it the line would be off its wanted level by {fixed(done.plan.level_coupling / ARCMIN, 2)} "
-            "arcmin, as the mounting surface is not parallel to the focal plane."
+            f"that the CCDs do not stand in one plane ({UM_PER_M * done.plane.extra_sigma:.1f} µm rms: chips, "
+            "curvature of field). The turn in the mounting surface of "
+            f"{fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off its wanted "
+            f"level by {fixed(done.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not parallel "
+            "to the focal plane."
         )
         heads = ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]")
         tables.append(Table(f"shims-{number}", title, caption, heads, rows))
@@ -253,10 +253,10 @@ def _plane(run: FocusRun) -> Section:
     text = (
         f"Chi-square of the plane is {plane.chi_square:.1f} for {plane.degrees_of_freedom} degrees of freedom "
         "with the places' own sigmas. What the places scatter beyond them, "
-        f"{UM * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims: CCDs that are "
-        "not in one plane, curvature of the field, sigmas that are too small.",
-        f"All vertices share an error of {UM * done.vertex_error:.2g} µm by the form of the curve; "
-        f"{UM * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
+        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims: CCDs that "
+        "are not in one plane, curvature of the field, sigmas that are too small.",
+        f"All vertices share an error of {UM_PER_M * done.vertex_error:.2g} µm by the form of the curve; "
+        f"{UM_PER_M * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
     )
     keys = ("band", "x_mm", "y_mm", "defocus_um", "defocus_um_sigma", "residual_um")
     caption = "Measured with one sigma by noise; lines: the plane that the shims take away."

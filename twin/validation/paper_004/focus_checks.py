@@ -14,9 +14,7 @@ from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
-from analysis.units import ARCMIN, ARCSEC
-from analysis.units import MM_PER_M as MM
-from analysis.units import UM_PER_M as UM
+from analysis.units import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.resolved import resolve_focus
@@ -283,17 +281,17 @@ def _measured(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterato
     count, sites = len(alignments), len(alignments[0].bench.sites)
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
-    before, after = (UM * float(np.sqrt(np.mean(error[:, k] ** 2))) for k in (0, 1))
-    span = UM * float(np.max(np.abs([a.states[0].true_defocus for a in alignments])))
+    before, after = (UM_PER_M * float(np.sqrt(np.mean(error[:, k] ** 2))) for k in (0, 1))
+    span = UM_PER_M * float(np.max(np.abs([a.states[0].true_defocus for a in alignments])))
     how = (
         f"{_alignments(count)}, {sites} fields and bands, edges in two directions through focus: {before:.2f} µm RMS "
         f"before, where CCDs stand up to {span:.0f} µm off, {after:.2f} µm after; largest "
-        f"{UM * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
+        f"{UM_PER_M * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
     )
-    total = UM * float(np.sqrt(np.mean(error**2)))
+    total = UM_PER_M * float(np.sqrt(np.mean(error**2)))
     yield context.check("004.alignment.defocus").evaluate(total, None, how, 0.0)
     plans = [Plan(a) for a in alignments]
-    left = np.array([MM * np.max(np.abs(p.left)) for p in plans])
+    left = np.array([MM_PER_M * np.max(np.abs(p.left)) for p in plans])
     how = (
         f"{_alignments(count)}: plane through the measured defocus of the {sites} sites, the assembly moved by exactly "
         f"that: {_list(left, 4)} mm. What stays is how the chips were glued, and curvature of field."
@@ -310,11 +308,11 @@ def _measured(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterato
     changes = np.array([p.shims.change for p in plans])
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
     how = (
-        f"{_alignments(count)}, {asked.shape[1]} holes: changes up to {UM * np.max(np.abs(asked)):.0f} µm. The surface "
-        "of the mount is inclined, so that shims alone, without a turn by hand, would cost the line's level "
+        f"{_alignments(count)}, {asked.shape[1]} holes: changes up to {UM_PER_M * np.max(np.abs(asked)):.0f} µm. The "
+        "surface of the mount is inclined, so that shims alone, without a turn by hand, would cost the line's level "
         f"{_list(alone, 2)}′."
     )
-    value = UM * float(np.sqrt(np.mean((changes - asked) ** 2)))
+    value = UM_PER_M * float(np.sqrt(np.mean((changes - asked) ** 2)))
     yield context.check("004.alignment.shims").evaluate(value, None, how, 0.0)
 
 
@@ -326,8 +324,8 @@ def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -
     )
     spread = placed[0][0].bench.setup.test.misset.chips
     return Chosen(
-        "scatter of the glued chips", UM * spread, "µm",
-        lambda factor: float(MM * np.max(np.abs(flat + factor * (as_glued - flat)))),
+        "scatter of the glued chips", UM_PER_M * spread, "µm",
+        lambda factor: float(MM_PER_M * np.max(np.abs(flat + factor * (as_glued - flat)))),
     )  # fmt: skip
 
 
@@ -344,7 +342,7 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator
         return
     count = len(alignments)
     plan = alignments[0].bench.setup.test
-    far = np.array([[MM * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
+    far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
     sites = f"{_alignments(count)} of {len(alignments[0].bench.sites)} fields and bands, by the traced pupils"
     how = f"{sites}: before {_list(far[:, 0], 2)} mm, after {_list(far[:, -1], 4)} mm."
@@ -361,8 +359,8 @@ def _reached(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator
     more = [_second_round(a) for a in alignments]
     how = (
         f"{_alignments(count)}: {int(np.sum(rounds == 0))} needed none, {int(np.sum(rounds == 1))} needed one. A "
-        f"second round would change a shim by {UM * max(more):.1f} µm at most; shims are ground in steps of "
-        f"{UM * plan.mount.step:g} µm."
+        f"second round would change a shim by {UM_PER_M * max(more):.1f} µm at most; shims are ground in steps of "
+        f"{UM_PER_M * plan.mount.step:g} µm."
     )
     value = float(np.max(rounds))
     share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
