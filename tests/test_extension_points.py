@@ -53,7 +53,6 @@ from optics.thermal.heat import Temperature
 from optics.waves.pupil_stack import circular_pupil
 from scenes.models.camera_model import surface_of
 from scenes.models.obstruction import find_obstructions
-from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from scenes.schema import json_schema
 from scenes.specs.camera import MirrorSpec
@@ -63,7 +62,8 @@ from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.procedures import FileKind, Procedure
 from scenes.specs.resolved import ExperimentSetup, resolve
-from scenes.specs.study import DesignSpec, Sampler
+from scenes.specs.samplers import Sampler
+from scenes.specs.study import DesignSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
@@ -71,6 +71,7 @@ from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
+from tests.twin.path_bench import IDEAL
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -79,7 +80,7 @@ from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
 from twin.run.data_files import FrameFacts
@@ -166,7 +167,7 @@ def test_nothing_that_is_added_here_stays() -> None:
 
 # --- a detector's noise -----------------------------------------------------------------------------------------------
 
-NOISE = "twin.sensors.noise_terms.NOISE_TERMS"
+NOISE = "twin.sensors.area_detector.NOISE_TERMS"
 
 
 @dataclass(frozen=True)
@@ -836,7 +837,7 @@ def test_a_job_with_a_reflector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 # --- studies ----------------------------------------------------------------------------------------------------------
 
-SAMPLERS = "scenes.specs.study.SAMPLERS"
+SAMPLERS = "scenes.specs.samplers.SAMPLERS"
 FORMATS = "twin.study.study_files.FORMATS"
 MIDDLE = Sampler("all in the middle", lambda runs, factors, generator: np.full((runs, factors), 0.5))
 
@@ -878,7 +879,7 @@ def test_a_sampler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_sampler_must_keep_to_the_unit_cube(points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     add(monkeypatch, SAMPLERS, "wrong", Sampler("wrong", lambda runs, factors, generator: points))
     with pytest.raises(ValueError, match="sampler wrong must give points"):
-        registered("scenes.specs.study.unit_cube")[2]("wrong", 3, 2, 1)
+        registered("scenes.specs.samplers.unit_cube")[2]("wrong", 3, 2, 1)
 
 
 @pytest.mark.parametrize(

@@ -27,11 +27,11 @@ from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 
 RIM_SIDES = 256
-"""Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it
-takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
+"""Sides of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of
+it takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
 
 FEW_SIDES = 64
-"""The same for many pupils at once: 16 times the errors."""
+"""Sides of that polygon for many pupils at once: 16 times the errors."""
 
 LARGEST = 0.5
 """Size of a piece, in radii of the pupil: a wavefront is continued from a piece to its box, the corners of which may
@@ -48,6 +48,10 @@ _TURNED = 1e-12
 
 _ROUND = 1e-10
 """Term of an edge's radius, below which it is none."""
+
+_ROOM = 1e-5
+"""By which the area of a part of a polygon may leave what is possible, of a pupil of radius 1: arcs are integrated by
+Gauss' rule."""
 
 SMALLEST = 1e-9
 """Area of a piece, of a pupil of radius 1, below which it is nothing."""
@@ -79,7 +83,7 @@ class PupilShadow:
 
     @property
     def area(self) -> np.ndarray:
-        """Of each pupil's shadow, (B,), in p."""
+        """Area of each pupil's shadow, (B,), in p."""
         return np.asarray(np.sum(area(self.pieces), axis=-1))
 
     @cached_property
@@ -120,7 +124,7 @@ class PupilShadow:
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
     def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
-        """The same as ``overlap``, part by part."""
+        """Quadrature as ``overlap`` gives it, part by part."""
         moves = np.stack([shift.real, shift.imag], axis=-1)
         full = area(self.pieces) > SMALLEST
         points, weights = self.whole(count)
@@ -220,7 +224,7 @@ def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
 
 
 def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
+    """Cut shadows (B, K, V, 2) into pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
     of the K each is, (L,).
     """
     owners = np.arange(pieces.shape[1])
@@ -357,10 +361,6 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     size, slope = _radius_and_slope(radius, turn)
     arc = turn * size
     arc_rise = 0.5 * weight * angle[..., None] * (turn * (slope + 1j * size)).imag
-    every, rises = (
-        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
-        for both in ((place, arc), (rise, arc_rise))
-    )
     # the region's box: of both ends of straight pieces, and of nodes on arcs
     corners = np.concatenate([first, last, arc.reshape(len(arc), arc.shape[1] * arc.shape[2])], axis=1)
     counted = np.concatenate([straight, straight, np.repeat(bent, len(share), axis=1)], axis=1)
@@ -370,7 +370,20 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     )
     none = ~np.any(counted, axis=1)
     low[none], high[none] = 0.0, 0.0
-    return from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    # What only fills the rows must not lie on the pupil's edge: in units of a narrow box that is millions away, where
+    # polynomials make of a rounding error in its angle, 1e-17, any number.
+    middle = 0.5 * (low + high) @ np.array([1.0, 1j])
+    used = np.concatenate([np.repeat(kept, len(share), axis=1) for kept in (straight, bent)], axis=1)
+    every, rises = (
+        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
+        for both in ((place, arc), (rise, arc_rise))
+    )
+    every, rises = np.where(used, every, middle[:, None]), np.where(used, rises, 0.0)
+    points, weights = from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    total = np.sum(weights, axis=-1)
+    if not np.all((total > -_ROOM) & (total < np.abs(area(polygons)) + _ROOM)):
+        raise ArithmeticError("a part of a shadow within the pupil came out larger than the whole of it")
+    return points, weights
 
 
 def _some(pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -186,9 +186,7 @@ PROCEDURES: dict[str, Procedure] = {
         files=(
             FileKind("turntable_test", "scenes.specs.turntable:TurntableTestSpec", "a turntable test"),
             FileKind(
-                "measured_turntable",
-                "scenes.specs.turntable:MeasuredTurntableSpec",
-                "a turntable test on measurements",
+                "measured_turntable", "scenes.specs.turntable:MeasuredTurntableSpec", "a turntable test on measurements"
             ),
         ),
         varied=True,
@@ -271,9 +269,7 @@ PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.conventions.check_export:exported",
         files=(
             FileKind(
-                "orbit_check",
-                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
-                "a check of the conventions of a pass",
+                "orbit_check", "scenes.specs.measured.orbit_data:OrbitCheckSpec", "a check of the conventions of a pass"
             ),
         ),
         judged=False,
@@ -301,9 +297,7 @@ PROCEDURES: dict[str, Procedure] = {
         export="twin.orbit.matching.match_numbers:exported",
         files=(
             FileKind(
-                "orbit_match",
-                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
-                "points to be measured in line images",
+                "orbit_match", "scenes.specs.measured.orbit_data:OrbitMatchSpec", "points to be measured in line images"
             ),
         ),
         judged=False,
@@ -386,4 +380,4 @@ PROCEDURES: dict[str, Procedure] = {
         judged=False,
     ),
 }
-"""As the command is called after ``twin.`` -> the test. A test is its own modules and one entry here."""
+"""Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

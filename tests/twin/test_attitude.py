@@ -172,6 +172,7 @@ def test_noise_between_readings_is_joined_smoothly() -> None:
     assert 0.7 * 2 < np.std(halfway[:, 0]) < 1.0 * 2
 
 
+@pytest.mark.second
 def test_slow_orbit_errors_have_their_deviation_and_correlation_time() -> None:
     kept, count = math.exp(-2.0 / 60.0), 40
     start, innovations = [], []

@@ -137,6 +137,7 @@ def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None
     assert 0.003 * ARCSEC < np.max(result.sigma) < 0.05 * ARCSEC
 
 
+@pytest.mark.second
 def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) -> None:
     series = Series("X", math.radians(15), math.radians(0.002), 100)
     setup = with_errors(reading=0.5 * ARCSEC, turntable_step=0.8 * ARCSEC)
@@ -155,6 +156,7 @@ def test_unrest_and_steps_scatter_as_declared(reader: Reader, backend: Backend) 
     assert scatter_agrees(float(np.sum(cross**2) / ((0.5 * ARCSEC) ** 2 + noise)), 198)
 
 
+@pytest.mark.second
 def test_errors_of_the_bench_act_as_they_should(reader: Reader, backend: Backend) -> None:
     series = series_per_axis(SETUP.spec)[0]
     angle = series.angles[-1]
@@ -205,6 +207,7 @@ def test_errors_are_drawn_as_large_as_declared() -> None:
         assert scatter_agrees(float(np.sum((np.array(values) / getattr(e, name)) ** 2)), len(values)), name
 
 
+@pytest.mark.second
 def test_seeds(reader: Reader, backend: Backend) -> None:
     first, again, other = (
         run_autocollimator_test(SETUP, backend, series_per_axis(SETUP.spec)[:n], seed, reader=reader)

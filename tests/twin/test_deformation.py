@@ -101,7 +101,7 @@ def centres(experiment, states) -> np.ndarray:
 def solution(experiment, path: str) -> tuple[np.ndarray, np.ndarray]:
     """Nodes of the finite elements of a mirror and their displacements in FIELD, (N, 3) each."""
     model = experiment.thermal
-    units = model.mirror_displacements(path)
+    units = model.unit_displacements(path)
     about = np.array({b.path: b for b in experiment.instrument.assembly.tree.bodies}[path].pivots["centre"])
     nodes = units[0].nodes
     moves = sum(g * unit.values for g, unit in zip(FIELD.gradient, units, strict=True))

@@ -59,6 +59,7 @@ def within(setup):
     return replace(bench(), setup=setup)
 
 
+@pytest.mark.second
 def test_images_are_those_of_the_general_renderer():
     """Between the nodes over the field, against a table of that very image and another Fourier sum."""
     b = bench()
@@ -96,6 +97,7 @@ def test_pixel_sampling_moves_no_centroid():
     assert np.ptp(spots.column) == pytest.approx(1.0, abs=2e-3)
 
 
+@pytest.mark.second
 def test_line_follows_the_turn_and_the_middle_is_zero():
     b, truth = bench(), run().truth
     middle = b.places(truth.axis, np.zeros(1))[0]
@@ -164,6 +166,7 @@ def test_result_agrees_with_the_truth():
     assert truth["principal_distance_mm"] == pytest.approx(5512.0, abs=0.1)
 
 
+@pytest.mark.second
 def test_error_of_the_zero_spoils_the_printed_equations_and_not_the_constant():
     """An operator's 2 arcsec: (3) leaves f d in every point, (2) turns it into p; theory of the module's docstring."""
     b = within(altered(zero=2.0 * ARCSEC))

@@ -22,6 +22,7 @@ def sensor(camera, platform=UNSTEADY) -> Sensor:
     return Sensor(camera, platform, Earth(), 0.7e-3, -3.0, LINES, LightEffects())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["forward", "nadir", "gf7"])
 def test_grid_against_the_rigorous_model(gf7_pair, backend, name: str) -> None:
     """Random lines and pixels, also between their centres, of an image whose attitude trembles at up to 31 Hz."""

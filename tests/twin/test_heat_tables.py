@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from optics.thermal.nodal_temperature import NodalTemperature
-from scenes.models.heated_bodies import FINE_CELLS
+from scenes.models.nodal_bodies import FINE_CELLS
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job

@@ -246,6 +246,7 @@ class Valley:
         return [self.slope(item) if isinstance(item, LayoutNumber) else self.facts(item) for item in items]
 
 
+@pytest.mark.second
 def test_refinement_ends_where_no_ratio_can_fall(bench: LayoutBench) -> None:
     """The least of the larger of two ratios, found by scipy from the closed form alone."""
     valley = Valley(bench)

@@ -15,10 +15,11 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from analysis.focal_plane.through_focus import QUARTIC
-from scenes.specs.load import SCENES, load_turntable_test
+from scenes.specs.load import LAB, SCENES, load_named
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.distortion_run import DistortionRun, measure_files
@@ -146,7 +147,7 @@ def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
 
 
 def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
-    spec = load_turntable_test(JOBS / "turntable.yaml")
+    spec = load_named(TurntableTestSpec, LAB, JOBS / "turntable.yaml")
     done = run_turntable(spec, 7, names=("cubic_spline",))
     for name, content in export_turntable(done).items():
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -190,6 +191,7 @@ def in_unit(path: Path, old: str, new: str, factor: float) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
     kinds: list[Callable[[], np.ndarray]] = [
         lambda: turntable_of(folder).series.mean,
@@ -219,6 +221,7 @@ def renumbered(path: Path, name: str, seed: int) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     before, run = distortion_of(folder), turntable_of(folder)
     for k, (name, column) in enumerate((("comparisons", "position"), ("held_out", "position"), ("spots", "point"))):
@@ -232,6 +235,7 @@ def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
 
 
+@pytest.mark.second
 def test_units_change_nothing_but_rounding(folder: Path) -> None:
     turntable, distortion, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
     in_unit(folder / "comparisons.csv", "difference [arcsec]", "difference [urad]", ARCSEC * 1e6)
@@ -247,6 +251,7 @@ def test_units_change_nothing_but_rounding(folder: Path) -> None:
     )
 
 
+@pytest.mark.second
 def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     fit = distortion_of(folder).compensated.fit
     in_unit(folder / "spots.csv", "along [mm]", "column", 1e3 / 7.0)
@@ -309,6 +314,7 @@ def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
     assert less.repeatability == pytest.approx(whole.repeatability, rel=0.01)
 
 
+@pytest.mark.second
 def test_missing_spots_are_no_spots(folder: Path) -> None:
     whole = distortion_of(folder)
     head, *body = rows_of(folder / "spots.csv")
@@ -411,6 +417,7 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
 # --- more data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_more_data_never_raise_a_sigma(folder: Path) -> None:
     """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
     head, *body = rows_of(folder / "mtf.csv")

@@ -18,7 +18,6 @@ from scenes.models.monitor_layout import (
     Beam,
     ImagingBeams,
     MonitorDesignSetup,
-    instrument_file,
     layout_spec,
     prism_mass,
     pupil_share,
@@ -154,6 +153,7 @@ def posterior(found: Information) -> np.ndarray:
     return np.asarray(found.disturbances.misfit(found.gain) + found.gain @ found.noise @ found.gain.T)
 
 
+@pytest.mark.second
 def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
     even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     # rounding falls with the number of frames where read noise spreads over its steps
@@ -197,6 +197,7 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
     assert np.all(sigma < 1.35 * np.sqrt(2.0) * airy[:, None])
 
 
+@pytest.mark.second
 def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
     # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
     start = path.instrument
@@ -230,7 +231,7 @@ def test_a_layout_whose_prisms_collide_is_refused_with_both_bodies_and_the_line(
 ) -> None:
     near = replace(SECOND, prism_180_distance=2.42, pupil_x=0.2)
     file = tmp_path / "hand.yaml"
-    file.write_text(instrument_file(layout_spec(setup, (FIRST, near)), "made by hand"), "utf-8")
+    file.write_text(layout_spec(setup, (FIRST, near)).file_text("made by hand"), "utf-8")
     design = written(tmp_path, DESIGN.replace("instrument: gf7_pair", "instrument: hand.yaml"))
     result = CliRunner().invoke(app, ["monitor", str(design), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2

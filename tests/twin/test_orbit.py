@@ -80,6 +80,7 @@ def test_the_node_follows_the_mean_sun(two_days) -> None:
     assert 97.3 < np.degrees(np.mean(inclination)) < 97.4
 
 
+@pytest.mark.second
 def test_nodes_of_other_inclinations_move_at_the_secular_rate() -> None:
     # -3/2 n J2 (R/p)^2 cos i by mean elements, themselves averaged over whole revolutions
     for inclination in (30.0, 63.4, 120.0):

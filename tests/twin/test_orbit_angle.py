@@ -310,6 +310,7 @@ def test_run_folder(done) -> None:
     assert {link for link in links if not link.startswith(("#", "data:"))} <= files(folder)
 
 
+@pytest.mark.second
 def test_config_repeats_the_run(done, tmp_path: Path) -> None:
     folder, _ = done
     target = tmp_path / "again"

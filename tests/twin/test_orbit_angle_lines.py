@@ -76,6 +76,7 @@ def test_what_is_tested_is_not_small(changed) -> None:
     assert abs(estimated(bare, flight).look[0] - flight.look["alpha"]) > 0.1 * ARCSEC
 
 
+@pytest.mark.second
 def test_mirrors_and_heat_reach_the_ground(gf7_pair, changed, backend) -> None:
     """A mirror's turn and figure in one camera, in place of the example's changes."""
     state = {
@@ -103,6 +104,7 @@ def test_height_of_one_arcsecond(changed) -> None:
     assert 4.5 < expected < 5.5
 
 
+@pytest.mark.second
 def test_scatter_of_the_pair(backend) -> None:
     """Chi-square of 100 passes to either side at 1e-4: three statements."""
     changes = {"base/backward/focal_plane": PAIR.test.changes["base/backward/focal_plane"]}
@@ -150,6 +152,7 @@ def test_scatter_of_off_axis_angles() -> None:
     assert full.height["high_resolution"] > 50.0
 
 
+@pytest.mark.second
 def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
     """A line turned so that its plane is the nadir line's: unsigned planes are told as folded, the signed angle not."""
     camera = LINES.camera
@@ -211,6 +214,7 @@ def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     assert {"artefacts/change.csv", "artefacts/sensitivity-alpha-points.svg"} <= files(folder)
 
 
+@pytest.mark.second
 def test_config_repeats_the_pair(done, tmp_path: Path) -> None:
     folder, _ = done
     result = run("angle", folder / "config.yaml", "--out", tmp_path / "again", "--quiet")

@@ -57,6 +57,7 @@ FOUND = {
 }
 
 
+@pytest.mark.second
 def test_what_is_stated_rightly_stands_and_what_cannot_be_told_is_said(files) -> None:
     """Camera and platform are wrong by what is stated of them. Half a pixel and half a line look like a turn of the
     platform by two arcseconds, and say so.

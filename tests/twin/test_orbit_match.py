@@ -62,6 +62,7 @@ def errors(flown: Simulation, found: Match) -> dict[str, np.ndarray]:
     return out
 
 
+@pytest.mark.second
 def test_points_in_files_are_where_the_true_sensor_has_them(flown: Simulation, files) -> None:
     """As in a simulated patch: 0.25 px with another season's light on 5 m pixels, and the covariance holds it."""
     found = matched(*files)

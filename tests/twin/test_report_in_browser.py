@@ -130,6 +130,7 @@ def open_page(browser):
         reader.context.close()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("width", "scheme"),
     [
@@ -209,6 +210,7 @@ def test_a_drawing_stands_in_where_there_is_no_webgl(launcher, report) -> None:
         browser.close()
 
 
+@pytest.mark.second
 def test_a_table_is_downloaded_without_network(run, report, open_page) -> None:
     reader = open_page(report, 1400, "light")
     with reader.page.expect_download() as waiting:

@@ -200,6 +200,7 @@ def test_a_corrupt_chunk_is_computed_again(done) -> None:
     assert same_bytes(folder) == before
 
 
+@pytest.mark.second
 def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     folder, path, _ = done
     before = same_bytes(folder)
@@ -211,6 +212,7 @@ def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     assert time.monotonic() - begun < 30.0
 
 
+@pytest.mark.second
 def test_folders_that_are_not_ones_own(done, tmp_path) -> None:
     folder, path, _ = done
     before = {name: (folder / name).read_bytes() for name in files(folder)}
@@ -284,6 +286,7 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     assert "tcp://" in result.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("address", "told"),
     [

@@ -137,6 +137,7 @@ def test_when_there_is_little_to_say(tmp_path, case) -> None:
     assert expected in page(tmp_path, study, {"y": y}, np.arange(len(y)) < failed)
 
 
+@pytest.mark.second
 def test_a_grid_with_holes_has_no_indices(tmp_path) -> None:
     study = study_of("{a: {key: [job, a], values: [1, 2, 3]}, b: {key: [job, b], values: [1, 2, 3]}}", "{kind: grid}",
                      report="{sobol: true}")  # fmt: skip
@@ -166,6 +167,7 @@ def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
 THREE = "{a: {key: [job, a], values: [1, 2, 3]}, c: {key: [job, c], values: ['$x_{', '100 $', 'a$b$']}}"
 
 
+@pytest.mark.second
 def test_dollars_are_no_formulas() -> None:
     """Of units and of values that are texts; matplotlib would read what stands between two of them as a formula."""
     study = study_of(THREE, "{kind: grid}", r'{y: {key: [t, y], unit: "$\\foo$"}, z: {key: [t, z], unit: US$}}')
@@ -175,6 +177,7 @@ def test_dollars_are_no_formulas() -> None:
     assert len(made.contents["artefacts/histograms.svg"]) > 1000
 
 
+@pytest.mark.second
 def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no such font")

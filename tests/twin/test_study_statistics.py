@@ -188,6 +188,7 @@ def least(coverage: float) -> int:
     return int(stats.binom.ppf(FALSE_ALARM, SEEDS, coverage))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "case", ["without noise", *(pytest.param(case, marks=pytest.mark.slow) for case in ("noise", "curved"))]
 )
@@ -237,6 +238,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("shape", "stated"),
     [
@@ -343,6 +345,7 @@ def test_a_share_of_noise_above_one_is_an_error_and_not_cut_off() -> None:
     assert impossible(shared) is None
 
 
+@pytest.mark.second
 def test_true_noise_is_possible_where_nothing_else_varies() -> None:
     """Half of such studies have a share above 1; chances are even, so that none of 100 is below 1e-6 (1e-4 a run, of
     fixed seeds), and a tenth of variance too much in 20 000 runs is found.
@@ -358,6 +361,7 @@ def test_true_noise_is_possible_where_nothing_else_varies() -> None:
     assert noise_share(half.responses[0], half.study).share == pytest.approx(0.5, rel=0.05)
 
 
+@pytest.mark.second
 def test_failures_that_go_with_the_response() -> None:
     """Runs fail where the response is bad: the interval of the others misses the truth, that of all runs does not."""
     held = missed = 0

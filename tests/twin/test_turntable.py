@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import choose, compensate
-from scenes.specs.load import EXAMPLES, load_turntable_test
+from scenes.specs.load import EXAMPLES, LAB, load_named
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
@@ -24,7 +24,7 @@ from twin.laboratory.turntable_run import TurntableRun, run_turntable
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4
-SPEC = load_turntable_test()
+SPEC = load_named(TurntableTestSpec, LAB, "turntable")
 FILE = EXAMPLES.parent / "lab" / "turntable.yaml"
 
 
@@ -210,7 +210,7 @@ def test_bad_files(old: str, new: str, text: str, tmp_path: Path) -> None:
     path = tmp_path / "turntable.yaml"
     path.write_text(source.replace(old, new), "utf-8")
     with pytest.raises(InputError, match=text) as caught:
-        load_turntable_test(path)
+        load_named(TurntableTestSpec, LAB, path)
     assert caught.value.line
 
 

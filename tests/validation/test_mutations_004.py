@@ -4,7 +4,7 @@ them is broken.
 Not listed, for nothing can be seen of them: the two edges' vertices swapped (best focus is their mean), the sign of an
 MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from twin.validation.paper_004 import distortion_checks, equations_004, focus_ch
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

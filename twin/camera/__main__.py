@@ -71,7 +71,7 @@ def main(
     def work(setup: CameraSetup, session: Session) -> Result:
         from scenes.models.camera_sharpness import blur_warnings
         from twin.camera.camera_report import camera_report
-        from twin.camera.camera_run import camera_data, camera_numbers, run_camera
+        from twin.camera.camera_run import CAMERA, camera_data, run_camera
         from twin.run.data_files import netcdf
         from twin.run.page import RunFacts, write_test
 
@@ -79,7 +79,7 @@ def main(
         # what a refocused camera's file lacked has been done; how good it is now its verdict says
         warnings = () if refocus else blur_warnings(setup, session.backend)
         shown = camera_report(run, warnings)
-        numbers = {**camera_numbers(run), "verdict": shown.verdict}
+        numbers = {**CAMERA(run), "verdict": shown.verdict}
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
         name = session.backend.name
         options = (*((what,) if what else ()), *(("--refocus",) if refocus else ()))

@@ -17,7 +17,6 @@ from optics.raytrace.trace import BeamMissedError
 from scenes.models.camera_design import (
     CameraDesignSetup,
     beams_of,
-    camera_file,
     camera_of,
     operands_of,
     prescription_of,
@@ -107,7 +106,7 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         warnings.append(f"camera {spec.name} is blurred: {told}")
     if not found.converged:
         warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
-    return DesignRun(setup, searched, camera_file(spec, remark), tuple(warnings))
+    return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
 def design_numbers(run: DesignRun) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from optics.numerics.backend import Backend
 from scenes.models.monitor_layout import (
     Beam,
     MonitorDesignSetup,
-    instrument_file,
     layout_spec,
 )
 from scenes.specs.detector import DetectorSpec
@@ -116,7 +115,7 @@ def run_monitor_design(
         spec = layout_spec(setup, facts.beams).model_copy(update={"name": name})
         lines = [f"{GOAL_NAMES[goal]} {text}" for goal, text in _texts(facts, bench).items()]
         remark = REMARK.format(start=setup.instrument.name, sigmas="; ".join(lines))
-        points.append(Point(name, facts, instrument_file(spec, remark)))
+        points.append(Point(name, facts, spec.file_text(remark)))
     return MonitorDesignRun(setup, bench, found, tuple(points))
 
 

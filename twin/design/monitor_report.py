@@ -19,7 +19,7 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 
 _MOST_CAUSES = 6
 

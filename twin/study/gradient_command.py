@@ -16,7 +16,7 @@ from twin.run.procedure import WRITE, Session
 from twin.run.provenance import inputs_in
 from twin.run.reference_frames import described
 from twin.run.run_folder import write_manifest
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.study.gradient.gradient_numbers import gradient_numbers, whole_table
 from twin.study.gradient.gradient_report import response_table, verdict, write_report
 from twin.study.gradient.study_gradient import Gradient, study_gradient

@@ -136,7 +136,7 @@ def run_study(
                 remember(text)
             # nor is what judges cameras, before the study's file is known to be good
             from scenes.models.camera_sharpness import blur_warnings, cameras_of
-            from twin.sensors.grey_steps import coarse_warnings
+            from twin.sensors.area_detector import coarse_warnings
 
             given = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
             given = (*given, *coarse_warnings(base))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from scenes.specs.study import GRID, SAMPLERS
+from scenes.specs.samplers import GRID, SAMPLERS
 from twin.run.report import one_sentence
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
 from twin.study.report.stated_noise import impossible

@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 import xarray as xr
 
-from scenes.specs.study import GRID, NOISE, FactorSpec, StudySpec
+from scenes.specs.samplers import GRID
+from scenes.specs.study import NOISE, FactorSpec, StudySpec
 
 _SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from scenes.specs.study import GRID, FactorSpec, StudySpec, unit_cube
+from scenes.specs.samplers import GRID, unit_cube
+from scenes.specs.study import FactorSpec, StudySpec
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
 from twin.study.runs.config_tree import Tree, leaf
