@@ -128,9 +128,9 @@ PROCEDURES: dict[str, Procedure] = {
         "focus",
         setup="scenes.specs.resolved:FocusSetup",
         resolve="scenes.specs.resolved:resolve_focus_test",
-        run="twin.laboratory.measured_focus:run_focus_test",
+        run="twin.laboratory.focus_run:run_focus",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
-        report="twin.laboratory.focus_measured_report:any_focus_report",
+        report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
             FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test"),
@@ -180,7 +180,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.resolved:TurntableSetup",
         resolve="scenes.specs.resolved:resolve_turntable_test",
         run="twin.laboratory.turntable_run:run_turntable_test",
-        numbers="twin.laboratory.turntable_numbers:turntable_numbers",
+        numbers="twin.laboratory.turntable_numbers:TURNTABLE",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(

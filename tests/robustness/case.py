@@ -17,7 +17,7 @@ JOBS = Path(__file__).parents[1] / "golden/jobs"
 
 CUTS = (
     "twin.monitor.truth.LineSight.truth",
-    "twin.laboratory.focus_alignment.align",
+    "twin.laboratory.focus_run.align",
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
     "twin.laboratory.distortion_run.choose",
