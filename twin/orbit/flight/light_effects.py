@@ -15,8 +15,7 @@ import numpy as np
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
 
 if TYPE_CHECKING:
-    from scenes.specs.orbit.angle import EffectsSpec
-    from scenes.specs.orbit.scene import LightEffectsSpec
+    from scenes.specs.orbit.angle import EffectsSpec, LightEffectsSpec
 
 SPEED_OF_LIGHT = 299_792_458.0
 """m/s."""
