@@ -27,11 +27,11 @@ from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 
 RIM_SIDES = 256
-"""Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it
-takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
+"""Sides of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of
+it takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
 
 FEW_SIDES = 64
-"""The same for many pupils at once: 16 times the errors."""
+"""Sides of that polygon for many pupils at once: 16 times the errors."""
 
 LARGEST = 0.5
 """Size of a piece, in radii of the pupil: a wavefront is continued from a piece to its box, the corners of which may
@@ -83,7 +83,7 @@ class PupilShadow:
 
     @property
     def area(self) -> np.ndarray:
-        """Of each pupil's shadow, (B,), in p."""
+        """Area of each pupil's shadow, (B,), in p."""
         return np.asarray(np.sum(area(self.pieces), axis=-1))
 
     @cached_property
@@ -124,7 +124,7 @@ class PupilShadow:
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
     def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
-        """The same as ``overlap``, part by part."""
+        """Quadrature as ``overlap`` gives it, part by part."""
         moves = np.stack([shift.real, shift.imag], axis=-1)
         full = area(self.pieces) > SMALLEST
         points, weights = self.whole(count)
@@ -237,7 +237,7 @@ def _without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list
 
 
 def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
+    """Cut shadows (B, K, V, 2) into pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
     of the K each is, (L,).
     """
     owners = np.arange(pieces.shape[1])

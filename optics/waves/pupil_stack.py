@@ -45,7 +45,7 @@ _EDGE_SAMPLES = 32
 _AT_ONCE = 2**14
 """Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
 _SHADOWS_AT_ONCE = 2**16
-"""The same for shadows, where the way to the points is longer than what is done there."""
+"""Nodes at once for shadows, where the way to the points is longer than what is done there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +245,7 @@ class PupilStack:
         return eikonal, amplitude
 
     def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same at p (F, Q) in pupils (F,)."""
+        """Values at places p (F, Q) of pupils (F,)."""
         order, place, most = in_rows(owner, len(self.axes))
         points = np.zeros((len(self.axes), most, p.shape[1]), complex)
         points[owner[order], place] = p[order]

@@ -16,7 +16,7 @@ from optics.numerics import quadrature
 from optics.raytrace.assembly import Interaction
 from optics.waves.wavefront import fit_wavefront, orthonormal_parts
 from scenes.lens.__main__ import read_prescription
-from scenes.lens.batoid_file import batoid_text
+from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import prescription_of
 from scenes.lens.prescription import LensSurface

@@ -291,6 +291,7 @@ def test_a_line_ccd_knows_its_exposure():
         LineCcd.from_specs(spec, full)
 
 
+@pytest.mark.second
 def test_coarse_grey_values_are_warned_of(backend):
     """By the data sheet alone: every one of the library is fine, 8 bits of the monitor's CCD are not."""
     for path in sorted((LIBRARY / "detectors").glob("*.yaml")):

@@ -351,6 +351,7 @@ def test_two_pages_take_turns():
             seen = numbered(one.recv(5))
 
 
+@pytest.mark.second
 def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
     """A page that reads nothing: answers of 1 MB do not pile up, and the other page is served."""
     computer = StandIn(bytes_each=1_000_000)

@@ -125,6 +125,7 @@ def test_bodies_fill_their_outline(gf7_pair, paths, seen):
         assert found.max(axis=0) == pytest.approx(where.max(axis=0), abs=3.0), body
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
 def test_all_that_matters_can_be_seen(backend, instrument, name, seen):
     model = instrument(name)
@@ -166,6 +167,7 @@ def test_colours(backend, gf7_pair, paths):
     assert (image.max(axis=-1) < 80).sum() > 5  # black housings
 
 
+@pytest.mark.second
 def test_a_seed_gives_the_same_picture(backend, gf7_pair, paths):
     first, again, other = (render_shot(gf7_pair, paths, backend, SMALL[2], seed).astype(int) for seed in (7, 7, 8))
     assert np.array_equal(first, again)
@@ -198,6 +200,7 @@ def test_grey_values_rise_with_light():
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_former_variant_is_set_again(backend):
     import mitsuba as mi
 

@@ -303,12 +303,7 @@ def _extent(model: CameraModel, backend: Backend, axis: int) -> tuple[float, flo
     room = 0.05 * length
     first = float(z.min()) - _BEFORE * length
     across = np.concatenate([points[..., axis], _begun(rays, first)[:1, ..., axis]])
-    return (
-        first,
-        float(z.max()) + 2.0 * room,
-        float(across.min()) - room,
-        float(across.max()) + room,
-    )
+    return (first, float(z.max()) + 2.0 * room, float(across.min()) - room, float(across.max()) + room)
 
 
 def _begun(points: np.ndarray, first: float) -> np.ndarray:

@@ -168,29 +168,17 @@ def _wavefronts(run: CameraRun) -> Section:
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."
-    return Section(
-        "Wavefront",
-        (text,),
-        (
-            _figure(
-                "wavefront-field",
-                "Over the field",
-                "Rms wavefront error; the ring marks the worst field.",
-                plots.error_figure, run,
-            ),
-            _figure(
-                "wavefront-maps",
-                "Maps",
-                "Over the stop, x along the line to the right, y along the track upward; one scale of colours. "
-                "Positive where the wavefront is ahead.",
-                plots.wavefront_figure, run,
-            ),
-            _figure(
-                "zernike-bars", "Zernike terms", "In the middle and at the worst field.", plots.zernike_figure, run
-            ),
-            table,
-        ),
-    )  # fmt: skip
+    over_field = "Rms wavefront error; the ring marks the worst field."
+    over_stop = (
+        "Over the stop, x along the line to the right, y along the track upward; one scale of colours. Positive where "
+        "the wavefront is ahead."
+    )
+    figures = (
+        _figure("wavefront-field", "Over the field", over_field, plots.error_figure, run),
+        _figure("wavefront-maps", "Maps", over_stop, plots.wavefront_figure, run),
+        _figure("zernike-bars", "Zernike terms", "In the middle and at the worst field.", plots.zernike_figure, run),
+    )
+    return Section("Wavefront", (text,), (*figures, table))
 
 
 def _spots(run: CameraRun) -> Section:
@@ -199,27 +187,11 @@ def _spots(run: CameraRun) -> Section:
         for s in run.spots
     ]
     heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
-    return Section(
-        "Spots",
-        (),
-        (
-            _figure(
-                "spots",
-                "Spot diagrams",
-                "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk.",
-                plots.spot_figure,
-                run,
-            ),
-            Table(
-                "spot-sizes",
-                "Spot sizes by field",
-                "Radii about the centroid.",
-                heads,
-                rows,
-                (None, 3, 3, 3, 3, 3),
-            ),
-        ),
-    )
+    caption = "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk."
+    figure = _figure("spots", "Spot diagrams", caption, plots.spot_figure, run)
+    decimals = (None, 3, 3, 3, 3, 3)
+    table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, decimals)
+    return Section("Spots", (), (figure, table))
 
 
 def _mtf(run: CameraRun) -> Section:
@@ -242,19 +214,10 @@ def _mtf(run: CameraRun) -> Section:
         f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
+    caption = "Along the line and along the track; dashed what diffraction allows."
+    figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
     return Section(
-        "MTF",
-        (text,),
-        (
-            _figure(
-                "mtf",
-                "MTF by field",
-                "Along the line and along the track; dashed what diffraction allows.",
-                plots.mtf_figure,
-                run,
-            ),
-            Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)),
-        ),
+        "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
     )
 
 
@@ -290,27 +253,16 @@ def _field(run: CameraRun) -> Section:
         [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
         for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
     ]
-    return Section(
-        "Over the field",
-        text,
-        (
-            _figure(
-                "distortion",
-                "Distortion",
-                "Left against the perfect camera with the best principal distance and point; right along the line.",
-                plots.distortion_figure, run,
-            ),
-            _figure(
-                "field-curves",
-                "Focus and illumination",
-                "Along the line. Illumination is the solid angle of the beam as the focal plane sees it.",
-                plots.curves_figure, run,
-            ),
-            Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
-            Table("distortion-line", "Distortion along the line", "", ("L [mm]", "W [deg]", "distortion [µm]"), line,
-                  (3, 5, 3)),
-        ),
-    )  # fmt: skip
+    against = "Left against the perfect camera with the best principal distance and point; right along the line."
+    bent = "Along the line. Illumination is the solid angle of the beam as the focal plane sees it."
+    told = ("L [mm]", "W [deg]", "distortion [µm]")
+    artefacts = (
+        _figure("distortion", "Distortion", against, plots.distortion_figure, run),
+        _figure("field-curves", "Focus and illumination", bent, plots.curves_figure, run),
+        Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
+        Table("distortion-line", "Distortion along the line", "", told, line, (3, 5, 3)),
+    )
+    return Section("Over the field", text, artefacts)
 
 
 def _bodies(run: CameraRun) -> Section:

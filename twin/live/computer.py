@@ -117,12 +117,7 @@ class Answers:
         try:
             state = self.bench.states(asked.state)
             told["svg"] = self.pictures.draw(
-                asked.view,
-                asked.camera,
-                asked.field,
-                state,
-                asked.state.frames,
-                self.bench.seed_of(asked.state.seed),
+                asked.view, asked.camera, asked.field, state, asked.state.frames, self.bench.seed_of(asked.state.seed)
             )
         except LOST as error:
             told["problem"] = str(error)[:1000]

@@ -330,9 +330,4 @@ def _played(course: CourseSpec) -> dict[str, Any]:
 
 
 def _label(parameter: Parameter) -> Mapping[str, str]:
-    return {
-        "key": parameter.key,
-        "symbol": parameter.symbol,
-        "unit": parameter.unit,
-        "meaning": parameter.meaning,
-    }
+    return {"key": parameter.key, "symbol": parameter.symbol, "unit": parameter.unit, "meaning": parameter.meaning}

@@ -382,9 +382,7 @@ def _step(
             chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
             onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
             event = dr.select(
-                reflecting,
-                UInt(int(Event.REFLECT)),
-                dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE)),
+                reflecting, UInt(int(Event.REFLECT)), dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE))
             )
             out_index = Float(1.0)
             if glass:

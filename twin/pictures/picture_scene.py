@@ -67,12 +67,7 @@ def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, n
 
 
 def framed(
-    points: np.ndarray,
-    azimuth: float,
-    elevation: float,
-    field: float,
-    size: tuple[int, int],
-    margin: float = 0.04,
+    points: np.ndarray, azimuth: float, elevation: float, field: float, size: tuple[int, int], margin: float = 0.04
 ) -> View:
     """The nearest camera of a direction that has all points in its picture.
 

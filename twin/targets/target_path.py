@@ -19,7 +19,7 @@ from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
-from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
@@ -142,7 +142,7 @@ class TargetPath:
         body = line_body(self.root)
         local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
-        sight = chief_directions(
+        _, sight = chief_rays(
             self.backend,
             assemble(self.assembly, [f"{self.name}/image_to_stop"], placed=placed),
             assemble(self.assembly, [f"{self.name}/image_to_object"], placed=placed),
