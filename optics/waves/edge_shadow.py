@@ -26,6 +26,9 @@ DEGREE = 10
 ROUND_SIDES = 48
 """Of the polygon that stands for a round edge and has its area."""
 
+MOST_PIECES = 120
+"""Of a shadow: the time of a transfer function grows with the square of their number."""
+
 _WINDOW, _WINDOW_SIDES = 1.2, 16
 """Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
 
@@ -64,6 +67,11 @@ class StopOutlines:
         """
         # each image by itself: what is one piece in one of them may be many in another
         each = [self._of_one(number, further) for number in range(count)]
+        if max(map(len, each)) > MOST_PIECES:
+            raise UnphysicalError(
+                f"edges cut the pupil into {max(map(len, each))} pieces of shadow, more than {MOST_PIECES}, which its "
+                "transfer function does not take"
+            )
         pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
         for number, one in enumerate(each):
@@ -146,8 +154,10 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
             if not shape.inner:
                 yield _turned([outer], edge), edge.blocks
             elif edge.blocks:
-                rings = difference(outer[None], shape.inner * unit[None])
-                yield _turned([ring[0] for ring in rings], edge), True
+                # sectors whose corners are those of their neighbours, so that no gap opens between them on the stop
+                both = np.stack([outer, np.roll(outer, -1, axis=0)], axis=1)
+                sectors = np.concatenate([both, (shape.inner / shape.radius) * both[:, ::-1]], axis=1)
+                yield _turned(list(sectors), edge), True
             else:
                 yield _turned([outer], edge), False
                 yield _turned([shape.inner * unit], edge), True
@@ -158,7 +168,7 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
             yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
         case Rectangle():
             corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-            yield _turned([corners * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+            yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks
         case Ray():
             half = 0.5 * shape.width
             yield _turned([np.array([[0.0, -half], [_FAR, -half], [_FAR, half], [0.0, half]])], edge), edge.blocks
@@ -197,6 +207,16 @@ def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
         else:
             raise UnphysicalError("the sides of a polygonal edge cross each other")
     return [*out, rest]
+
+
+def _divided(corners: np.ndarray) -> np.ndarray:
+    """A polygon (V, 2) with further corners on its sides, which may bend on the stop."""
+    share = np.arange(_PARTS)[:, None] / _PARTS
+    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+
+
+_PARTS = 8
+"""Of each side of a rectangle."""
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
