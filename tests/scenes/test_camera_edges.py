@@ -159,7 +159,7 @@ def test_a_chief_ray_that_is_stopped_is_still_the_beams_middle(bare, cut) -> Non
 
 
 def dense_mtf(optics: CameraOptics, field: tuple[float, float], frequency: np.ndarray, cells: int = 900) -> np.ndarray:
-    """MTF by the autocorrelation of a raster of the pupil, every cell a traced ray that edges stop or let through: along
+    """MTF by the autocorrelation of a raster of the pupil, every cell a traced ray that edges stop or pass: along
     the line and along the track, (2, M). Shares the traced rays with the product, and nothing else.
     """
     axis = (np.arange(cells) + 0.5) / cells * 2.0 - 1.0
