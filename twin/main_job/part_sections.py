@@ -4,24 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
 from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
 from twin.path_tracing.families import family_name
 from twin.path_tracing.path_result import Family
-from twin.run.artefact import (
-    FAR,
-    Artefact,
-    Cell,
-    Marked,
-    Table,
-    fixed,
-    plain,
-    residual,
-    residual_cell,
-    significant,
-)
+from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
 from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
@@ -318,3 +309,39 @@ def _way(family: Family) -> str:
     prisms = [step for step in way if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
+
+
+SHOWN_ANGLES = np.arange(0.0, 90.0, 10.0)
+"""Angles of incidence, degrees, at which coatings are shown; those beyond their tables are left out."""
+
+
+def finish_section(run: RenderRun) -> Section | None:
+    """What the tables are at the monitor's wavelength; None where there are none."""
+    measured = None if run.stray is None else run.stray.measured
+    if measured is None or not (measured.scatter or measured.coatings):
+        return None
+    tables = []
+    if measured.scatter:
+        rows: list[tuple[Cell, ...]] = []
+        for kind, scatter in measured.scatter.items():
+            rms = scatter.table.reciprocity()
+            for angle, stated in zip(scatter.table.incidence, scatter.stated, strict=True):
+                total = scatter.table.total(float(angle))
+                unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
+                rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * stated, unequal))
+        heads = ("surfaces", "incidence [deg]", "total scatter [%]", "stated by the file [%]", "not reciprocal [% rms]")
+        text = "Of the incident light: the integral of the table, which is what paths scatter."
+        tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
+    if measured.coatings:
+        coats: list[tuple[Cell, ...]] = []
+        for kind, coating in measured.coatings.items():
+            through = kind == "coated"
+            for degrees in SHOWN_ANGLES:
+                if degrees == 0.0 or np.radians(degrees) <= coating.angles[-1]:
+                    reflected, passed = coating.at(float(np.radians(degrees)), through)
+                    coats.append((kind, float(degrees), 100.0 * reflected, 100.0 * passed if through else ""))
+        columns = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
+        text = "At the monitor's wavelength, for unpolarised light."
+        tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
+    about = "Finishes by tables that somebody measured; all others are built in."
+    return Section("Measured finishes", (about,), tuple(tables), 1)

@@ -58,6 +58,15 @@ class Truth:
         lines = np.concatenate([self.lines[:, :1], self.lines[:, 1:][:, states]], axis=1)
         return replace(self, cameras=cameras, angle_change=self.angle_change[states], lines=lines)
 
+    def vector(self, camera: str) -> np.ndarray:
+        """(S, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera.
+
+        Args:
+            camera: its name.
+        """
+        change = self.cameras[camera]
+        return np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
+
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
         """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.
 
@@ -223,7 +232,7 @@ def truth_jacobian(
     states = [m.state(DIFFERENCE) for m in motions] + [m.state(-DIFFERENCE) for m in motions]
     truth = trace_truth(instrument, backend, states)
     out = {}
-    for name, change in truth.cameras.items():
-        rows = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f])
+    for name in truth.cameras:
+        rows = truth.vector(name).T
         out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * DIFFERENCE)
     return out

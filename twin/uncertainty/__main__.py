@@ -81,9 +81,9 @@ def main(
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.page import RunFacts, write_test
         from twin.run.provenance import checks_in
+        from twin.uncertainty.coverage import run_uncertainty
         from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
         from twin.uncertainty.uncertainty_report import uncertainty_report
-        from twin.uncertainty.uncertainty_run import run_uncertainty
 
         run = run_uncertainty(resolved, session.backend, states, session.advance)
         shown = uncertainty_report(run)
