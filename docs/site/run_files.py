@@ -19,6 +19,7 @@ from scenes.specs.study import UNITS, unit_of
 from scenes.yaml.yaml_file import read_yaml
 from tests.golden.fields import kept_fields
 from tests.golden.jobs import ALL
+from twin.run.quantity import Record
 from twin.run.run_folder import Manifest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -206,7 +207,7 @@ def meaning(kind: str, path: tuple[str, ...]) -> str:
     if kind == "manifest":
         return attributes(Manifest).get(re.sub(r"(\[\])+$", "", path[0]), "")
     model = _model(kind)
-    said = _of_dataclass(model, path)[0] if model is not None else ""
+    said = _declared(model, path)[0] if model is not None else ""
     if said:
         return said
     if key.endswith("_sigma") or key == "sigma":
@@ -215,31 +216,37 @@ def meaning(kind: str, path: tuple[str, ...]) -> str:
 
 
 @cache
-def _models() -> dict[str, type[Any]]:
-    """Kind of file -> the dataclass whose docstring begins with its name."""
+def _models() -> dict[str, type[Any] | Record[Any]]:
+    """Kind of file -> the record whose meaning, or the dataclass whose docstring, begins with its name."""
     out = {}
     for path in sorted((ROOT / "twin").rglob("*.py")):
         for node in ast.parse(path.read_text("utf-8")).body:
+            name, text = "", ""
             if isinstance(node, ast.ClassDef):
-                said = re.match(r"([a-z_]+)\.json\b", ast.get_docstring(node) or "")
-                if said:
-                    module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-                    out[said[1]] = getattr(importlib.import_module(module), node.name)
+                name, text = node.name, ast.get_docstring(node) or ""
+            elif isinstance(node, ast.AnnAssign | ast.Assign) and isinstance(node.value, ast.Call) and node.value.args:
+                target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
+                name, text = ast.unparse(target), _text(node.value.args[0], "")
+            if said := re.match(r"([a-z_]+)\.json\b", text):
+                module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+                out[said[1]] = getattr(importlib.import_module(module), name)
     return out
 
 
-def _model(kind: str) -> type[Any] | None:
+def _model(kind: str) -> type[Any] | Record[Any] | None:
     return _models().get(kind)
 
 
 def mapping_meaning(kind: str, path: tuple[str, ...]) -> str:
     """What the dataclass says of itself whose fields stand below a path; empty where none makes the file."""
     model = _model(kind)
-    return _of_dataclass(model, path)[1] if model is not None and path else ""
+    return _declared(model, path)[1] if model is not None and path else ""
 
 
-def _of_dataclass(model: type[Any], path: tuple[str, ...]) -> tuple[str, str]:
-    """What a dataclass says of its field at the end of a path, and what the dataclass there says of itself."""
+def _declared(model: type[Any] | Record[Any], path: tuple[str, ...]) -> tuple[str, str]:
+    """What a record or a dataclass says of its field at the end of a path, and what the one there says of itself."""
+    if isinstance(model, Record):
+        return _of_record(model, path)
     here: Any = model
     said = ""
     for part in path:
@@ -256,6 +263,20 @@ def _of_dataclass(model: type[Any], path: tuple[str, ...]) -> tuple[str, str]:
         for _ in range(part.count("[]")):
             here = _item(here)
     return said, summary(here) if isinstance(here, type) and dataclasses.is_dataclass(here) else ""
+
+
+def _of_record(record: Record[Any], path: tuple[str, ...]) -> tuple[str, str]:
+    here: Record[Any] | None = record
+    said = ""
+    for part in path:
+        names = re.sub(r"(\[\])+$", "", part).strip("{}").split("|")
+        found = None if here is None else next((one for one in here if one.key in names), None)
+        if found is not None:
+            said, here = found.meaning, found.below
+        elif not part.startswith("{"):
+            # a name of a mapping leads to what the mapping holds; anything else is not declared
+            return "", ""
+    return said, "" if here is None else here.meaning
 
 
 def _bare(hint: Any) -> Any:

@@ -78,6 +78,12 @@ class Quantity(Generic[S]):
     converted: bool = True
 
     @property
+    def below(self) -> Record[Any] | None:
+        """The record whose quantities stand below the key, also where its rows do; None for a plain value."""
+        owner = getattr(self.of, "__self__", None)
+        return self.record or (owner if isinstance(owner, Record) else None)
+
+    @property
     def unit(self) -> str:
         """As the program writes it, empty for none."""
         square = self.key.removesuffix("2") if self.key.endswith("m2") else ""
