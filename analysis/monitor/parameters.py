@@ -56,6 +56,11 @@ class Parameter:
         return self.file_unit.replace("um", "µm")
 
     @property
+    def label(self) -> str:
+        """Head of its column: ``Δα [arcsec]``."""
+        return f"{self.symbol} [{self.unit}]"
+
+    @property
     def per_si(self) -> float:
         """How many of its unit make one SI unit."""
         return _PER_SI[self.file_unit]

@@ -63,12 +63,8 @@ def _motions(run: RenderRun) -> Table:
     pitch = 1e6 * run.experiment.path.pitch
     places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
     heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
-    heads += [f"{p.symbol} [{p.unit}] true" for p in parameters.CAMERA_PARAMETERS]
-    heads += [
-        f"{p.symbol} [{p.unit}] {estimator.title}"
-        for estimator in run.estimators.values()
-        for p in parameters.CAMERA_PARAMETERS
-    ]
+    readers = ("true", *(estimator.title for estimator in run.estimators.values()))
+    heads += [f"{p.label} {reader}" for reader in readers for p in parameters.CAMERA_PARAMETERS]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
@@ -106,10 +102,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
         bands[len(rows)] = body.removeprefix(f"{BASE}/")
         for k in members:
             motion = table.motions[k]
-            row: list[Cell] = [
-                _short(motion.label),
-                Marked(shown_unit(motion.unit), "", "number"),
-            ]
+            row: list[Cell] = [_short(motion.label), Marked(shown_unit(motion.unit), "", "number")]
             for p, floor in enumerate(floors):
                 true = float(table.true[p, k])
                 row.append(Marked(significant(true), "", "truth start"))
@@ -122,7 +115,7 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
     caption = Markup('All digits: the table of <a href="#motions">motions and spots</a>.')
     heads = ["Motion", "per", *(head for own in columns for head in ("true", *(label for label, _ in own)))]
     spans = zip(parameters.CAMERA_PARAMETERS, columns, strict=True)
-    over = [("", 2), *((f"{p.symbol} [{p.unit}]", 1 + len(own)) for p, own in spans)]
+    over = [("", 2), *((p.label, 1 + len(own)) for p, own in spans)]
     title = f"Camera {name}"
     return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
 

@@ -142,5 +142,5 @@ def _table(run: RenderRun, wide: bool) -> Table:
         # adding 0.0 after rounding leaves no minus before a zero
         cells = [f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
         tail = f"{own.error:+.{p.decimals}f}", f"{round(own.error / own.sigma, 1) + 0.0:+.1f}"
-        table.add_row(escape(own.label), *cells, *tail)
+        table.add_row(escape(own.parameter.label), *cells, *tail)
     return table

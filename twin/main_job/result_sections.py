@@ -37,12 +37,7 @@ ANGLE_TITLE = "Angle between the cameras"
 
 
 def figure(
-    drawn: Mapping[str, str],
-    name: str,
-    caption: str,
-    title: str = "",
-    full: Table | None = None,
-    count: int = 0,
+    drawn: Mapping[str, str], name: str, caption: str, title: str = "", full: Table | None = None, count: int = 0
 ) -> SvgFigure:
     """A drawing of the run in the page, the ``count``-th of its kind."""
     own = name.partition(" ")[0] + f"-{count}" * (" " in name)
@@ -73,7 +68,7 @@ def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
 
 
 def _label(reading: Reading) -> Marked:
-    return Marked(reading.label, reading.parameter.meaning, "text")
+    return Marked(reading.parameter.label, reading.parameter.meaning, "text")
 
 
 def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> Table:
@@ -109,10 +104,7 @@ def _state_table(run: RenderRun, name: str, title: str) -> Table:
             bands[len(rows)] = heading
         key = first.group if first.where == "both" else f"{first.group}.{p.key}"
         finest = min((one.sigma for one in same if one.sigma > 0), default=0.0)
-        row: list[Cell] = [
-            _label(first),
-            Marked(fixed(first.true, decimals_for(finest)), "", "truth", f"{key}.true"),
-        ]
+        row: list[Cell] = [_label(first), Marked(fixed(first.true, decimals_for(finest)), "", "truth", f"{key}.true")]
         for one in same:
             ratio = residual(one.error, one.sigma)
             good[one.estimator] += ratio is None or abs(ratio) <= FAR
@@ -324,7 +316,7 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
             texts = (error, residual_text(residual(r.error, r.sigma)), expected, left)
             cells = [Marked(text, "", "number") for text in texts]
             judged = residual_cell("", residual(r.error - bias, r.noise), "")
-            rows.append([name, r.label, *cells, judged])
+            rows.append([name, r.parameter.label, *cells, judged])
             row: list[Cell] = [name, r.parameter.symbol, r.parameter.unit, r.error, r.sigma, r.noise]
             full.append([*row, bias, r.error - bias])
         outside, uncovered = joined(found.outside), joined(found.uncovered)

@@ -104,7 +104,7 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
                 axes = figure.add_subplot(grid[row, column])
                 _panel(axes, series, time, same, names)
                 if column == 0:
-                    axes.set_ylabel(same[0].label)
+                    axes.set_ylabel(same[0].parameter.label)
                 if row == 0:
                     axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
                 axes.tick_params(labelbottom=row == rows - 1)
@@ -113,7 +113,7 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
         for same in groups.get(ANGLE_GROUP, ()):
             axes = figure.add_subplot(grid[-1, :])
             _panel(axes, series, time, same, names)
-            axes.set_ylabel(same[0].label)
+            axes.set_ylabel(same[0].parameter.label)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(label)
         svg.shared_legend(figure, figure.axes[0])
@@ -159,13 +159,13 @@ def smoothed_svg(series: TimeSeries) -> str:
         for column, name in enumerate(cameras):
             for row, same in enumerate(groups[name]):
                 axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-                panel(axes, same[0].label if column == 0 else "", same[0], row)
+                panel(axes, same[0].parameter.label if column == 0 else "", same[0], row)
                 if row == 0:
                     axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
         half = len(cameras) if GROUND_GROUP in groups else 2 * len(cameras)
         for same in groups.get(ANGLE_GROUP, ()):
             axes = figure.add_subplot(grid[-1, :half])
-            panel(axes, same[0].label, same[0], rows - 1)
+            panel(axes, same[0].parameter.label, same[0], rows - 1)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
         for same in groups.get(GROUND_GROUP, ())[-1:]:
             axes = figure.add_subplot(grid[-1, len(cameras) :])

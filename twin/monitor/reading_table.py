@@ -70,11 +70,6 @@ class Reading:
         return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
 
     @property
-    def label(self) -> str:
-        """How tables and figures call it: ``Δα [arcsec]``."""
-        return f"{self.parameter.symbol} [{self.parameter.unit}]"
-
-    @property
     def ratio(self) -> float:
         """Error in sigmas; without noise it is infinite unless it is rounding."""
         if self.sigma > 0.0:

@@ -182,7 +182,7 @@ def _summary(run: RecoverRun) -> Table:
         own = next(row for row in same if row.estimator == reading.judged)
         values = [fixed(row.value, decimals_for(own.sigma, 3)) for row in same]
         sigmas = [significant(own.sigma, 3, floor=0.0), significant(own.noise, 3, floor=0.0)]
-        rows.append([own.where, own.label, *values, *sigmas, fixed(own.size, 1, sign=True)])
+        rows.append([own.where, own.parameter.label, *values, *sigmas, fixed(own.size, 1, sign=True)])
     at = f" at {moment(run.times[-1])}" if run.times else ""
     title = f"{_name(run)}: recovered from measured frames{at}"
     caption = f"σ and the last column are those of the {reading.estimators[reading.judged].title}."
@@ -309,7 +309,7 @@ def _drawn(run: RecoverRun) -> list[Line]:
             found = [(times, table.row(one.group, one.parameter.key, "smoothed")) for times, table in parts]
             points = np.concatenate([np.stack([times, row.value, row.sigma], axis=1) for times, row in found])
             band = points[np.argsort(points[:, 0])].T
-        out.append(Line(one.camera, one.label, np.array([run.times, values, sigmas]), band))
+        out.append(Line(one.camera, one.parameter.label, np.array([run.times, values, sigmas]), band))
     return out
 
 

@@ -166,11 +166,10 @@ class Found:
                 at = {"camera": camera, "parameter": key}
                 true = float(truth[key].sel(camera=camera))
                 rows[camera, key] = self._row(true, self.values.sel(at), sigma.sel(at), noise.sel(at))
-        both = [("both", f"angle_{parameters.ANGLE.key}", self.angle, parameters.ANGLE.key)]
-        for where, key, found, name in (
-            *both,
-            *(("ground", f"ground_{p.key}", self.ground, p.key) for p in parameters.GROUND),
-        ):
+        pairs = [("both", "angle", parameters.ANGLE, self.angle)]
+        pairs += [("ground", "ground", one, self.ground) for one in parameters.GROUND]
+        for where, start, one, found in pairs:
+            key, name = f"{start}_{one.key}", one.key
             if key in truth and found:
                 columns = (found[name], found[f"{name}_sigma"], found[f"{name}_sigma_noise"])
                 rows[where, key] = self._row(float(truth[key]), *columns)
@@ -253,9 +252,8 @@ def _truth(run: RenderRun) -> xr.Dataset:
     cameras = true["cameras"]
     keys = list(next(iter(cameras.values())))
     data: dict[str, Any] = {key: ("camera", [cameras[name][key] for name in cameras]) for key in keys}
-    if "intersection_angle" in true:
-        data |= {f"angle_{key}": value for key, value in reversed(true["intersection_angle"].items())}
-    data |= {f"ground_{key}": value for key, value in true.get("ground", {}).items()}
+    for start, group in (("angle", "intersection_angle"), ("ground", "ground")):
+        data |= {f"{start}_{key}": value for key, value in true.get(group, {}).items()}
     about = {"reference_frames": frames_text("truth")}
     return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
 
