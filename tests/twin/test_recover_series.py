@@ -81,7 +81,7 @@ def course(experiment, tmp_path_factory) -> Course:
 def dicts(run_or_series) -> tuple:
     """All that the smoother says."""
     found = run_or_series.smoothed
-    return found.at_dict(), found.between_dict(), found.to_dict()
+    return found.changes.groups(), found.between_dict(), found.to_dict()
 
 
 def sigmas_away(one, other, key: str) -> float:

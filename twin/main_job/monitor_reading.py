@@ -20,7 +20,7 @@ from analysis.monitor.recovery import Recovery
 from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.fit_state import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
-from twin.monitor.reading_table import Reading, ReadingTable, reading_table
+from twin.monitor.reading_table import ReadingTable, reading_table
 from twin.monitor.truth import Truth
 from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
@@ -78,14 +78,6 @@ class MonitorReading:
     def table(self) -> ReadingTable:
         """All readings, beside the truth where there is one."""
         return reading_table(self.recovery, self.cameras, self.truth, self.ground).at(0)
-
-    def readings(self, estimator: str) -> tuple[Reading, ...]:
-        """The table's rows of an estimator: all changes of each camera, of their angle, and errors on the ground.
-
-        Args:
-            estimator: its name.
-        """
-        return self.table.of(estimator)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:

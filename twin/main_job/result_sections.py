@@ -307,7 +307,7 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     notes = []
-    own = [r for r in run.reading.readings(run.judged) if r.camera]
+    own = [r for r in run.reading.table.of(run.judged) if r.camera]
     for name in run.experiment.instrument.cameras:
         found = systematics(run, name)
         for k, r in enumerate(one for one in own if one.camera == name):

@@ -60,7 +60,7 @@ def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
     """All readings of an estimator: those of each camera, then the angle and the errors on the ground; over a course
     root mean squares.
     """
-    return run.series.readings.rms.of(estimator) if run.series else run.reading.readings(estimator)
+    return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
 def judge(run: RenderRun) -> Judgement:

@@ -16,7 +16,6 @@ from analysis.monitor.recovery import Recovery, estimates_of
 from analysis.monitor.series_smoother import smooth, window_of
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
-from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from optics.numerics.threads import one_blas_thread
 from optics.thermal.heat import Temperature
@@ -30,6 +29,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
 from twin.monitor.reading_table import ReadingTable, reading_table
+from twin.run.quantity import Quantity, Record
 
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""
@@ -105,38 +105,61 @@ class TimeSeries:
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
-        found = self.readings.groups("true")
-        together = {} if self.smoothed is None else self.smoothed.at_dict()
-        out: dict[str, Any] = {
-            "times_s": self.times.tolist(),
-            "detail": self.shown,
-            "temperatures": {
-                path: {"change_K": [f.change for f in fields], "gradient_K_per_m": [list(f.gradient) for f in fields]}
-                for path, fields in self.temperatures.items()
-            },
-            "cameras": {
-                name: {**group, **together.get("cameras", {}).get(name, {})} for name, group in found["cameras"].items()
-            },
-        }
-        if self.motions:
-            out["motions"] = {
-                path: {
-                    "pivot": moves[0].pivot,
-                    "rotate_arcsec": [[angle / ARCSEC for angle in motion.rotate] for motion in moves],
-                    "shift_um": [[1e6 * length for length in motion.shift] for motion in moves],
-                    "scale_ppm": [1e6 * motion.scale for motion in moves],
-                }
-                for path, moves in self.motions.items()
-            }
-        for name, more in (("intersection_angle", {"nominal_deg": float(np.degrees(self.angle))}), ("ground", {})):
-            if name in found:
-                out[name] = {**more, **found[name], **together.get(name, {})}
-        out["sigma_holds"] = self.sigma_holds.tolist()
-        if self.smoothed is not None:
-            out["disturbances"] = self.smoothed.to_dict()
-            if len(self.smoothed.times):
-                out["between"] = self.smoothed.between_dict()
-        return out
+        numbers: dict[str, Any] = COURSE(self)
+        return numbers
+
+    def group(self, name: str) -> dict[str, Any] | None:
+        """A group of readings as course.json has it, filtered and smoothed ones included; None where there is none.
+
+        Args:
+            name: ``cameras``, ``intersection_angle`` or ``ground``.
+        """
+        found, more = self.readings.groups("true"), {} if self.smoothed is None else self.smoothed.changes.groups()
+        if name == "cameras":
+            return {camera: own | more.get(name, {}).get(camera, {}) for camera, own in found[name].items()}
+        return found[name] | more.get(name, {}) if name in found else None
+
+
+def _angle(course: TimeSeries) -> dict[str, Any] | None:
+    found = course.group("intersection_angle")
+    return None if found is None else {"nominal_deg": float(np.degrees(course.angle))} | found
+
+
+_TEMPERATURES: Record[Sequence[Temperature]] = Record(
+    "The temperature of a body that was given, at each time, its perturbation included.",
+    Quantity("change_K", lambda fields: [one.change for one in fields], "change at the body's origin"),
+    Quantity("gradient_K_per_m", lambda fields: [one.gradient for one in fields], "gradient along the body's axes"),
+)
+_MOTIONS: Record[Sequence[Motion]] = Record(
+    "The motion of a body that was given, at each time, its perturbation included.",
+    Quantity("pivot", lambda moves: moves[0].pivot, "point that a rotation or a growth leaves in place"),
+    Quantity("rotate_arcsec", lambda moves: [one.rotate for one in moves], "rotation about X, Y and Z"),
+    Quantity("shift_um", lambda moves: [one.shift for one in moves], "shift along X, Y and Z"),
+    Quantity("scale_ppm", lambda moves: [one.scale for one in moves], "relative growth"),
+)
+COURSE: Record[TimeSeries] = Record(
+    "course.json: as truth.json and recovered.json, with a list over the times for each number.",
+    Quantity("times_s", lambda course: course.times, "times of the measurements"),
+    Quantity("detail", lambda course: course.shown, "number of the time that the run shows in full"),
+    Quantity("temperatures", lambda course: course.temperatures, "temperatures by body", record=_TEMPERATURES),
+    Quantity("cameras", lambda course: course.group("cameras"), "true changes of each camera and what is read of them"),
+    Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
+    Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
+    Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
+    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether the sigmas hold at each time"),
+    Quantity(
+        "disturbances",
+        lambda course: None if course.smoothed is None else course.smoothed.to_dict(),
+        "whether all measurements agree with what is stated to move",
+        where_known=True,
+    ),
+    Quantity(
+        "between",
+        lambda course: course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None,
+        "filtered and smoothed changes between the times",
+        where_known=True,
+    ),
+)
 
 
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
@@ -313,10 +336,6 @@ class SmoothedCourse:
     innovations: np.ndarray
     each: int
     consistency: Consistency
-
-    def at_dict(self) -> dict[str, Any]:
-        """Filtered and smoothed changes at the times of the course, a list over the times for each number."""
-        return self.changes.groups()
 
     def between_dict(self) -> dict[str, Any]:
         """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""

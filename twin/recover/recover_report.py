@@ -42,7 +42,7 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
         out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
     if run.smoothed is not None:
         between = run.smoothed.between_dict()
-        out["smoothed"] = {**run.smoothed.at_dict(), "disturbances": run.smoothed.to_dict(), "between": between}
+        out["smoothed"] = {**run.smoothed.changes.groups(), "disturbances": run.smoothed.to_dict(), "between": between}
     return out
 
 
@@ -78,7 +78,7 @@ def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
 
 def _verdict(run: RecoverRun) -> str:
     reading = run.last
-    found = reading.readings(reading.judged)
+    found = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
     out = [one for one in found if abs(one.size) > FAR]
     when = f" at {moment(run.times[-1])}, the last of {len(run.times)} times" if run.times else ""
@@ -270,7 +270,7 @@ def _series(run: RecoverRun) -> Section:
     rows: list[list[Cell]] = [
         [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
         for time, reading in zip(run.times, run.readings, strict=True)
-        for one in reading.readings(reading.judged)
+        for one in reading.table.of(reading.judged)
     ]
     judged = run.last.estimators[run.last.judged].title
     caption = f"Value: as the {judged} reads each time by itself, against the same frames before."
@@ -298,7 +298,7 @@ def _drawn(run: RecoverRun) -> list[Line]:
     """What the figure of a series shows: changes of the cameras and of their angle."""
     assert run.times is not None
     out = []
-    every = [reading.readings(reading.judged) for reading in run.readings]
+    every = [reading.table.of(reading.judged) for reading in run.readings]
     for number, one in enumerate(every[-1]):
         if one.group == GROUND_GROUP:
             continue
