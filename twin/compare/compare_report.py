@@ -26,7 +26,7 @@ from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, t
 
 MOST_BARS = 30
 """Changes of a figure: the largest for their sigma."""
-MOST_IMAGES = 8
+_MOST_IMAGES = 8
 """Images that are shown."""
 
 
@@ -161,13 +161,13 @@ def _pictures(
     for array in found.arrays:
         if array.largest is None or array.shape is None or len(array.shape) < 2 or min(array.shape[-2:]) < 8:
             continue
-        if len(out) == MOST_IMAGES:
+        if len(out) == _MOST_IMAGES:
             break
         pair = [images_of(one, array) for one in (reference, run)]
         if any(one is None for one in pair):
             continue
         for label, first, second in _views(array, *(np.asarray(one, dtype=np.float64) for one in pair)):
-            if len(out) == MOST_IMAGES:
+            if len(out) == _MOST_IMAGES:
                 break
             title = " ".join(filter(None, (array.file, array.name, label)))
             png = _picture(first, second, names, title)

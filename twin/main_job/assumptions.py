@@ -19,7 +19,6 @@ from twin.run.artefact import plain, significant
 
 __all__ = [
     "NOISE",
-    "NOISE_ALONE",
     "assumed",
     "combination",
     "contradicted",
@@ -30,7 +29,7 @@ __all__ = [
     "share_text",
 ]
 
-NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
+_NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
 NOISE = "the noise of the images"
 """How the part of the variance is called that more frames lower."""
@@ -40,7 +39,7 @@ def assumed(reading: MonitorReading) -> str:
     """What the sigmas assume, and whether the measured shifts agree with it; a sentence without its end."""
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
-        return NOISE_ALONE
+        return _NOISE_ALONE
     agree = "agree with them" if found.agrees else "contradict them"
     return (
         f"σ: noise and the stated disturbances {stated.name}; the shifts {agree} (chi-square "

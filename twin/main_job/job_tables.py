@@ -100,7 +100,7 @@ BENT: Record[NodalDeformation] = Record(
         "mesh_prints_through", lambda face: face.printed_through, "whether what is left changes from node to node"
     ),
 )
-WARMED_FACE: Record[HeatedFace] = Record(
+_WARMED_FACE: Record[HeatedFace] = Record(
     "What temperatures that are not linear do to an optical face, in its own nominal axes.",
     Quantity("rotate_arcsec", lambda face: face.motion.rotate, "rotation about X, Y and Z"),
     Quantity("shift_nm", lambda face: face.motion.shift, "shift along X, Y and Z"),
@@ -129,7 +129,7 @@ WARMED: Record[HeatedBody] = Record(
         "largest distance of the body from any node",
     ),
     Quantity("index_path_not_carried_nm", lambda body: body.index_path, "optical path that no linear index carries"),
-    Quantity("faces", lambda body: body.faces, "its optical faces", record=WARMED_FACE),
+    Quantity("faces", lambda body: body.faces, "its optical faces", record=_WARMED_FACE),
 )
 
 

@@ -18,7 +18,7 @@ from twin.pictures.light_paths import RIM, Beam, LightPaths
 from twin.run import svg
 
 FIELD_COLOURS = {"left edge": svg.SKY, "centre": svg.BLUE, "right edge": svg.PURPLE}
-CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)
+_CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)
 """Of a camera's monitor beams, in the order of its channels; they begin again where there are more."""
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
@@ -70,7 +70,7 @@ def _channel(beam: Beam) -> str:
 def _colours(instrument: Instrument) -> dict[str, str]:
     """Name of a channel -> colour, the same in all cameras."""
     names = dict.fromkeys(channel.side for channel in instrument.channels)
-    return {name: CHANNEL_COLOURS[i % len(CHANNEL_COLOURS)] for i, name in enumerate(names)}
+    return {name: _CHANNEL_COLOURS[i % len(_CHANNEL_COLOURS)] for i, name in enumerate(names)}
 
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:

@@ -25,7 +25,7 @@ from twin.monitor.truth import Truth
 from twin.run.provenance import SelfCheck
 from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
-__all__ = ["CENTROID_NOTES", "STATED", "STATED_SIGMA", "MonitorReading", "stated"]
+__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "stated"]
 
 CENTROID_NOTES = {
     "ml": "maximum-likelihood fit of the calibrated spot shape",
@@ -309,14 +309,14 @@ SHARE, OFF = 3, 1
 """Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
-STATED_SIGMA = 8
+_STATED_SIGMA = 8
 """Significant digits of a sigma, and of a chi-square."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
 """Endings of the keys of sigmas."""
 
 
 def _to_digits(value: float) -> float:
-    return float(f"{value:.{STATED_SIGMA - 1}e}")
+    return float(f"{value:.{_STATED_SIGMA - 1}e}")
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from twin.targets.target_result import EdgeReading, TargetRun
 
 NUMBER = 7
 """Width of most numbers there."""
-WIDE = 90
+_WIDE = 90
 """Columns of a terminal from which on the table also has the noise's part of sigma."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
@@ -68,7 +68,7 @@ def _print_result(run: RenderRun, console: Console) -> None:
     """The verdict, the result table and what to bear in mind."""
     told = judge(run)
     print_verdict(console, told.verdict)
-    print_whole(console, _table(run, console.width >= WIDE))
+    print_whole(console, _table(run, console.width >= _WIDE))
     console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)

@@ -67,11 +67,11 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     sections = (*tables, limits, *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problems = [*missing, _pictures(run, session) if picture else ""]
-    pictures = [place for name in PICTURES if (place := folder.path / name).exists()]
+    pictures = [place for name in _PICTURES if (place := folder.path / name).exists()]
     folder.write_text("report.html", render_report(run, sections, drawn.get(SCENE), pictures, drawn))
     warnings = [*judge(run).warnings, *missing]
     entries = {"backend": session.backend.name, "seed": run.seed, "frames": run.frames, "warnings": warnings}
-    again = list(again_words(run, session.backend.name, picture))
+    again = list(_again_words(run, session.backend.name, picture))
     checks = [check.to_dict() for check in run.checks]
     write_manifest(folder, PROGRAM, session.started, seconds, **entries, again=again, checks=checks)
     return "; ".join(filter(None, problems))
@@ -105,13 +105,13 @@ def _pictures(run: RenderRun, session: Session) -> str:
     return ""
 
 
-PICTURES = {
+_PICTURES = {
     "picture.png": "The instrument",
     "picture_prisms.png": "The central prism and what is next to it",
     "picture_focal_plane.png": "The detectors of the first camera",
 }
 """What the rendered pictures show."""
-JPEG_QUALITY = 88
+_JPEG_QUALITY = 88
 AGAIN = (
     "The run folder's own config.yaml holds everything that was resolved; with the same versions it gives the same "
     "images bit by bit."
@@ -167,7 +167,7 @@ def render_report(
             tuple(section for section in parts if section is not None),
             warnings=told.warnings,
         ),
-        again_words(run, backend, bool(pictures)),
+        _again_words(run, backend, bool(pictures)),
         [
             ("Again", AGAIN),
             ("Backend", f"{backend}, float64"),
@@ -206,7 +206,7 @@ def _light(drawn: Mapping[str, str]) -> Section:
     return Section("Light path and footprints", (), (footprints,), name="light", closed=True)
 
 
-def again_words(run: RenderRun, backend: str, pictures: bool) -> tuple[str, ...]:
+def _again_words(run: RenderRun, backend: str, pictures: bool) -> tuple[str, ...]:
     """Words of the command that makes a run again from its own folder."""
     options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))
@@ -215,9 +215,9 @@ def again_words(run: RenderRun, backend: str, pictures: bool) -> tuple[str, ...]
 def _picture(place: Path) -> Markup:
     """A rendered picture for the page, a fifth of the file's size."""
     image = cv2.imread(str(place))
-    ok, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    ok, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     if not ok:
         raise OSError(f"the picture {place.name} cannot be encoded as JPEG")
     address = "data:image/jpeg;base64," + base64.b64encode(encoded.tobytes()).decode("ascii")
     figure = '<figure><img src="{0}" alt="{1}"><figcaption>{2}: <code>{1}</code></figcaption></figure>'
-    return Markup(figure).format(address, place.name, PICTURES[place.name])
+    return Markup(figure).format(address, place.name, _PICTURES[place.name])

@@ -32,8 +32,8 @@ from twin.run.report import Section
 
 IN_PAGE = ""
 """File of what only the page shows."""
-GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
-ANGLE_TITLE = "Angle between the cameras"
+_GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
+_ANGLE_TITLE = "Angle between the cameras"
 
 
 def figure(
@@ -61,10 +61,10 @@ def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
     on the ground.
     """
     if reading.group == GROUND_GROUP:
-        return GROUND_TITLE
+        return _GROUND_TITLE
     if reading.camera:
         return f"Camera {reading.camera}"
-    return f"{ANGLE_TITLE}, nominally {fixed(float(np.degrees(run.truth.angle)), 4)}°" if nominal else ANGLE_TITLE
+    return f"{_ANGLE_TITLE}, nominally {fixed(float(np.degrees(run.truth.angle)), 4)}°" if nominal else _ANGLE_TITLE
 
 
 def _label(reading: Reading) -> Marked:

@@ -19,7 +19,7 @@ COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, 
 """Of the nodes; after the last one they begin again, with the next line style."""
 STYLES = ("-", "--", ":")
 """Of the first nodes, and of those whose colour has been used before."""
-BESIDE = 0.12
+_BESIDE = 0.12
 """Distance of the marks of two estimators at one time, part of the distance of two times."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
@@ -35,7 +35,7 @@ def time_unit(times: np.ndarray) -> tuple[float, str]:
     return next((size, unit) for least, size, unit in UNITS if span >= least)
 
 
-def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
+def _time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
     """Times of a course in a unit that suits its length, and the axis label."""
     size, unit = time_unit(series.times)
     return series.times / size, f"time [{unit}]"
@@ -46,7 +46,7 @@ def temperatures_svg(series: TimeSeries) -> str:
     below them its motions, rotation and shift.
     """
     with svg.look("temperatures"):
-        time, label = time_axis(series)
+        time, label = _time_axis(series)
         nodes = list(dict.fromkeys((*series.temperatures, *series.motions)))
         looks = {
             path: {"color": COLOURS[k % len(COLOURS)], "ls": STYLES[k // len(COLOURS) % len(STYLES)], "lw": 1.4}
@@ -93,7 +93,7 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
         names: estimator -> its name for readers.
     """
     with svg.look("course"):
-        time, label = time_axis(series)
+        time, label = _time_axis(series)
         groups = _by_group(series)
         cameras = [name for name in groups if name not in (ANGLE_GROUP, GROUND_GROUP)]
         rows = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups)
@@ -187,7 +187,7 @@ def _by_group(series: TimeSeries) -> dict[str, list[list[Reading]]]:
 def _panel(axes: Axes, series: TimeSeries, time: np.ndarray, same: list[Reading], names: dict[str, str]) -> None:
     _frame(axes, series, time)
     # side by side, or the bars hide each other
-    step = BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
+    step = _BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
     for j, (estimator, (marker, colour)) in enumerate(marks(names).items()):
         one = next(row for row in same if row.estimator == estimator)
         place = time + (j - 0.5 * (len(names) - 1)) * step

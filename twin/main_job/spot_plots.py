@@ -21,8 +21,8 @@ from twin.run.artefact import FAR, SAME, residual, shown_unit, significant, tick
 
 STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
-LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
-LEAST_CORE = 7.0
+_LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
+_LEAST_CORE = 7.0
 """Half-width of the core's window, pixels, when the spot moves less."""
 
 
@@ -51,7 +51,7 @@ def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | Non
 def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[float, float, float]:
     """Centre (row, column) and half-width of a square that holds both centres, pixels."""
     centre = 0.5 * (before + after)
-    half = max(LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
+    half = max(_LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
     return float(centre[0]), float(centre[1]), half
 
 
@@ -105,7 +105,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
             row[0].set_title("before")
             row[1].set_title("after")
             row[3].set_title("after \N{MINUS SIGN} before")
-            row[2].legend(loc="upper left", labelcolor="white", handlelength=1.2, borderaxespad=0.3, **LEGEND)
+            row[2].legend(loc="upper left", labelcolor="white", handlelength=1.2, borderaxespad=0.3, **_LEGEND)
         for axes in row[[1, 3]]:
             axes.tick_params(labelleft=False)
         for axes in row:
@@ -206,11 +206,11 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
 
 ROW = 0.168
 """Height of a row, inches."""
-DECADES = 3
+_DECADES = 3
 """Of the colours' logarithmic part, below the largest number."""
-MOST_LEVEL = 4
+_MOST_LEVEL = 4
 """Names of columns that have room beside one another."""
-STRONG = 0.55
+_STRONG = 0.55
 """Depth of a colour from which the number in it is white."""
 
 
@@ -219,7 +219,7 @@ def motion_map_svg(run: RenderRun) -> str:
     pitch = 1e6 * run.experiment.path.pitch
     tables = list(run.crosstalk.items())
     largest = max(float(np.abs(table.spot_shift).max()) for _, table in tables) * pitch
-    norm = SymLogNorm(largest * 10.0**-DECADES, linscale=0.4, vmin=-largest, vmax=largest)
+    norm = SymLogNorm(largest * 10.0**-_DECADES, linscale=0.4, vmin=-largest, vmax=largest)
     rows = max(len(table.motions) for _, table in tables)
     labels = [_labels(table) for _, table in tables]
     with svg.look("motions"):
@@ -242,12 +242,12 @@ def _panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNor
     axes.imshow(values, cmap=svg.DIVERGING, norm=norm, aspect="auto", interpolation="nearest")
     axes.xaxis.set_ticks_position("top")
     # many are told below one another
-    turn = 90.0 if len(names) > MOST_LEVEL else 0.0
+    turn = 90.0 if len(names) > _MOST_LEVEL else 0.0
     axes.set_xticks(range(values.shape[1]), [f"{name} [µm]" for name in names], rotation=turn)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     for (row, column), value in np.ndenumerate(values):
         deep = abs(float(norm(value)) - 0.5) * 2.0
-        colour = "white" if deep > STRONG else svg.INK
+        colour = "white" if deep > _STRONG else svg.INK
         text = significant(float(value), 2, floor=SAME)
         axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)

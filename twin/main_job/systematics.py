@@ -21,7 +21,7 @@ from twin.monitor.motions import ElementaryMotion
 from twin.run.artefact import plain, shown_unit, significant
 from twin.uncertainty.monitor_limits import short_text, unit_text
 
-FAMILY = 4
+_FAMILY = 4
 """The first motions of a crosstalk table are the family that the estimators of paper 001 assume."""
 SHOWN = 1e-3
 """Least amount of a motion, in its table unit, that is spoken of."""
@@ -61,7 +61,7 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
     true = table.true @ amounts[camera]
     unit = rows_of(run.reading.cameras[camera])
     bias = {e: unit @ (gain[rows] @ moved) - true for e, gain in run.gains.items()}
-    others = [i for i in range(FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
+    others = [i for i in range(_FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
     outside = tuple(_told(table.motions[i], amounts[camera][i]) for i in others)
     return Systematics(bias, outside, _parts(run, camera, amounts), _uncovered(run, camera, table))
 
@@ -72,7 +72,7 @@ def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
     # what weighs all motions by what is stated takes none of them as it is
-    known = 0 if run.estimators[run.judged].stated else FAMILY
+    known = 0 if run.estimators[run.judged].stated else _FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
     own = {name: run.experiment.instrument.coordinates_of(name) for name in names}
     for name, table in run.crosstalk.items():

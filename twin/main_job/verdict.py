@@ -38,13 +38,13 @@ __all__ = [
 
 FALSE_ALARM = 1e-3
 """Chance that noise and disturbances as stated make any warning of a misreading in a run."""
-EXPLAINED = 0.2
+_EXPLAINED = 0.2
 """Share of an error that may be left over where it is called explained to first order."""
-SOFTER = 0.05
+_SOFTER = 0.05
 """Relative loss of MTF at Nyquist from which it is spoken of."""
 MOST_FRAMES = 10_000
 """More frames than that are no advice."""
-DIMMED = 0.5
+_DIMMED = 0.5
 """Share of its nominal light below which a spot counts as dimmed, as for the warning about it."""
 
 
@@ -254,12 +254,12 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     for name in used:
         for text, vector in found[name].parts.items():
             parts[text] = parts.get(text, 0.0) + float(weights[cameras.index(name)] @ vector[:4])
-    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, EXPLAINED * abs(worst.error))
+    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, _EXPLAINED * abs(worst.error))
     if parts and explained:
         text, part = max(parts.items(), key=lambda pair: pair[1] / worst.error)
         share = part / worst.error
         if share > 0.5:
-            most = "the cause is" if share > 1.0 - EXPLAINED else "most of it is"
+            most = "the cause is" if share > 1.0 - _EXPLAINED else "most of it is"
             return (
                 f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
                 f"{worst.shown(part, sign=True)} {worst.parameter.unit}, which more frames do not cure: see Crosstalk"
@@ -312,7 +312,7 @@ def _series_verdict(run: RenderRun, series: TimeSeries, found: tuple[Reading, ..
 def _dimmed(run: RenderRun) -> str:
     """Spots that lost more than half of their light, of the state that is shown."""
     share = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
-    lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < DIMMED]
+    lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < _DIMMED]
     if not lost:
         return ""
     names = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in lost)
@@ -340,7 +340,7 @@ def _blurred(run: RenderRun) -> str:
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
-    return f"; the MTF at Nyquist {where}, falls {change}: see Image quality" if share > SOFTER else ""
+    return f"; the MTF at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
 
 
 def alarm_limit(count: int) -> float:

@@ -19,7 +19,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions
 from twin.monitor.truth import truth_jacobian
 
-SEEN_WITHIN = 0.1
+_SEEN_WITHIN = 0.1
 """Relative error up to which the words say that a change is seen."""
 
 PRINTED = {
@@ -112,9 +112,9 @@ class CameraCrosstalk:
             true, seen = self.true[3, k], self.readings["derived"][3, k]
             false = self.readings["derived"][:3, k] - self.true[:3, k]
             worst = int(np.argmax(np.abs(false)))
-            if abs(seen - true) < SEEN_WITHIN * abs(true):
+            if abs(seen - true) < _SEEN_WITHIN * abs(true):
                 verdict = "the spots see it"
-            elif abs(seen) < SEEN_WITHIN * abs(true):
+            elif abs(seen) < _SEEN_WITHIN * abs(true):
                 verdict = "the spots do not see it"
             else:
                 verdict = "the spots see it wrongly"

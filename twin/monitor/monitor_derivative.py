@@ -38,7 +38,7 @@ from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, pivot_states
 from twin.monitor.truth import trace_truth, truth_jacobian
 
 
-def size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
+def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
     """Derivative of the sizes of C bodies by the steps of M states, (C, M)."""
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
@@ -69,9 +69,9 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
-    faces = size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
+    faces = _size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
     q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
-    sizes = size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
+    sizes = _size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
@@ -216,8 +216,8 @@ def spot_gradient(
     rays = max(chunk // len(path.channels), 1)
     size = monitor.size[once]
     pitch = path.pitch * monitor.size
-    face_steps = size_steps(placed, [channel.face_body for channel in path.channels])
-    chip_steps = size_steps(placed, [channel.ccd_body for channel in path.channels])
+    face_steps = _size_steps(placed, [channel.face_body for channel in path.channels])
+    chip_steps = _size_steps(placed, [channel.ccd_body for channel in path.channels])
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
         place, heading = launch[:, piece], launched[:, piece]

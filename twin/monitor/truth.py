@@ -215,7 +215,7 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
     return LineSight(instrument, backend).truth(states)
 
 
-DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-6
 """Half step of the central differences (rad, m or relative): truncation and rounding are both below 1e-8 of the
 result."""
 
@@ -229,10 +229,10 @@ def truth_jacobian(
     Returns:
         Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
     """
-    states = [m.state(DIFFERENCE) for m in motions] + [m.state(-DIFFERENCE) for m in motions]
+    states = [m.state(_DIFFERENCE) for m in motions] + [m.state(-_DIFFERENCE) for m in motions]
     truth = trace_truth(instrument, backend, states)
     out = {}
     for name in truth.cameras:
         rows = truth.vector(name).T
-        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * DIFFERENCE)
+        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * _DIFFERENCE)
     return out

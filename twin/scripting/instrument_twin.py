@@ -246,7 +246,7 @@ class InstrumentTwin:
         experiment = self._bench.experiment
         names = list(self.cameras)
         keys = [channel.key for channel in experiment.path.channels]
-        chosen = [motion_named(text, self._nodes) for text in motions]
+        chosen = [_motion_named(text, self._nodes) for text in motions]
         size = np.array([motion.unit_size for motion in chosen])
         spots = spot_jacobian(experiment.path, chosen)
         truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
@@ -379,7 +379,7 @@ _AXES = {"x": 0, "y": 1, "z": 2}
 _FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; 'about PIVOT' may follow a turn or a scale"
 
 
-def motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
+def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     """The elementary motion that a text names.
 
     Args:

@@ -93,7 +93,7 @@ class Shot:
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
         told = f"<p>{escape(self.verdict)}</p>"
-        return f"{told}{truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
+        return f"{told}{_truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +186,11 @@ class Found:
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
-        return notes + reading_frame(self).to_html(escape=True)
+        return notes + _reading_frame(self).to_html(escape=True)
 
     def __repr__(self) -> str:
         notes = "".join(f"\nwarning: {text}" for text in self.warnings)
-        return reading_frame(self).to_string() + notes
+        return _reading_frame(self).to_string() + notes
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
@@ -202,7 +202,7 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
     return out
 
 
-def reading_frame(found: Found) -> pd.DataFrame:
+def _reading_frame(found: Found) -> pd.DataFrame:
     """Readings by camera and parameter, a column for each estimator, with the judged one's sigmas."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
@@ -211,7 +211,7 @@ def reading_frame(found: Found) -> pd.DataFrame:
     return values.assign(**{name: column.to_pandas() for name, column in own.items()})
 
 
-def truth_frame(truth: xr.Dataset) -> pd.DataFrame:
+def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     """True parameters, a row for each camera."""
     return truth[[one.key for one in parameters.CAMERA_PARAMETERS]].to_dataframe()
 

@@ -19,7 +19,7 @@ from twin.run.procedure import Session
 from twin.run.reference_frames import described
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
-MOST_STATES = 100_000
+_MOST_STATES = 100_000
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -44,7 +44,7 @@ def main(
     states: Annotated[
         int,
         typer.Option(
-            "--states", min=0, max=MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
+            "--states", min=0, max=_MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
         ),
     ] = 0,
     out: Out = None,

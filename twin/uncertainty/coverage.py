@@ -252,7 +252,7 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
     return out
 
 
-SPREAD = "what is stated to move"
+_SPREAD = "what is stated to move"
 """A part of the work."""
 
 
@@ -298,7 +298,7 @@ def run_uncertainty(
                 allowed="`disturbances: NAME` in the job or the instrument, or --disturbances NAME",
             )
         )
-    advance(SPREAD, 0, 1)
+    advance(_SPREAD, 0, 1)
     experiment = MonitorExperiment(resolved, backend)
     noise = expected_covariance(experiment, resolved.frames)
     limits = find_limits(experiment, noise, resolved.frames, second_monitor=True)
@@ -310,7 +310,7 @@ def run_uncertainty(
                 allowed="disturbances of cameras, their mirrors or focal planes",
             )
         )
-    advance(SPREAD, 1, 1)
+    advance(_SPREAD, 1, 1)
     seed, coverage = resolved.job.render.seed, None
     if states:
         coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)

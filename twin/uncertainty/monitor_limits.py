@@ -35,8 +35,8 @@ FIELD = 0.1 * ARCSEC
 """Standard deviation with which a test field fixes a direction of a camera: a quarter of a metre on the ground from
 500 km, what control points of that accuracy give."""
 DAY = 86400.0
-MORE_FRAMES = 4
-UNMOVED = 1e-8
+_MORE_FRAMES = 4
+_UNMOVED = 1e-8
 """Standard deviation before any measurement, arcsec, um or m, up to which a quantity is taken as one that nothing
 stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
@@ -189,14 +189,14 @@ def find_limits(
         return None
     cameras = experiment.cameras
     before = np.sqrt(np.diag(stated.parameter_covariance))
-    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > UNMOVED)
+    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > _UNMOVED)
     if not found:
         return None
     rows = np.stack([quantity.row for quantity in found])
     gains = estimator_gains(cameras, stated, noise)
     splits = {name: limits.split(rows, stated, noise, gain) for name, gain in gains.items()}
     remedies = [
-        Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
+        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", _left(rows, stated, noise / _MORE_FRAMES)),
         Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
     ]
     fields = half_fields(experiment.instrument, experiment.nominal_truth.principal_distance)

@@ -70,27 +70,27 @@ SHARE: Record[tuple[str, float]] = Record(
     Quantity("motion", itemgetter(0), "label of the motion"),
     Quantity("share", itemgetter(1), "its share of the variance"),
 )
-SPLIT: Record[_Limited] = Record(
+_SPLIT: Record[_Limited] = Record(
     "A variance by motions.",
     Quantity("sigma", lambda one: one.sigma, "standard deviation, whose square is shared out"),
     Quantity("lines", lambda one: one.lines[:LINES], "motions with the largest shares, largest first", record=SHARE),
     Quantity("rest", lambda one: float(sum(share for _, share in one.lines[LINES:])), "share of all other motions"),
     Quantity("noise", lambda one: one.noise, "share of the noise of the images"),
 )
-AMOUNT: Record[tuple[str, float, str]] = Record(
+_AMOUNT: Record[tuple[str, float, str]] = Record(
     "A motion in a combination of motions.",
     Quantity("motion", itemgetter(0), "label of the motion"),
     Quantity("amount", itemgetter(1), "its amount in the combination"),
     Quantity("unit", itemgetter(2), "unit of the amount"),
 )
-SEEN_LEAST: Record[_Limited] = Record(
+_SEEN_LEAST: Record[_Limited] = Record(
     "Motions that change a quantity and that the spots see least.",
     Quantity("change", lambda one: one.limits.least_seen[one.q].change, "change of the quantity by all of them"),
-    Quantity("motions", lambda one: one.motions, "the largest of them", record=AMOUNT),
+    Quantity("motions", lambda one: one.motions, "the largest of them", record=_AMOUNT),
     Quantity("spots_px", lambda one: one.limits.least_seen[one.q].spots, "how far they move the spots"),
     Quantity("spots_noise_px", lambda one: one.limits.least_seen[one.q].noise, "standard deviation of their noise"),
 )
-ELASTICITY: Record[tuple[Elasticity, int]] = Record(
+_ELASTICITY: Record[tuple[Elasticity, int]] = Record(
     "How the posterior's standard deviation follows a stated number.",
     Quantity("number", lambda one: one[0].number, "name of the stated number"),
     Quantity("stated", lambda one: one[0].size, "the number as it is stated"),
@@ -108,7 +108,7 @@ ELASTICITY: Record[tuple[Elasticity, int]] = Record(
         "standard deviation if the number is twice as large and stated so",
     ),
 )
-HEAVY_TAIL: Record[_Limited] = Record(
+_HEAVY_TAIL: Record[_Limited] = Record(
     "Errors of the posterior if each stated number is the scale of Student's distribution.",
     Quantity("degrees", lambda one: one.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
     Quantity("rms", lambda one: float(one.limits.heavy_tail.rms[one.q]), "root mean square of the error"),
@@ -121,24 +121,24 @@ HEAVY_TAIL: Record[_Limited] = Record(
         "chance of an error beyond 3 sigma; 0.0027 of a normal error",
     ),
 )
-LIMITED: Record[_Limited] = Record(
+_LIMITED: Record[_Limited] = Record(
     "What limits one quantity, in the unit that its key ends in.",
-    Quantity("before", lambda one: one, "variance before the measurement", record=SPLIT),
-    Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=SPLIT),
+    Quantity("before", lambda one: one, "variance before the measurement", record=_SPLIT),
+    Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=_SPLIT),
     Quantity("known", lambda one: one.known, "standard deviation that is left if that motion is known"),
-    Quantity("least_seen", lambda one: one, "motions that hide from the spots", record=SEEN_LEAST),
+    Quantity("least_seen", lambda one: one, "motions that hide from the spots", record=_SEEN_LEAST),
     Quantity(
         "from_statement",
         lambda one: float(one.limits.from_statement[one.q]),
         "share of the posterior's variance that no spot constrains",
     ),
-    Quantity("elasticities", lambda one: one.followed, "stated numbers that make most of it", record=ELASTICITY),
-    Quantity("student_t", lambda one: one, "what a statement with heavy tails leaves", record=HEAVY_TAIL),
+    Quantity("elasticities", lambda one: one.followed, "stated numbers that make most of it", record=_ELASTICITY),
+    Quantity("student_t", lambda one: one, "what a statement with heavy tails leaves", record=_HEAVY_TAIL),
 )
-REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
+_REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
     "A further measurement.",
     Quantity("what", lambda one: one[0].what, "the measurement in words"),
-    Quantity("left", lambda one: by_quantity(one[1], one[0].sigma), "standard deviation that it leaves of a quantity"),
+    Quantity("left", lambda one: _by_quantity(one[1], one[0].sigma), "standard deviation that it leaves of a quantity"),
 )
 LIMITS: Record[MonitorLimits] = Record(
     "uncertainty.json",
@@ -148,15 +148,15 @@ LIMITS: Record[MonitorLimits] = Record(
     Quantity("outside", lambda found: found.outside, "chance that a spot leaves its CCD"),
     Quantity(
         "quantities",
-        lambda found: by_quantity(found.quantities, [_Limited(found, q) for q in range(len(found.quantities))]),
+        lambda found: _by_quantity(found.quantities, [_Limited(found, q) for q in range(len(found.quantities))]),
         "what limits each quantity",
-        record=LIMITED,
+        record=_LIMITED,
     ),
     Quantity(
         "remedies",
         lambda found: {one.name: (one, found.quantities) for one in found.remedies},
         "what further measurements would leave",
-        record=REMEDY,
+        record=_REMEDY,
     ),
 )
 
@@ -194,7 +194,7 @@ COUNT: Record[_Counted] = Record(
     Quantity("limits_68", lambda one: one.limits(0), "limits of held_68 if every sigma is right"),
     Quantity("limits_95", lambda one: one.limits(1), "limits of held_95 if every sigma is right"),
 )
-OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
+_OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
     "A count that is beyond its limits.",
     Quantity("estimator", itemgetter(0), "who reads the quantity"),
     Quantity("group", itemgetter(1), "group of the quantity"),
@@ -210,13 +210,13 @@ STATES: Record[Coverage] = Record(
     Quantity(
         "estimators",
         lambda found: {
-            name: by_quantity(found.quantities, [_Counted(found, q, name) for q in range(len(found.quantities))])
+            name: _by_quantity(found.quantities, [_Counted(found, q, name) for q in range(len(found.quantities))])
             for name in found.errors
         },
         "errors of each quantity by each estimator",
         record=COUNT,
     ),
-    Quantity("outliers", lambda found: found.outliers, "counts that are beyond their limits", record=OUTLIER),
+    Quantity("outliers", lambda found: found.outliers, "counts that are beyond their limits", record=_OUTLIER),
     Quantity("chi_square_mean", lambda found: float(np.mean(found.chi_square)), "mean chi-square of the shifts"),
     Quantity("alarms", lambda found: found.alarms, "states whose chi-square is beyond its limit"),
     Quantity("alarms_limit", lambda found: found.alarm_limit, "largest number of alarms by chance"),
@@ -224,7 +224,9 @@ STATES: Record[Coverage] = Record(
 )
 
 
-def by_quantity(quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray) -> dict[str, dict[str, Any]]:
+def _by_quantity(
+    quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray
+) -> dict[str, dict[str, Any]]:
     """Group -> key -> value.
 
     Args:

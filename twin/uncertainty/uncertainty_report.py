@@ -60,7 +60,7 @@ def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int =
         f"Stated disturbances: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
         "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
         "of both cameras together.",
-        limits_svg(limits),
+        _limits_svg(limits),
     )
     text = [_verdict(limits)]
     if limits.outside > RARE:
@@ -107,7 +107,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
     )
 
 
-def headline(limits: MonitorLimits) -> int:
+def _headline(limits: MonitorLimits) -> int:
     """Number of the quantity that an answer begins with: height, else the angle, else the first parameter."""
     keys = [(q.group, q.key) for q in limits.quantities]
     for wanted in ((GROUND_GROUP, "height_m"), (ANGLE_GROUP, "change_arcsec")):
@@ -118,7 +118,7 @@ def headline(limits: MonitorLimits) -> int:
 
 def _verdict(limits: MonitorLimits) -> str:
     """What is left of the headline quantity, what makes it up and what would help most."""
-    q = headline(limits)
+    q = _headline(limits)
     quantity, split = limits.quantities[q], limits.splits[BEST]
     unit, name = unit_text(quantity), short_text(quantity)
     motion, share = limits.lines(BEST, q)[0]
@@ -249,8 +249,8 @@ def _statement(limits: MonitorLimits) -> Section:
         (None, None, 2, None, None, None, None, 2),
         3,
     )
-    most = max(limits.elasticities, key=lambda one: float(one.elasticity[headline(limits)]))
-    q = headline(limits)
+    most = max(limits.elasticities, key=lambda one: float(one.elasticity[_headline(limits)]))
+    q = _headline(limits)
     unit = unit_text(limits.quantities[q])
     text = (
         f"The sigmas are as good as the stated numbers. The {short_text(limits.quantities[q])} follows "
@@ -344,7 +344,7 @@ PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, 
 MARKS = "os^vDP*X"
 
 
-def limits_svg(limits: MonitorLimits) -> str:
+def _limits_svg(limits: MonitorLimits) -> str:
     """Left, of every quantity the standard deviations of all estimators over that before the measurement; right, the
     variance that the posterior leaves by bodies.
     """
