@@ -226,7 +226,7 @@ def motion_map_svg(run: RenderRun) -> str:
         figure = svg.new_figure(1.1 + ROW * rows, {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01})
         panels = figure.subplots(1, len(tables), squeeze=False)[0]
         for k, (axes, (name, table)) in enumerate(zip(panels, tables, strict=True)):
-            _panel(axes, pitch * table.spot_shift.T, table.coordinates, norm)
+            _motion_panel(axes, pitch * table.spot_shift.T, table.coordinates, norm)
             axes.set_yticks(range(len(table.motions)), labels[k])
             # told once where all cameras have the same motions
             axes.tick_params(labelleft=k == 0 or labels[k] != labels[0])
@@ -238,7 +238,7 @@ def _labels(table: CameraCrosstalk) -> list[str]:
     return [f"{motion.label}, 1 {shown_unit(motion.unit)}" for motion in table.motions]
 
 
-def _panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNorm) -> None:
+def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNorm) -> None:
     axes.imshow(values, cmap=svg.DIVERGING, norm=norm, aspect="auto", interpolation="nearest")
     axes.xaxis.set_ticks_position("top")
     # many are told below one another
