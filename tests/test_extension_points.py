@@ -90,6 +90,7 @@ from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
+from twin.study import scripted
 from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
 from twin.study.runs.base_job import Run
@@ -497,7 +498,7 @@ def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (outcome,) = setup.job.evaluate(setup.tree, [Plan.of(setup).run(0)], load_backend())
     check_responses(setup, outcome)
     vary = {"base/forward/M2": {"shift": "0 0 (-5 .. 5) um"}}
-    assert key in twin.study.scripted.config_text(bench.twin, vary, 2, 0, "sobol")
+    assert key in scripted.config_text(bench.twin, vary, 2, 0, "sobol")
 
 
 def bar_size(image: np.ndarray) -> tuple[float, float]:
