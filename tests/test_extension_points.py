@@ -33,6 +33,7 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.estimators import Estimator, Formula, OfEachCamera, Shifts
 from analysis.monitor.monitoring import PARAMETERS, MonitorGeometry
+from analysis.monitor.parameters import Parameter
 from analysis.monitor.recovery import measure_spots
 from analysis.spots.centroid import gaussian_fit, mean_frames
 from analysis.spots.noise import NoiseModel
@@ -73,7 +74,9 @@ from tests.twin import test_prism_images
 from tests.twin.commands import invoke
 from tests.twin.path_bench import IDEAL
 from tests.twin.study_bench import write_study as write_study_file
+from tests.twin.test_report import tables_of
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
+from twin.live.live_bench import LiveBench
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.orbit import Orbit, acceleration, propagate
@@ -88,6 +91,7 @@ from twin.run.page import RunFacts, write_test
 from twin.run.report import Report, Section
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.sensors.area_detector import EmvaDetector
+from twin.study import scripted
 from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
 from twin.study.runs.base_job import BlockResult, Run
@@ -411,6 +415,90 @@ responses:
     half, derived = (gradient.ad[gradient.responses.index(name), 0] for name in ("half", "derived"))
     assert half == pytest.approx(0.5 * derived, rel=1e-9)
     assert abs(derived) > 1.0
+
+
+READINGS = "analysis.monitor.parameters.CAMERA_PARAMETERS"
+READ_JOB = """instrument: gf7_pair
+disturbances: launch
+perturb: {base/forward/M2: {shift: [0 um, 0 um, 3 um]}}
+course: {times: [0 min, 10 min], temperature: {base/forward: {change: [0 K, 0.1 K]}}}
+render: {frames: 2}
+"""
+READ_STUDY = """name: study
+base: {command: render, file: job.yaml}
+factors: {m2z: {key: [job, perturb, base/forward/M2, shift, 2], values: [2 um]}}
+design: {kind: grid}
+responses:
+  relative: {key: [recovered, cameras, forward, model, d_f_relative_ppm]}
+"""
+
+
+@extends(READINGS)
+def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The change of the principal distance as a part of it: one entry, seen in every view of the table of readings."""
+    toy, key, symbol = "a part of the principal distance", "d_f_relative_ppm", "Δf/f"
+    relative: Callable[[CameraCalibration], Any] = lambda c: (0.0, 0.0, 0.0, 1.0 / c.geometry.focal_length_m)  # noqa: E731
+    add(monkeypatch, READINGS, None, Parameter(key, symbol, toy, 3, relative))
+    (tmp_path / "job.yaml").write_text(READ_JOB, "utf-8")
+    folder = tmp_path / "run"
+    done = invoke(twin.render.app, tmp_path / "job.yaml", "--out", folder)
+    assert done.exit_code == 0, done.output
+
+    # JSON: what is read and what is true are the same part of the principal distance
+    recovered, truth, course = (read(folder, name) for name in ("recovered", "truth", "course"))
+    for camera, true in truth["cameras"].items():
+        focal_length = 1e-3 * true["principal_distance_mm"]
+        assert true[key] == pytest.approx(true["d_f_um"] / focal_length, rel=1e-6)
+        for found in recovered["cameras"][camera].values():
+            for end in ("", "_sigma", "_sigma_noise"):
+                within = 1e-5 * found[f"{key}_sigma_noise"]
+                assert found[f"{key}{end}"] == pytest.approx(found[f"d_f_um{end}"] / focal_length, rel=1e-6, abs=within)
+        for who in ("true", "model", "posterior", "filtered", "smoothed"):
+            assert len(course["cameras"][camera][who][key]) == 2
+        assert key in read(folder, "crosstalk")[camera]["motions"][0]["model"]
+    assert key in json.dumps(read(folder, "uncertainty"))
+
+    # terminal, page and the CSV tables that the page hands out
+    assert f"{symbol} [ppm]" in done.stdout
+    page = page_text(folder)
+    assert f'data-key="forward.{key}.model"' in page
+    assert f'data-key="course.forward.{key}.model"' in page
+    assert toy in page
+    handed = tables_of(page)
+    for name in ("results", "shown_time", "course", "residuals"):
+        heads, *lines = handed[name]
+        assert symbol in {line[heads.index("parameter")] for line in lines}
+
+    # tables for other programs
+    done = invoke(twin.export.__main__.app, folder, "--tables", "csv", "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert toy in (tmp_path / "out/files.json").read_text("utf-8")
+
+    # live page, and the instrument in a script
+    bench = LiveBench(twin.load(tmp_path / "job.yaml"))
+    assert bench.greeting()["parameters"][-1] == {"key": key, "symbol": symbol, "unit": "ppm", "meaning": toy}
+    told, _ = bench.state(bench.at_rest)
+    assert told["truth"]["cameras"]["forward"][key] == pytest.approx(truth["cameras"]["forward"][key], rel=1e-6)
+    assert key in told["readings"]["cameras"]["forward"]["model"]
+    shot = bench.twin.render(frames=2)
+    found = bench.twin.recover(shot.before, shot.after)
+    assert float(found.compare(shot.truth).loc[("forward", key), "true"]) == pytest.approx(
+        truth["cameras"]["forward"][key], rel=1e-6
+    )
+    np.testing.assert_allclose(
+        found.sigma.sel(parameter=key) / found.sigma.sel(parameter="d_f_um"),
+        (found.values.sel(parameter=key) / found.values.sel(parameter="d_f_um")),
+        rtol=1e-9,
+    )
+    jacobian = bench.twin.jacobian(["base/forward/M2 shift z"])
+    assert float(jacobian.true.sel(camera="forward", parameter=key)[0]) != 0.0
+
+    # studies: what a response may name, and what a script's study has
+    setup = resolve_study(write_study_file(tmp_path / "study", text=READ_STUDY))
+    (outcome,) = setup.job.evaluate(setup.tree, [Plan.of(setup).run(0)], load_backend())
+    check_responses(setup, outcome)
+    vary = {"base/forward/M2": {"shift": "0 0 (-5 .. 5) um"}}
+    assert key in scripted.config_text(bench.twin, vary, 2, 0, "sobol")
 
 
 def bar_size(image: np.ndarray) -> tuple[float, float]:

@@ -57,17 +57,6 @@ class GroundError:
         arrays = (self.error_m, self.sigma_m, self.sigma_noise_m, self.plan_rms_m, self.height_rms_m)
         return GroundError(*(array[states] for array in arrays))
 
-    def to_dict(self) -> dict[str, Any]:
-        """along_m, across_m, height_m with their sigmas, and plan_rms_m, height_rms_m: floats or nested lists."""
-        out: dict[str, Any] = {}
-        for k, axis in enumerate(AXES):
-            out[f"{axis}_m"] = self.error_m[..., k].tolist()
-            out[f"{axis}_m_sigma"] = self.sigma_m[..., k].tolist()
-            out[f"{axis}_m_sigma_noise"] = self.sigma_noise_m[..., k].tolist()
-        out["left_plan_rms_m"] = self.plan_rms_m.tolist()
-        out["left_height_rms_m"] = self.height_rms_m.tolist()
-        return out
-
 
 @dataclass(frozen=True)
 class GroundGeometry:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
-from analysis.units import ARCSEC
 
 __all__ = ["IntersectionAngleChange", "exact", "first_order"]
 
@@ -49,14 +48,6 @@ class IntersectionAngleChange:
         """
         noise = None if self.sigma_noise_rad is None else self.sigma_noise_rad[states]
         return IntersectionAngleChange(self.change_rad[states], self.sigma_rad[states], noise)
-
-    def to_dict(self) -> dict[str, Any]:
-        """change_arcsec, change_arcsec_sigma and change_arcsec_sigma_noise: floats, or nested lists for arrays."""
-        return {
-            "change_arcsec": (np.asarray(self.change_rad) / ARCSEC).tolist(),
-            "change_arcsec_sigma": (np.asarray(self.sigma_rad) / ARCSEC).tolist(),
-            "change_arcsec_sigma_noise": (np.asarray(self.noise_rad) / ARCSEC).tolist(),
-        }
 
 
 def first_order(forward: CameraParameters, backward: CameraParameters) -> IntersectionAngleChange:

@@ -29,15 +29,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ndtr
 
+from analysis.monitor import parameters
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from analysis.monitor.ground_error import AXES, GroundGeometry
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.units import ARCSEC
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 
 Array = NDArray[np.float64]
-ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
-ANGLE_KEY = "change_arcsec"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +44,18 @@ class Quantity:
 
     Attributes:
         group: a camera, ``intersection_angle`` or ``ground``.
-        key: in results, ends in its unit.
-        row: (4 K,) in that unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
+        parameter: which of its readings.
+        row: (4 K,) in the reading's unit per rad and m of d_alpha, d_beta, d_gamma, d_f of one camera after the other.
     """
 
     group: str
-    key: str
+    parameter: Parameter
     row: Array
+
+    @property
+    def key(self) -> str:
+        """In results, ends in its unit."""
+        return self.parameter.key
 
 
 def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry | None = None) -> tuple[Quantity, ...]:
@@ -63,22 +66,23 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
         cameras: by name, in the order of the spots.
         ground: of a pair.
     """
-    count = len(PARAMETERS)
+    count = 4
     unit = np.eye(count * len(cameras))
     out = [
-        Quantity(name, key, PER_SI[k] * unit[count * c + k])
-        for c, name in enumerate(cameras)
-        for k, key in enumerate(PARAMETERS)
+        Quantity(name, one, row @ unit[count * c : count * (c + 1)])
+        for c, (name, camera) in enumerate(cameras.items())
+        for one, row in zip(parameters.CAMERA_PARAMETERS, parameters.rows_of(camera), strict=True)
     ]
     if len(cameras) == 2:
         first, second = (camera.look_rad for camera in cameras.values())
         # positive where the lines of sight open: the forward one's d_alpha minus the other's
-        sign = 1.0 if first > second else -1.0
-        out.append(Quantity(ANGLE_GROUP, ANGLE_KEY, sign * (unit[0] - unit[count]) / ARCSEC))
+        sign = parameters.ANGLE.per_si if first > second else -parameters.ANGLE.per_si
+        out.append(Quantity(ANGLE_GROUP, parameters.ANGLE, sign * (unit[0] - unit[count])))
     if ground is not None:
-        one, two = (camera.geometry.focal_length_m for camera in cameras.values())
-        rows = ground.rows((one, two))
-        out += [Quantity(GROUND_GROUP, f"{axis}_m", row) for axis, row in zip(AXES, rows[len(rows) // 2], strict=True)]
+        one_f, two_f = (camera.geometry.focal_length_m for camera in cameras.values())
+        rows = ground.rows((one_f, two_f))
+        middle = rows[len(rows) // 2]
+        out += [Quantity(GROUND_GROUP, axis, row) for axis, row in zip(parameters.GROUND, middle, strict=True)]
     return tuple(out)
 
 

@@ -205,7 +205,7 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
     """
     done: list[np.ndarray] = []
     owners: list[int] = []
-    order = range(len(polygons))
+    order = list(range(len(polygons)))
     if fewest:
         order = sorted(order, key=lambda number: -float(np.mean(area(polygons[number]))))
     for number in order:

@@ -13,8 +13,7 @@ from scenes.specs.instrument import BASE
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Spent, Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from twin.monitor.observation import Observing, observe, one_detector
-from twin.monitor.state_reading import StateReader
+from twin.monitor.observation import Observing, StateReader, observe, one_detector
 from twin.sensors.poisson_numbers import poisson_numbers
 
 STATES, QUICK_STATES = 200, 25

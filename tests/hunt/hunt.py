@@ -22,8 +22,9 @@ from tests.hunt.legal_instruments import legal_instrument
 from tests.hunt.legal_jobs import legal_job, legal_statement
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
-from twin.main_job.verdict import Reading, judge, readings
+from twin.main_job.verdict import judge, readings
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.reading_table import Reading
 
 FAR = 5.0
 """Sigmas from which on a reading is wrong: of ten thousand honest ones in a thousand cases none comes so far (6e-3)."""

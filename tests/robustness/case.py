@@ -37,7 +37,7 @@ CUTS = (
     "twin.design.design_run.search",
     "twin.design.layout_search._OneSearch.run",
     "twin.camera.camera_run.run_camera",
-    "twin.uncertainty.uncertainty_run.run_uncertainty",
+    "twin.uncertainty.coverage.run_uncertainty",
     "twin.recover.recover_run._modelled",
     "twin.recover.recover_run._measured",
     "twin.live.__main__._serve",

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from scenes.yaml.errors import InputError
 from twin.compare.__main__ import app
-from twin.compare.comparison import compare, numbers, verdict
+from twin.compare.compare_report import compare, numbers, verdict
 from twin.compare.run_differences import read_run
 from twin.main_job.render_job import render_job
 from twin.run.run_folder import RunFolder, write_manifest

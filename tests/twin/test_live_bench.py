@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import math
 from collections import Counter
 from pathlib import Path
 
@@ -110,8 +109,9 @@ def test_a_recorded_course_has_the_states_that_were_shown(bench, first, backend,
     for k, (_, asked) in enumerate(steps):
         told, _ = bench.state(asked)
         for camera, values in told["truth"]["cameras"].items():
-            series = run.series.truth[camera][:, k] * np.array([180 * 3600 / math.pi] * 3 + [1e6])
-            shown = [values[key] for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")]
+            keys = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+            series = [run.series.readings.row(camera, key, "model").true[k] for key in keys]
+            shown = [values[key] for key in keys]
             # a batch of states rounds in another order than one; lines of sight hold 1e-16 of a turn, 2e-11 arcsec each
             assert series == pytest.approx(shown, abs=1e-9)
 

@@ -312,7 +312,7 @@ def test_record_and_repeat(page, backend, tmp_path):
     run = render_job(resolve(job_of(page, tmp_path, "#save-course")), backend, frames=2)
     assert run.series is not None
     assert len(run.series.times) >= 3
-    assert 1e6 * run.series.truth["forward"][3, -1] == pytest.approx(shown, abs=1e-7)
+    assert run.series.readings.row("forward", "d_f_um", "model").true[-1] == pytest.approx(shown, abs=1e-7)
 
 
 def test_a_course_is_played(browser):

@@ -139,11 +139,12 @@ def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
     assert np.array_equal(after, run.after[:, 0])
     assert np.array_equal(bench.before(bench.at_rest), run.before[:, 0])
     assert run.series is not None
+    true = run.series.readings.row("forward", "d_f_um", "model").true
     for time in (0, 2):
         asked = AskedState(**{**bench.at_rest.model_dump(), "time": time})
         other, frames = bench.state(asked)
         assert np.array_equal(frames, run.series.frames[time])
-        assert other["truth"]["cameras"]["forward"]["d_f_um"] == 1e6 * run.series.truth["forward"][3, time]
+        assert other["truth"]["cameras"]["forward"]["d_f_um"] == true[time]
     saved = render_job(resolve(written(tmp_path, job_text(bench, asked), "saved.yaml")), backend)
     assert other["readings"] == stated(saved.recovered_dict())
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from analysis.monitor.limits import ANGLE_GROUP
+from analysis.monitor.parameters import ANGLE_GROUP
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.monitor_layout import (
     Beam,

@@ -81,16 +81,13 @@ def course(experiment, tmp_path_factory) -> Course:
 def dicts(run_or_series) -> tuple:
     """All that the smoother says."""
     found = run_or_series.smoothed
-    return found.at_dict(), found.between_dict(), found.to_dict()
+    return found.changes.groups(), found.between_dict(), found.to_dict()
 
 
 def sigmas_away(one, other, key: str) -> float:
     """Largest difference of the smoothed changes of the cameras in sigmas of the noise."""
-    worst = 0.0
-    for name, every in one.smoothed.changes.parameters.items():
-        a, b = every[key], other.smoothed.changes.parameters[name][key]
-        worst = max(worst, float(np.max(np.abs(a.vector - b.vector) / b.sigma_noise)))
-    return worst
+    pairs = zip(one.smoothed.changes.of(key), other.smoothed.changes.of(key), strict=True)
+    return max(float(np.max(np.abs(a.value - b.value) / b.noise)) for a, b in pairs if a.camera)
 
 
 def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
@@ -107,9 +104,9 @@ def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
     assert numbers["smoothed"]["between"] == written["between"]
     assert numbers["smoothed"]["disturbances"] == written["disturbances"]
     # from the last time on nothing comes, so that both are one
-    last = found.smoothed.changes.parameters["forward"]
-    np.testing.assert_allclose(last["filtered"].vector[-1], last["smoothed"].vector[-1], rtol=1e-9)
-    assert np.all(last["smoothed"].sigma[0] <= last["filtered"].sigma[0] * (1.0 + 1e-9))
+    filtered, smoothed = (found.smoothed.changes.of(name)[:4] for name in ("filtered", "smoothed"))
+    assert [row.value[-1] for row in filtered] == pytest.approx([row.value[-1] for row in smoothed], rel=1e-9)
+    assert all(b.sigma[0] <= a.sigma[0] * (1.0 + 1e-9) for a, b in zip(filtered, smoothed, strict=True))
 
 
 @pytest.mark.second
@@ -123,10 +120,8 @@ def test_a_learnt_shape_does_for_a_series_as_well(course, backend):
         sigma = np.sqrt(np.diag(modelled))
         np.testing.assert_array_less(np.abs(reading.recovery.shift[0] - course.series.shift[k]), 0.5 * sigma)
         np.testing.assert_allclose(np.sqrt(np.diag(own)), sigma, rtol=0.1)
-    learnt, whole = found.smoothed.changes.parameters, course.series.smoothed.changes.parameters
-    for name, every in whole.items():
-        for estimator in ("filtered", "smoothed"):
-            np.testing.assert_allclose(learnt[name][estimator].sigma, every[estimator].sigma, rtol=0.1)
+    for one, other in zip(found.smoothed.changes, course.series.smoothed.changes, strict=True):
+        np.testing.assert_allclose(one.sigma, other.sigma, rtol=0.1)
     assert found.smoothed.consistency.agrees
 
 
@@ -137,12 +132,11 @@ def test_the_report_shows_the_series(course, backend):
     assert list(table.heads)[-4:] == ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
     each = len(table.rows) // len(TIMES)
     assert len(table.rows) == each * len(TIMES)
-    changes = found.smoothed.changes
+    read = found.smoothed.changes.row("forward", "d_alpha_arcsec", "smoothed")
     for k, time in enumerate((0.0, 720.0, 1800.0, 3000.0)):
         row = table.rows[each * k]
         assert row[:3] == [time, "forward", "Δα"]
-        assert row[-2] == changes.parameters["forward"]["smoothed"].to_dict()["d_alpha_arcsec"][k]
-        assert row[-1] == changes.parameters["forward"]["smoothed"].to_dict()["d_alpha_arcsec_sigma"][k]
+        assert row[-2:] == [read.value[k], read.sigma[k]]
     assert "Chi-square of all 4 measurements" in section.text[0]
     assert "contradict" not in section.text[0]
     assert recover_report(found).warnings == ()
@@ -153,11 +147,9 @@ def test_only_time_differences_matter(course, backend):
     """Stated motions are stationary: a series that begins ten hours later says the same."""
     later = [f"{60 * 10 + minute} min" for minute in (0, 12, 30, 50)]
     found = course.measured(backend, course.text(later))
-    for name, every in found.smoothed.changes.parameters.items():
-        for estimator, one in every.items():
-            other = course.series.smoothed.changes.parameters[name][estimator]
-            # the law is a function of differences of times, which round at 1e-16 of ten hours
-            np.testing.assert_allclose(one.vector, other.vector, rtol=0, atol=1e-9 * float(np.max(other.sigma)))
+    for one, other in zip(found.smoothed.changes, course.series.smoothed.changes, strict=True):
+        # the law is a function of differences of times, which round at 1e-16 of ten hours
+        np.testing.assert_allclose(one.value, other.value, rtol=0, atol=1e-9 * float(np.max(other.sigma)))
     np.testing.assert_allclose(found.smoothed.times - 36000.0, course.series.smoothed.times, atol=1e-9)
 
 
@@ -173,8 +165,10 @@ def test_corrected_frames_are_smoothed_as_well(course, backend):
     assert [spot.clean for spot in spots].count(False) == 1
     # three pixels beside the spot, of which two of three frames are left
     assert sigmas_away(found, course.series, "smoothed") < 0.3
-    sigma = [one.smoothed.changes.parameters["forward"]["smoothed"].sigma_noise for one in (found, course.series)]
-    np.testing.assert_allclose(sigma[0], sigma[1], rtol=0.02)
+    for one, other in zip(
+        found.smoothed.changes.of("smoothed"), course.series.smoothed.changes.of("smoothed"), strict=True
+    ):
+        np.testing.assert_allclose(one.noise, other.noise, rtol=0.02)
     # without the correction it is another measurement
     raw = course.measured(backend, "corrections: none\n" + course.text(forward_left="struck.tiff"))
     assert sigmas_away(raw, course.series, "smoothed") > 3.0

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from analysis.monitor.estimators import ESTIMATORS
+from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from scenes.specs.resolved import resolve
 from tests.twin.policed_page import breaches
 from twin.main_job.crosstalk_sections import is_wrong
+from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import STAGES, render_job
-from twin.main_job.render_report import render_report
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.result_sections import residual_section
 from twin.main_job.summary_plot import summary_png
 from twin.main_job.systematics import systematics

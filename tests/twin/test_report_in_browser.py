@@ -8,8 +8,8 @@ import pytest
 
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
+from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
-from twin.main_job.render_report import render_report
 from twin.main_job.verdict import judge
 from twin.pictures.scene_file import write_scene
 from twin.run.artefact import SvgFigure, Table

@@ -16,10 +16,10 @@ from analysis.spots.centroid import mean_frames
 from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import difference_covariance
 from scenes.models.disturbances import state_of
-from twin.main_job.unseen_motions import BLIND
+from twin.main_job.systematics import BLIND
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_sampling import WRONG
-from twin.monitor.state_reading import StateReader
+from twin.monitor.observation import StateReader
 from twin.scripting import instrument_twin
 from twin.study.runs.base_job import BlockResult
 

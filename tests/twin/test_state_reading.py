@@ -11,7 +11,7 @@ from scenes.specs.resolved import resolve
 from tests.benchmarks.monitor_speed import random_states
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.monitor.state_reading import StateReader
+from twin.monitor.observation import StateReader
 
 
 @pytest.fixture(scope="module")

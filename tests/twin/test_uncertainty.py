@@ -22,7 +22,7 @@ from tests.twin.commands import invoke
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import trace_truth
 from twin.uncertainty import __main__ as command
-from twin.uncertainty import uncertainty_run
+from twin.uncertainty import coverage
 from twin.uncertainty.coverage import FALSE, run_states
 from twin.uncertainty.monitor_limits import BEST, expected_covariance, find_limits
 from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
@@ -104,10 +104,10 @@ def test_what_rests_on_the_stated_numbers(monkeypatch):
     elasticity, and twice as large they make it 1.8 times as large. Warnings of the instrument are the run's.
     """
     experiment, found = bench("gf7_pair", "orbit")
-    monkeypatch.setattr(uncertainty_run, "MonitorExperiment", lambda *given: experiment)
-    monkeypatch.setattr(uncertainty_run, "find_limits", lambda *given, **more: found)
-    monkeypatch.setattr(uncertainty_run, "blur_warnings", lambda *given: ("blurred",))
-    run = uncertainty_run.run_uncertainty(experiment.resolved, load_backend())
+    monkeypatch.setattr(coverage, "MonitorExperiment", lambda *given: experiment)
+    monkeypatch.setattr(coverage, "find_limits", lambda *given, **more: found)
+    monkeypatch.setattr(coverage, "blur_warnings", lambda *given: ("blurred",))
+    run = coverage.run_uncertainty(experiment.resolved, load_backend())
     assert run.warnings == ("blurred",)
     assert uncertainty_report(run).warnings[0] == "blurred"
     numbers = uncertainty_numbers(run)

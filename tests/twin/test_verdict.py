@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from analysis.monitor.limits import Split
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor.parameters import ANGLE, GROUND
+from analysis.monitor.parameters import CAMERA_PARAMETERS as PARAMETERS
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
 from twin.main_job.assumptions import assumed, combination
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS
 from twin.main_job.verdict import FALSE_ALARM, alarm_limit, judge, readings, recovered_numbers
 from twin.run.artefact import FAR
 
@@ -207,8 +207,9 @@ def test_a_course_is_judged_over_its_times(job) -> None:
     far = [r for r in found if r.far]
     assert f"{len(found) - len(far)} of {len(found)} changes" in told.verdict
     first = found[0]
-    error = run.series.parameters["forward"]["model"].d_alpha_rad - run.series.truth["forward"][0]
-    assert first.error == pytest.approx(float(np.sqrt(np.mean(error**2))) * 3600.0 * 180.0 / np.pi, rel=1e-12)
+    course = run.series.to_dict()["cameras"]["forward"]
+    error = np.array(course["model"]["d_alpha_arcsec"]) - course["true"]["d_alpha_arcsec"]
+    assert first.error == pytest.approx(float(np.sqrt(np.mean(error**2))), rel=1e-12)
 
 
 def test_files_and_json_hold_the_same_sentence(job) -> None:
@@ -310,15 +311,13 @@ def test_the_share_of_a_body_is_that_of_its_errors() -> None:
 def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
     """The combination of all parameters gives, of the true ones, the true angle and errors on the ground."""
     run = job(EXAMPLE, LAUNCH, frames=9)
-    true = np.concatenate(
-        [np.array([run.true_parameters(name)[p.key] for p in PARAMETERS]) / PER_SI for name in run.truth.cameras]
-    )
+    true = np.concatenate([run.truth.vector(name)[0] for name in run.truth.cameras])
     truth = run.truth_dict()
-    for p, values in ((ANGLE, truth["intersection_angle"]), *((p, truth["ground"]) for p in GROUND)):
+    for group, p in (("intersection_angle", ANGLE), *(("ground", p) for p in GROUND)):
         # second order of 10 arcsec: 5e-5 of it
-        assert combination(run.reading, "", p) @ true == pytest.approx(values[p.key], rel=2e-3)
+        assert combination(run.reading, group, p.key) @ true == pytest.approx(truth[group][p.key], rel=2e-3)
     for k, p in enumerate(PARAMETERS):
-        row = combination(run.reading, "backward", p)
+        row = combination(run.reading, "backward", p.key)
         assert row @ true == pytest.approx(truth["cameras"]["backward"][p.key], rel=1e-12)
         assert np.count_nonzero(row) == 1
         assert row[4 + k] != 0.0

@@ -58,8 +58,7 @@ def main(
     """
 
     def work(given: None, session: Session) -> Result:
-        from twin.compare.compare_report import compare_report
-        from twin.compare.comparison import KIND, PROGRAM, compare, numbers
+        from twin.compare.compare_report import KIND, PROGRAM, compare, compare_report, numbers
 
         comparison = compare(runs, rtol, sigmas)
         report = replace(compare_report(comparison), code=0 if comparison.same else DIFFERENT)

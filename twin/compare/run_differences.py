@@ -35,7 +35,7 @@ TOLD = frozenset(("verdict", "warnings"))
 """Sentences at the top of a result that follow from its numbers, which are compared themselves."""
 NAMES = ("name", "motion", "label", "field", "path", "time_s")
 """Keys by which an entry of a list is told from the others, in this order."""
-SERIES = 12
+_SERIES = 12
 """Numbers of a list from which it is compared as an array."""
 PLAIN = ("json",)
 ARRAYS = ("nc", "tiff")
@@ -200,7 +200,7 @@ def leaves(data: Any, key: str = "", series: bool = True) -> Iterator[tuple[str,
             if name not in LEFT_OUT and name not in ("schema", "reference_frames"):
                 yield from leaves(value, f"{key}.{name}" if key else str(name), series)
     elif isinstance(data, list):
-        if series and len(data) > SERIES and (array := _as_array(data)) is not None:
+        if series and len(data) > _SERIES and (array := _as_array(data)) is not None:
             yield key, array
             return
         names = _entry_names(data)

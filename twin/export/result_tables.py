@@ -15,6 +15,7 @@ from typing import Any
 
 import h5py
 
+from analysis.monitor import parameters
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
@@ -84,15 +85,7 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
         "reduced_chi_square": ("", "of the fit of the spot's shape to all pixels; 1 for a spot as calibrated"),
         "core_chi_square": ("", "the same of the pixels of the spot's core"),
         "sigma_widened": ("", "factor by which the fit widened the standard deviations; 1 for a spot that fits"),
-        "d_alpha_arcsec": ("arcsec", "turn of the camera about its Y, right-handed, perturbed minus nominal"),
-        "d_beta_arcsec": ("arcsec", "turn of the camera about its X, right-handed, perturbed minus nominal"),
-        "d_gamma_arcsec": ("arcsec", "turn of the camera about its Z, the line of sight, perturbed minus nominal"),
-        "d_f_um": ("um", "change of the principal distance, in pixels of the line CCD, longer positive"),
         "principal_distance_mm": ("mm", "principal distance of the nominal camera"),
-        "change_arcsec": ("arcsec", "change of the angle between the cameras' lines of sight, opening positive"),
-        "along_m": ("m", "error on the ground along the track"),
-        "across_m": ("m", "error on the ground across the track, to the right"),
-        "height_m": ("m", "error in height, up"),
         "left_plan_rms_m": ("m", "rms error in plan that is left when the reading is corrected for"),
         "left_height_rms_m": ("m", "rms error in height that is left when the reading is corrected for"),
         "sort": ("", "what the point was chosen for: control by the map, tie between the lines"),
@@ -118,7 +111,8 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
         "status": ("", "empty where it is accepted, else why it is not"),
     }
 )
-"""Column -> unit and what it holds; other columns say both in their own names."""
+"""Column -> unit and what it holds, beside those of `analysis.monitor.parameters`; other columns say both in their own
+names."""
 TITLES: Mapping[str, str] = FrozenMap({POINTS: "Points measured in the images", "study.csv": "Every run of the study"})
 """File of a table that the run keeps -> what it is; others are known by their file."""
 _POINT_HEIGHT = ("m", "height of the ground point above the ellipsoid of WGS 84")
@@ -251,12 +245,14 @@ def _column(name: str, values: Sequence[Any], named: Mapping[str, str] = FrozenM
     own, unit = (head["name"], head["unit"]) if head is not None else (name, "")
     if own in named:
         return DataColumn.of(own, values, unit, named[own])
-    if own in DESCRIPTIONS and not unit:
-        return DataColumn.of(own, values, *DESCRIPTIONS[own])
+    read = (*parameters.CAMERA_PARAMETERS, parameters.ANGLE, *parameters.GROUND)
+    known = {**DESCRIPTIONS, **{one.key: (one.file_unit, one.meaning) for one in read}}
+    if own in known and not unit:
+        return DataColumn.of(own, values, *known[own])
     for ending, text in _SIGMAS.items():
         base = own.removesuffix(ending)
-        if base != own and base in DESCRIPTIONS:
-            return DataColumn.of(own, values, DESCRIPTIONS[base][0], text.format(base))
+        if base != own and base in known:
+            return DataColumn.of(own, values, known[base][0], text.format(base))
     return DataColumn.of(own, values, unit or unit_of((own,)), f"column {own!r} of the run's own table")
 
 

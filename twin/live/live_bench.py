@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor import parameters
+from analysis.monitor.parameters import Parameter
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from scenes.models.clearance import Clearances
@@ -25,9 +27,8 @@ from twin.main_job.assumptions import contradiction, doubted
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.state_reading import StateReader
+from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
@@ -128,9 +129,9 @@ class LiveBench:
             "seed": self.at_rest.seed,
             "estimators": list(run.estimators),
             "judged": run.judged,
-            "parameters": [_label(p) for p in PARAMETERS],
-            "angle": _label(ANGLE) if len(twin.cameras) == 2 else None,
-            "ground": [_label(p) for p in GROUND] if experiment.ground is not None else [],
+            "parameters": [_label(p) for p in parameters.CAMERA_PARAMETERS],
+            "angle": _label(parameters.ANGLE) if len(twin.cameras) == 2 else None,
+            "ground": [_label(p) for p in parameters.GROUND] if experiment.ground is not None else [],
             "disturbances": "" if stated_motion is None else stated_motion.name,
             "course": None if job.course is None else _played(job.course),
         }

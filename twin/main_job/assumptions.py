@@ -8,18 +8,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
-from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Split, quantities, split
+from analysis.monitor.limits import Split, quantities, split
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, Parameter
-from twin.monitor.smoothed_course import SmoothedCourse
+from twin.monitor.reading_table import Reading
+from twin.monitor.time_series import SmoothedCourse
 from twin.run.artefact import plain, significant
 
 __all__ = [
     "NOISE",
-    "NOISE_ALONE",
     "assumed",
     "combination",
     "contradicted",
@@ -30,7 +29,7 @@ __all__ = [
     "share_text",
 ]
 
-NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
+_NOISE_ALONE = "No disturbances are stated: σ is that of the noise of the images alone"
 """Without a sentence's end."""
 NOISE = "the noise of the images"
 """How the part of the variance is called that more frames lower."""
@@ -40,7 +39,7 @@ def assumed(reading: MonitorReading) -> str:
     """What the sigmas assume, and whether the measured shifts agree with it; a sentence without its end."""
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
-        return NOISE_ALONE
+        return _NOISE_ALONE
     agree = "agree with them" if found.agrees else "contradict them"
     return (
         f"σ: noise and the stated disturbances {stated.name}; the shifts {agree} (chi-square "
@@ -135,26 +134,28 @@ def _suspected(found: Consistency, stated: Sequence[str]) -> str:
     )
 
 
-def combination(reading: MonitorReading, camera: str, parameter: Parameter) -> np.ndarray:
+def combination(reading: MonitorReading, group: str, key: str) -> np.ndarray:
     """(4 x cameras,) what a change is made of: its unit per SI of all cameras' parameters, to first order.
 
     Args:
         reading: of the instrument.
-        camera: whose change; empty for the angle and the ground.
-        parameter: which.
+        group: whose change: a camera, or the group of what two read together.
+        key: of the change.
     """
-    group = camera or (ANGLE_GROUP if parameter == ANGLE else GROUND_GROUP)
     found = quantities(reading.cameras, reading.ground)
-    return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, parameter.key))
+    return next(quantity.row for quantity in found if (quantity.group, quantity.key) == (group, key))
 
 
-def limits(reading: MonitorReading, camera: str, parameter: Parameter) -> tuple[str, float]:
-    """What the judged estimator leaves most of the variance of a change's error to, and its share: a body without the
-    base, or NOISE. Of a reading under stated disturbances; arguments as of `combination`.
+def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
+    """What leaves most of the variance of a change's error, and its share: a body without the base, or NOISE.
+
+    Args:
+        reading: of the instrument, under stated disturbances.
+        one: the change, as the judged estimator reads it.
     """
     stated = reading.disturbances
     assert stated is not None
-    row, noise = combination(reading, camera, parameter)[None], reading.recovery.shift_covariance[0]
+    row, noise = combination(reading, one.group, one.parameter.key)[None], reading.recovery.shift_covariance[0]
     found = split(row, stated, noise, reading.gains[reading.judged])
     variances = {NOISE: found.noise, **Split.by(found.after, stated.bodies)}
     shares = {body: float(variance[0]) for body, variance in variances.items()}

@@ -10,24 +10,12 @@ from itertools import groupby
 import numpy as np
 from markupsafe import Markup
 
+from analysis.monitor import parameters
 from scenes.specs.instrument import BASE
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.monitor.crosstalk import PRINTED, CameraCrosstalk
-from twin.run.artefact import (
-    SAME,
-    SYMBOLS,
-    Artefact,
-    Cell,
-    Marked,
-    Table,
-    Text,
-    fixed,
-    plain,
-    shown_unit,
-    significant,
-)
+from twin.run.artefact import SAME, SYMBOLS, Artefact, Cell, Marked, Table, Text, fixed, plain, shown_unit, significant
 from twin.run.report import Section
 
 WRONG = 0.1
@@ -75,8 +63,8 @@ def _motions(run: RenderRun) -> Table:
     pitch = 1e6 * run.experiment.path.pitch
     places = list(dict.fromkeys(place for table in run.crosstalk.values() for place in table.coordinates))
     heads = ["camera", "motion", "body", "per", *(f"{place} [µm]" for place in places)]
-    heads += [f"{p.symbol} [{p.unit}] true" for p in PARAMETERS]
-    heads += [f"{p.symbol} [{p.unit}] {estimator.title}" for estimator in run.estimators.values() for p in PARAMETERS]
+    readers = ("true", *(estimator.title for estimator in run.estimators.values()))
+    heads += [f"{p.label} {reader}" for reader in readers for p in parameters.CAMERA_PARAMETERS]
     rows: list[list[Cell]] = []
     for name, table in run.crosstalk.items():
         for k, motion in enumerate(table.motions):
@@ -105,9 +93,8 @@ def crosstalk_section(run: RenderRun) -> Section:
 
 def _crosstalk(run: RenderRun, camera: int) -> Table:
     name, table = list(run.crosstalk.items())[camera]
-    columns = [_columns(run, table, p) for p in range(len(PARAMETERS))]
-    own = run.recovered_dict()["cameras"][name][run.judged]
-    floors = [max(SAME, UNSEEN * own[f"{p.key}_sigma_noise"]) for p in PARAMETERS]
+    columns = [_columns(run, table, p) for p in range(len(parameters.CAMERA_PARAMETERS))]
+    floors = [max(SAME, UNSEEN * row.noise) for row in run.reading.table.of(run.judged) if row.camera == name]
     bodies = [motion.body for motion in table.motions]
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
@@ -127,7 +114,8 @@ def _crosstalk(run: RenderRun, camera: int) -> Table:
             rows.append(row)
     caption = Markup('All digits: the table of <a href="#motions">motions and spots</a>.')
     heads = ["Motion", "per", *(head for own in columns for head in ("true", *(label for label, _ in own)))]
-    over = [("", 2), *((f"{p.symbol} [{p.unit}]", 1 + len(columns[i])) for i, p in enumerate(PARAMETERS))]
+    spans = zip(parameters.CAMERA_PARAMETERS, columns, strict=True)
+    over = [("", 2), *((p.label, 1 + len(own)) for p, own in spans)]
     title = f"Camera {name}"
     return Table(f"crosstalk-{camera}", title, caption, heads, rows, over=over, bands=bands, within=IN_PAGE)
 
@@ -167,7 +155,7 @@ def formula_section(run: RenderRun) -> Section:
         "for. A factor of 1 is a correct formula."
     )
     every = {name: table.factors for name, table in run.crosstalk.items()}
-    symbols = {p.key: p.symbol for p in PARAMETERS}
+    symbols = {p.key: p.symbol for p in parameters.CAMERA_PARAMETERS}
     rows: list[list[Cell]] = []
     for same in zip(*every.values(), strict=True):
         row: list[Cell] = [f"{symbols[same[0].parameter]}, {same[0].formula}", same[0].motion]

@@ -8,13 +8,14 @@ from collections.abc import Collection, Mapping
 from pathlib import PurePath
 from typing import Any
 
-from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.nodal_deformation import PRINTED, SEEN, NodalDeformation
+from scenes.models.nodal_bodies import HeatedBody, HeatedFace
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.main_job.render_results import RenderRun
+from twin.run.quantity import Quantity, Record
 
 
 def table_names(job: JobSpec) -> Mapping[tuple[str, str], str]:
@@ -71,30 +72,81 @@ def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
     return run.experiment.deformed(run.resolved.job)
 
 
-def deformation_numbers(run: RenderRun) -> dict[str, Any]:
-    """Contents of deformation.json."""
+def heated_of(run: RenderRun) -> Mapping[str, HeatedBody]:
+    """Body -> what its table of temperatures is.
+
+    Args:
+        run: of the job.
+    """
+    return run.experiment.heated(run.resolved.job)
+
+
+BENT: Record[NodalDeformation] = Record(
+    "What a table of displaced nodes was found to be.",
+    Quantity("nodes", lambda face: len(face.weight), "nodes on the optical surface"),
+    Quantity("nodes_not_used", lambda face: face.others, "nodes off the optical surface"),
+    Quantity("spacing_mm", lambda face: face.spacing, "distance of neighbouring nodes"),
+    Quantity("rotate_arcsec", lambda face: face.rotate, "rigid rotation about X, Y and Z"),
+    Quantity("shift_um", lambda face: face.shift, "rigid shift along X, Y and Z"),
+    Quantity("growth_ppm", lambda face: face.growth, "relative growth"),
+    Quantity("change_rms_nm", lambda face: face.rms(face.change), "change of sag beyond rigid motion and growth"),
+    Quantity("change_pv_nm", lambda face: face.range(face.change), "peak to valley of that change"),
+    Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.figure.items()}, "Zernike terms of the change"),
+    Quantity("residual_rms_nm", lambda face: face.rms(face.residual), "what the Zernike terms leave"),
+    Quantity("residual_pv_nm", lambda face: face.range(face.residual), "peak to valley of what they leave"),
+    Quantity("not_carried_rms_nm", lambda face: face.rms(face.lost), "what the grid of the rest does not carry"),
+    Quantity("between_nodes_rms_nm", lambda face: face.between, "error of nodes that are foretold by the others"),
+    Quantity(
+        "mesh_prints_through", lambda face: face.printed_through, "whether what is left changes from node to node"
+    ),
+)
+_WARMED_FACE: Record[HeatedFace] = Record(
+    "What temperatures that are not linear do to an optical face, in its own nominal axes.",
+    Quantity("rotate_arcsec", lambda face: face.motion.rotate, "rotation about X, Y and Z"),
+    Quantity("shift_nm", lambda face: face.motion.shift, "shift along X, Y and Z"),
+    Quantity("growth_ppm", lambda face: face.motion.stretch, "relative growth"),
+    Quantity("figure_nm", lambda face: {f"Z{j}": a for j, a in face.motion.figure.items()}, "Zernike terms of its sag"),
+    Quantity("not_carried_rms_nm", lambda face: face.lost, "what the Zernike terms do not carry"),
+    Quantity("coarser_elements_rms_nm", lambda face: face.unmeshed, "by how much coarser finite elements differ"),
+)
+WARMED: Record[HeatedBody] = Record(
+    "What a table of temperatures was found to be.",
+    Quantity("nodes", lambda body: body.nodes, "nodes of the table"),
+    Quantity("spacing_mm", lambda body: body.spacing, "distance of neighbouring nodes"),
+    Quantity("linear_change_k", lambda body: body.linear.change, "change at the body's origin of the linear field"),
+    Quantity("linear_gradient_k_per_m", lambda body: body.linear.gradient, "gradient of the linear field"),
+    Quantity("not_linear_rms_k", lambda body: body.left[0], "what the linear field leaves, RMS over the volume"),
+    Quantity("not_linear_largest_k", lambda body: body.left[1], "what it leaves at most"),
+    Quantity("between_nodes_rms_k", lambda body: body.between, "error of nodes that are foretold by the others"),
+    Quantity(
+        "outside_share",
+        lambda body: None if body.coverage is None else body.coverage.outside,
+        "share of the body's volume beyond the nodes",
+    ),
+    Quantity(
+        "farthest_mm",
+        lambda body: None if body.coverage is None else body.coverage.farthest,
+        "largest distance of the body from any node",
+    ),
+    Quantity("index_path_not_carried_nm", lambda body: body.index_path, "optical path that no linear index carries"),
+    Quantity("faces", lambda body: body.faces, "its optical faces", record=_WARMED_FACE),
+)
+
+
+def table_numbers(run: RenderRun, kind: str) -> dict[str, Any]:
+    """Contents of deformation.json or temperature.json.
+
+    Args:
+        run: of the job.
+        kind: what its tables hold, ``deformation`` or ``temperature``.
+    """
     names = table_names(run.resolved.job)
-    faces = faces_of(run).items()
-    return {"bodies": {path: {"table": names[path, "deformation"], **_numbers(face)} for path, face in faces}}
-
-
-def _numbers(face: NodalDeformation) -> dict[str, Any]:
-    return {
-        "nodes": len(face.weight),
-        "nodes_not_used": face.others,
-        "spacing_mm": 1e3 * face.spacing,
-        "rotate_arcsec": [turn / ARCSEC for turn in face.rotate],
-        "shift_um": [1e6 * move for move in face.shift],
-        "growth_ppm": 1e6 * face.growth,
-        "change_rms_nm": 1e9 * face.rms(face.change),
-        "change_pv_nm": 1e9 * face.range(face.change),
-        "figure_nm": {f"Z{j}": 1e9 * a for j, a in face.figure.items()},
-        "residual_rms_nm": 1e9 * face.rms(face.residual),
-        "residual_pv_nm": 1e9 * face.range(face.residual),
-        "not_carried_rms_nm": 1e9 * face.rms(face.lost),
-        "between_nodes_rms_nm": 1e9 * face.between,
-        "mesh_prints_through": face.printed_through,
-    }
+    found = (
+        {path: BENT(face) for path, face in faces_of(run).items()}
+        if kind == "deformation"
+        else {path: WARMED(body) for path, body in heated_of(run).items()}
+    )
+    return {"bodies": {path: {"table": names[path, kind], **numbers} for path, numbers in found.items()}}
 
 
 def deformation_warnings(faces: Mapping[str, NodalDeformation], planes: Collection[str] = ()) -> tuple[str, ...]:

@@ -15,26 +15,10 @@ from scenes.models.camera_model import CameraModel
 from scenes.models.instrument_model import Instrument
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
 from twin.pictures.light_paths import RIM, Beam, LightPaths
-from twin.run.svg import (
-    BLUE,
-    BROWN,
-    GREEN,
-    GREY,
-    INK,
-    LIGHT,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    YELLOW,
-    gridded,
-    look,
-    new_figure,
-    to_svg,
-)
+from twin.run import svg
 
-FIELD_COLOURS = {"left edge": SKY, "centre": BLUE, "right edge": PURPLE}
-CHANNEL_COLOURS = (VERMILION, ORANGE, BROWN, GREY, YELLOW, INK)
+FIELD_COLOURS = {"left edge": svg.SKY, "centre": svg.BLUE, "right edge": svg.PURPLE}
+_CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)
 """Of a camera's monitor beams, in the order of its channels; they begin again where there are more."""
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
@@ -45,34 +29,38 @@ _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the sto
 
 def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
     """Base X-Z plane, metres; the mirrors are cut in the camera's plane of symmetry."""
-    with look("side-view"):
+    with svg.look("side-view"):
         spread = np.concatenate([b.vertices.reshape(-1, 3) for b in paths.beams])
         low, high = spread[:, [0, 2]].min(axis=0) - 0.3, spread[:, [0, 2]].max(axis=0) + 0.3 + 0.5 * ARROW
         width, height = high - low
-        figure = new_figure(min(10.6 * height / width + 0.6, 9.0))
+        figure = svg.new_figure(min(10.6 * height / width + 0.6, 9.0))
         axes = figure.subplots()
         for camera in instrument.cameras:
             _camera_side(axes, instrument, paths, camera)
         _prisms(axes, instrument, paths)
         axes.set(xlabel="base X, flight direction [m]", ylabel="base Z, toward the scene [m]", aspect="equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        gridded(axes)
+        svg.gridded(axes)
         colours = _colours(instrument)
         kinds = {_fill(solid) for solid in instrument.solids}
         handles = [
-            Line2D([], [], color=BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
+            Line2D([], [], color=svg.BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
             *(
                 Line2D([], [], color=colours[name], lw=1.2, label=f"monitor beam, {name} channel (out and back)")
                 for name in dict.fromkeys(c.side for c in instrument.channels if c in _seen(instrument, c.camera))
             ),
-            Line2D([], [], color=INK, lw=3, label="mirrors, clear apertures"),
-            Line2D([], [], color=GREEN, lw=3, label="focal plane; return faces"),
-            *([Patch(fc=_GLASS, ec=INK, lw=0.8, label="glass prisms")] if _GLASS in kinds else []),
-            *([Patch(fc=_FRAME, ec=INK, lw=0.8, label="mirrors and frames of the monitor")] if _FRAME in kinds else []),
-            Patch(fc=_BLOCK, ec=INK, lw=0.8, label="central prism, common reference"),
+            Line2D([], [], color=svg.INK, lw=3, label="mirrors, clear apertures"),
+            Line2D([], [], color=svg.GREEN, lw=3, label="focal plane; return faces"),
+            *([Patch(fc=_GLASS, ec=svg.INK, lw=0.8, label="glass prisms")] if _GLASS in kinds else []),
+            *(
+                [Patch(fc=_FRAME, ec=svg.INK, lw=0.8, label="mirrors and frames of the monitor")]
+                if _FRAME in kinds
+                else []
+            ),
+            Patch(fc=_BLOCK, ec=svg.INK, lw=0.8, label="central prism, common reference"),
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _channel(beam: Beam) -> str:
@@ -82,7 +70,7 @@ def _channel(beam: Beam) -> str:
 def _colours(instrument: Instrument) -> dict[str, str]:
     """Name of a channel -> colour, the same in all cameras."""
     names = dict.fromkeys(channel.side for channel in instrument.channels)
-    return {name: CHANNEL_COLOURS[i % len(CHANNEL_COLOURS)] for i, name in enumerate(names)}
+    return {name: _CHANNEL_COLOURS[i % len(_CHANNEL_COLOURS)] for i, name in enumerate(names)}
 
 
 def _seen(instrument: Instrument, camera: str) -> list[Channel]:
@@ -94,7 +82,7 @@ def _seen(instrument: Instrument, camera: str) -> list[Channel]:
 def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str) -> None:
     model, placed = instrument.cameras[camera], paths.placed
     imaging = next(b for b in paths.of(camera, monitor=False) if b.name.endswith("centre"))
-    _fan(axes, imaging, BLUE, 0.09)
+    _fan(axes, imaging, svg.BLUE, 0.09)
     seen, colours = {c.side for c in _seen(instrument, camera)}, _colours(instrument)
     for beam in paths.of(camera, monitor=True):
         if _channel(beam) in seen:
@@ -103,7 +91,7 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     middle = np.mean(centres, axis=0)
     for mirror in model.mirrors:
         curve = placed.pose(f"{BASE}/{camera}/{mirror}").apply(_section(model, mirror))
-        axes.plot(curve[:, 0], curve[:, 2], color=INK, lw=3, solid_capstyle="butt", zorder=4)
+        axes.plot(curve[:, 0], curve[:, 2], color=svg.INK, lw=3, solid_capstyle="butt", zorder=4)
         centre = curve[len(curve) // 2]
         away = (centre - middle)[[0, 2]]
         away = 15.0 * away / np.linalg.norm(away)
@@ -116,11 +104,11 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
             assert aperture is not None
             radius = aperture.bounds[1]
             ends = pose.apply(radius * np.array([[0.0, -1.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
-            axes.plot(*_widest(ends), color=GREEN, lw=3, solid_capstyle="butt", zorder=5)
+            axes.plot(*_widest(ends), color=svg.GREEN, lw=3, solid_capstyle="butt", zorder=5)
     origin = placed.pose(f"{BASE}/{camera}")
     end = imaging.vertices[0, 0]
     tip = end + ARROW * (end - imaging.vertices[0, 1]) / np.linalg.norm(end - imaging.vertices[0, 1])
-    axes.annotate("", xy=tip[[0, 2]], xytext=end[[0, 2]], arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.3})
+    axes.annotate("", xy=tip[[0, 2]], xytext=end[[0, 2]], arrowprops={"arrowstyle": "-|>", "color": svg.INK, "lw": 1.3})
     look_deg = float(np.degrees(instrument.spec.cameras[camera].look))
     text = f"{camera}, look {look_deg:+.4g}°".replace("-", "\N{MINUS SIGN}")
     first = placed.pose(f"{BASE}/{camera}/{model.mirrors[0]}").apply(_section(model, model.mirrors[0]))
@@ -139,7 +127,7 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
     for solid in instrument.solids:
         outline = _outline(solid, paths)
         axes.add_patch(Polygon(outline, closed=True, fc=_fill(solid), ec="none", zorder=1.6))
-        axes.add_patch(Polygon(outline, closed=True, fill=False, ec=INK, lw=0.8, zorder=3))
+        axes.add_patch(Polygon(outline, closed=True, fill=False, ec=svg.INK, lw=0.8, zorder=3))
         what = "prism" if solid.transparent else "mirrors"
         if solid.path == CENTRAL_PRISM:
             middle = 0.5 * (outline[:, 0].min() + outline[:, 0].max())
@@ -167,7 +155,7 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
     """Seen along the line CCD a focal plane is a point: it is drawn as a bar wide enough to be seen."""
     pose = paths.placed.pose(f"{BASE}/{camera}/focal_plane")
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
-    axes.plot(bar[:, 0], bar[:, 2], color=GREEN, lw=4, solid_capstyle="butt", zorder=5)
+    axes.plot(bar[:, 0], bar[:, 2], color=svg.GREEN, lw=4, solid_capstyle="butt", zorder=5)
     # beside the monitor beams, which go to the central prism
     prism = paths.placed.pose(CENTRAL_PRISM).translation
     aside = -17.0 if prism[0] > pose.translation[0] else 10.0
@@ -222,10 +210,10 @@ def _label(
 
 def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
     """Where the beams meet each mirror, millimetres in the mirror's own x, y; a row per camera."""
-    with look("footprints"):
+    with svg.look("footprints"):
         cameras = list(instrument.cameras)
         columns = max(len(model.mirrors) for model in instrument.cameras.values())
-        figure = new_figure(0.7 + 3.0 * len(cameras))
+        figure = svg.new_figure(0.7 + 3.0 * len(cameras))
         grid = figure.subplots(len(cameras), columns, squeeze=False)
         for line, camera in enumerate(cameras):
             model = instrument.cameras[camera]
@@ -239,7 +227,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
                     axes.set_ylabel("y, in the plane of symmetry [mm]")
             for k in range(len(model.mirrors), columns):
                 grid[line, k].set_axis_off()
-        handles = [Line2D([], [], color=INK, lw=1.3, label="clear aperture")]
+        handles = [Line2D([], [], color=svg.INK, lw=1.3, label="clear aperture")]
         handles += [Line2D([], [], color=c, lw=1.3, label=f"imaging, {f}") for f, c in FIELD_COLOURS.items()]
         ends = {c.side: c.ccd[1] > 0.0 for c in instrument.channels}
         marks = [
@@ -247,7 +235,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
             for name, colour in _colours(instrument).items()
         ]
         figure.legend(handles=[*handles, *marks], loc="outside upper center", ncols=6, columnspacing=1.3)
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
@@ -257,7 +245,7 @@ def _style(colour: str, filled: bool) -> dict[str, Any]:
 
 def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: str, mirror: str) -> None:
     outline = 1e3 * instrument.cameras[camera].apertures[mirror].outline()
-    axes.plot(outline[:, 0], outline[:, 1], color=INK, lw=1.3)
+    axes.plot(outline[:, 0], outline[:, 1], color=svg.INK, lw=1.3)
     for beam in paths.of(camera, monitor=False):
         edge = 1e3 * beam.footprints[mirror, 0][1:]
         axes.add_patch(Polygon(edge, closed=True, fill=False, ec=FIELD_COLOURS[beam.name.rpartition("/")[2]], lw=1.2))
@@ -269,6 +257,6 @@ def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: s
                 axes.add_patch(Polygon(1e3 * points[1:], closed=True, **style))
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.06)
-    axes.grid(color=LIGHT, lw=0.4)
+    axes.grid(color=svg.LIGHT, lw=0.4)
     axes.set_axisbelow(True)
     axes.tick_params(length=2.5)

@@ -20,10 +20,19 @@ from analysis.monitor.recovery import Recovery
 from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.fit_state import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
+from twin.monitor.reading_table import ReadingTable, reading_table
+from twin.monitor.truth import Truth
 from twin.run.provenance import SelfCheck
-from twin.uncertainty.words import short_text, unseen_texts
+from twin.uncertainty.monitor_limits import short_text, unseen_texts
 
-__all__ = ["STATED", "STATED_SIGMA", "MonitorReading", "stated"]
+__all__ = ["CENTROID_NOTES", "STATED", "MonitorReading", "stated"]
+
+CENTROID_NOTES = {
+    "ml": "maximum-likelihood fit of the calibrated spot shape",
+    "gaussian": "fit of a Gaussian",
+    "energy": "windowed energy centroid, as in the paper",
+}
+"""Method of finding spots -> its name for readers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +50,7 @@ class MonitorReading:
         frames: of each spot after.
         centroid: by which method the spots were found.
         found_wrong: why sigma does not hold, as far as it was found before the spots were read.
+        truth: of the state, where it is simulated.
     """
 
     channels: tuple[tuple[str, str], ...]
@@ -52,6 +62,7 @@ class MonitorReading:
     frames: int
     centroid: str
     found_wrong: tuple[str, ...] = ()
+    truth: Truth | None = None
 
     @property
     def estimators(self) -> dict[str, Estimator]:
@@ -62,6 +73,11 @@ class MonitorReading:
     def judged(self) -> str:
         """The estimator that the verdict is about: `posterior` where disturbances are stated, else `model`."""
         return judged(self.estimators)
+
+    @cached_property
+    def table(self) -> ReadingTable:
+        """All readings, beside the truth where there is one."""
+        return reading_table(self.recovery, self.cameras, self.truth, self.ground).at(0)
 
     @cached_property
     def gains(self) -> dict[str, np.ndarray]:
@@ -198,10 +214,7 @@ class MonitorReading:
 
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
-        cameras = {
-            name: {estimator: _first(p.to_dict()) for estimator, p in estimators.items()}
-            for name, estimators in self.recovery.parameters.items()
-        }
+        read = self.table.groups()
         spots: dict[str, Any] = {}
         r = self.recovery
         fits = None if r.evidence is None else (r.evidence.before, r.evidence.after)
@@ -211,11 +224,7 @@ class MonitorReading:
                 "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **(first or {})},
                 "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **(last or {})},
             }
-        out: dict[str, Any] = {"cameras": cameras, "spots": spots}
-        if r.angle:
-            out["intersection_angle"] = {e: _first(a.to_dict()) for e, a in r.angle.items()}
-        if r.ground:
-            out["ground"] = {e: _first(g.to_dict()) for e, g in r.ground.items()}
+        out: dict[str, Any] = {"cameras": read.pop("cameras"), "spots": spots, **read}
         if self.consistency is not None:
             out["disturbances"] = self._stated(self.consistency)
         if self.from_statement:
@@ -300,14 +309,14 @@ SHARE, OFF = 3, 1
 """Decimals of shares, and of how far linear readings are off in sigmas: noise does not move them but by chance."""
 STATED = 6
 """Decimals of a reading's sigma to which files state the reading."""
-STATED_SIGMA = 8
+_STATED_SIGMA = 8
 """Significant digits of a sigma, and of a chi-square."""
 _SIGMAS = ("_sigma", "_sigma_noise", "_rms_m")
 """Endings of the keys of sigmas."""
 
 
 def _to_digits(value: float) -> float:
-    return float(f"{value:.{STATED_SIGMA - 1}e}")
+    return float(f"{value:.{_STATED_SIGMA - 1}e}")
 
 
 def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
@@ -333,11 +342,6 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
         else:
             out[key] = value
     return out
-
-
-def _first(arrays: Mapping[str, Any]) -> dict[str, float]:
-    """The only state's values."""
-    return {key: float(np.ravel(value)[0]) for key, value in arrays.items()}
 
 
 def _fit(fits: FitStates, spot: int) -> dict[str, float]:

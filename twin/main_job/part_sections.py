@@ -4,29 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
 from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
 from twin.path_tracing.families import family_name
 from twin.path_tracing.path_result import Family
-from twin.run.artefact import (
-    FAR,
-    Artefact,
-    Cell,
-    Marked,
-    Table,
-    fixed,
-    plain,
-    residual,
-    residual_cell,
-    significant,
-)
+from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
 from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
 from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 
-WHEN = ("before", "after")
+_WHEN = ("before", "after")
 FREE = "the pupils are free: `obstruction: ignore`"
 
 
@@ -58,9 +49,9 @@ def quality_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:
             "quality",
             "",
             caption,
-            ("", *WHEN * len(PLACES)),
+            ("", *_WHEN * len(PLACES)),
             rows,
-            over=(("", 1), *((place, len(WHEN)) for place in PLACES)),
+            over=(("", 1), *((place, len(_WHEN)) for place in PLACES)),
             bands=bands,
             within=IN_PAGE,
             full=_every_field(quality),
@@ -91,7 +82,7 @@ def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> li
     for key, label, values, unit, decimals in lines:
         row: list[Cell] = [label]
         for place, field in PLACES.items():
-            for s, when in enumerate(WHEN):
+            for s, when in enumerate(_WHEN):
                 value = unit * float(values[s, quality.fields.index(field)])
                 text = fixed(value, decimals, sign=key == "defocus_um")
                 row.append(Marked(text, "", "number", f"quality.{name}.{key}.{place}.{when}"))
@@ -104,7 +95,7 @@ def _every_field(quality: ImageQuality) -> Table:
     places = {quality.fields.index(field): place for place, field in PLACES.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
-        for s, when in enumerate(WHEN):
+        for s, when in enumerate(_WHEN):
             for k, field in enumerate(quality.fields):
                 numbers = (camera.wfe, camera.wfe_refocused, 1e6 * camera.defocus, camera.mtf_along_line)
                 values = [float(n[s, k]) for n in (*numbers, camera.mtf_along_track, 1e2 * camera.light_lost)]
@@ -116,7 +107,7 @@ def _every_field(quality: ImageQuality) -> Table:
 
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
 TITLES = {"edge": "knife edge", "bars": "bars"}
-DECIMALS = 4
+_DECIMALS = 4
 """Of an MTF."""
 
 
@@ -225,16 +216,16 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
 
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
     """One measured value and its truth."""
-    true = Marked(fixed(reading.true_nyquist, DECIMALS), "", "truth", f"{key}.true")
+    true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
     found = reading.nyquist
     if found is None:
         return Marked("not measurable", "", "number", key), true
     value, sigma = found
-    text = f"{fixed(value, DECIMALS)} ± {fixed(sigma, DECIMALS)}"
+    text = f"{fixed(value, _DECIMALS)} ± {fixed(sigma, _DECIMALS)}"
     return residual_cell(text, residual(value - reading.true_nyquist, sigma), key), true
 
 
-STRONGEST = 4
+_STRONGEST = 4
 """Families listed of each source."""
 
 
@@ -258,7 +249,7 @@ def stray_section(run: RenderRun) -> Section | None:
             what, (x, y) = family_name(family.touches, nominal), (1e6 * float(c) for c in family.centroid)
             chain = " ".join(map(str, family.touches))
             full.append([channel.key, family.kind, what, share, sigma, x, y, family.count, chain])
-            if k < STRONGEST:
+            if k < _STRONGEST:
                 size = Marked(f"{significant(share)} ± {significant(sigma, 1)}", "", "number")
                 where = [Marked(fixed(c, 1), "", "number") for c in (x, y)]
                 families.append([channel.key, family.kind, what, size, *where])
@@ -314,3 +305,39 @@ def _way(family: Family) -> str:
     prisms = [step for step in way if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)
+
+
+_SHOWN_ANGLES = np.arange(0.0, 90.0, 10.0)
+"""Angles of incidence, degrees, at which coatings are shown; those beyond their tables are left out."""
+
+
+def finish_section(run: RenderRun) -> Section | None:
+    """What the tables are at the monitor's wavelength; None where there are none."""
+    measured = None if run.stray is None else run.stray.measured
+    if measured is None or not (measured.scatter or measured.coatings):
+        return None
+    tables = []
+    if measured.scatter:
+        rows: list[tuple[Cell, ...]] = []
+        for kind, scatter in measured.scatter.items():
+            rms = scatter.table.reciprocity()
+            for angle, stated in zip(scatter.table.incidence, scatter.stated, strict=True):
+                total = scatter.table.total(float(angle))
+                unequal: Cell = "" if np.isnan(rms) else 100.0 * rms
+                rows.append((kind, float(np.degrees(angle)), 100.0 * total, 100.0 * stated, unequal))
+        heads = ("surfaces", "incidence [deg]", "total scatter [%]", "stated by the file [%]", "not reciprocal [% rms]")
+        text = "Of the incident light: the integral of the table, which is what paths scatter."
+        tables.append(Table("finish_scatter", "Measured scattering", text, heads, rows, (), 4))
+    if measured.coatings:
+        coats: list[tuple[Cell, ...]] = []
+        for kind, coating in measured.coatings.items():
+            through = kind == "coated"
+            for degrees in _SHOWN_ANGLES:
+                if degrees == 0.0 or np.radians(degrees) <= coating.angles[-1]:
+                    reflected, passed = coating.at(float(np.radians(degrees)), through)
+                    coats.append((kind, float(degrees), 100.0 * reflected, 100.0 * passed if through else ""))
+        columns = ("surfaces", "incidence in air [deg]", "reflected [%]", "transmitted [%]")
+        text = "At the monitor's wavelength, for unpolarised light."
+        tables.append(Table("finish_coatings", "Measured coatings", text, columns, coats, (), 4))
+    about = "Finishes by tables that somebody measured; all others are built in."
+    return Section("Measured finishes", (about,), tuple(tables), 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -17,7 +16,6 @@ from twin.main_job.render_drawings import load_drawing
 from twin.main_job.render_folder import write_run
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
 from twin.main_job.verdict import judge, recovered_numbers
 from twin.run.cli import print_verdict, print_whole, result_table
 from twin.run.command import Result, print_warnings
@@ -27,12 +25,9 @@ from twin.run.second_process import SecondProcess
 from twin.targets.target_images import DIRECTIONS, PLACES
 from twin.targets.target_measurement import EdgeReading, TargetRun
 
-DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
-DECIMALS |= dict.fromkeys((p.key for p in GROUND), 3)
-"""Of a parameter in the terminal's table."""
 NUMBER = 7
 """Width of most numbers there."""
-WIDE = 90
+_WIDE = 90
 """Columns of a terminal from which on the table also has the noise's part of sigma."""
 
 _ALONG = dict(zip(DIRECTIONS, ("along line", "along track"), strict=True))
@@ -73,7 +68,7 @@ def _print_result(run: RenderRun, console: Console) -> None:
     """The verdict, the result table and what to bear in mind."""
     told = judge(run)
     print_verdict(console, told.verdict)
-    print_whole(console, _table(run, console.width >= WIDE))
+    print_whole(console, _table(run, console.width >= _WIDE))
     console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
@@ -126,7 +121,6 @@ def _head(name: str) -> str:
 
 def _table(run: RenderRun, wide: bool) -> Table:
     """What every estimator recovered, beside the truth, with sigma and error of the judged one."""
-    truth, recovered = run.truth_dict(), run.recovered_dict()
     title = f"{run.resolved.instrument.name}: recovered from the images ({run.frames} frames, seed {run.seed})"
     if run.series is not None:
         title += f"\nat {moment(float(run.series.times[run.series.shown]))} of the course"
@@ -138,25 +132,15 @@ def _table(run: RenderRun, wide: bool) -> Table:
     for head in ("true", *map(_head, run.estimators), *sigmas, "error", "in σ"):
         table.add_column(head, justify="right", no_wrap=True)
 
-    def add(p: Parameter, true: float, estimators: Mapping[str, Mapping[str, float]]) -> None:
-        decimals, own = DECIMALS[p.key], estimators[judged]
-        sigma, error = own[f"{p.key}_sigma"], own[p.key] - true
-        values = [true, *(estimators[name][p.key] for name in run.estimators), sigma]
-        values += [own[f"{p.key}_sigma_noise"]] * wide
+    group = ""
+    for same in run.reading.table.by_change():
+        own, p = next(row for row in same if row.estimator == judged), same[0].parameter
+        if own.where != group:
+            group = own.where
+            table.add_row(f"[bold]{escape(group)}[/]")
+        values = [own.true, *(row.value for row in same), own.sigma, *([own.noise] if wide else [])]
         # adding 0.0 after rounding leaves no minus before a zero
-        cells = [f"{round(value, decimals) + 0.0:.{decimals}f}" for value in values]
-        label = escape(f"{p.symbol} [{p.unit}]")
-        table.add_row(label, *cells, f"{error:+.{decimals}f}", f"{round(error / sigma, 1) + 0.0:+.1f}")
-
-    for camera, estimators in recovered["cameras"].items():
-        table.add_row(f"[bold]{escape(camera)}[/]")
-        for p in PARAMETERS:
-            add(p, truth["cameras"][camera][p.key], estimators)
-    if "intersection_angle" in truth:
-        table.add_row("[bold]both[/]")
-        add(ANGLE, truth["intersection_angle"][ANGLE.key], recovered["intersection_angle"])
-    if "ground" in truth:
-        table.add_row("[bold]ground[/]")
-        for p in GROUND:
-            add(p, truth["ground"][p.key], recovered["ground"])
+        cells = [f"{round(value, p.decimals) + 0.0:.{p.decimals}f}" for value in values]
+        tail = f"{own.error:+.{p.decimals}f}", f"{round(own.error / own.sigma, 1) + 0.0:+.1f}"
+        table.add_row(escape(own.parameter.label), *cells, *tail)
     return table

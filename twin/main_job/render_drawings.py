@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from importlib import import_module
 from typing import Any
 from xml.sax.saxutils import escape
 
-from optics.geometry.tree import State
-from scenes.models.instrument_model import Instrument
 from twin.main_job.render_results import RenderRun
 from twin.pictures.light_paths import LightPaths
 from twin.run.artefact import Undrawn
@@ -29,28 +28,40 @@ def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any
         run: the run; what it works out on demand is taken as it is now.
         paths: its light, traced.
     """
-    experiment = run.experiment
-    out: dict[str, Callable[[], Any]] = {"motions": partial(_motions, run)}
-    out |= {f"spots {name}": partial(_spots, run, name) for name in experiment.instrument.cameras}
-    out[IRRADIANCE] = partial(_irradiance, run)
-    out["footprints"] = partial(_footprints, experiment.instrument, paths)
-    if run.targets is not None:
-        for name in run.targets.cameras:
-            out[f"targets {name}"] = partial(_targets, run, name)
-            if run.targets.has_edges:
-                out[f"mtf {name}"] = partial(_mtf, run, name)
-    if run.series is not None:
-        out["course"] = partial(_course, run)
-        out["temperatures"] = partial(_temperatures, run)
-        if run.series.smoothed is not None:
-            out["smoothed"] = partial(_smoothed, run)
-    out[SUMMARY] = partial(_summary, run)
-    out["side"] = partial(_side, experiment.instrument, paths)
-    out["residuals"] = partial(_residuals, run)
+    instrument, series, targets = run.experiment.instrument, run.series, run.targets
+    out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots.motion_map_svg", run)}
+    out |= {f"spots {name}": _drawing("spot_plots.spots_svg", run, name) for name in instrument.cameras}
+    out[IRRADIANCE] = _drawing("render_files.irradiance_file", run)
+    out["footprints"] = _drawing("light_path_plots.footprints_svg", instrument, paths)
+    if targets is not None:
+        for name, camera in targets.cameras.items():
+            out[f"targets {name}"] = _drawing("target_plots.images_svg", name, camera)
+            if targets.has_edges:
+                out[f"mtf {name}"] = _drawing("target_plots.curves_svg", name, camera)
+    if series is not None:
+        titles = {name: estimator.title for name, estimator in run.estimators.items()}
+        out["course"] = _drawing("series_plots.parameters_svg", series, titles)
+        out["temperatures"] = _drawing("series_plots.temperatures_svg", series)
+        if series.smoothed is not None:
+            out["smoothed"] = _drawing("series_plots.smoothed_svg", series)
+    out[SUMMARY] = _drawing("summary_plot.summary_png", run)
+    out["side"] = _drawing("light_path_plots.side_view_svg", instrument, paths)
+    out["residuals"] = _drawing("spot_plots.residuals_svg", run)
     if run.quality is not None and run.quality.obstruction:
-        out["pupils"] = partial(_pupils, run)
-    out[SCENE] = partial(_scene, experiment.instrument, run.state, paths)
+        out["pupils"] = _drawing("target_plots.pupils_svg", run.quality)
+    out[SCENE] = partial(_call, "twin.pictures.scene_file", "scene_bytes", instrument, run.state, paths)
     return {name: partial(_tried, name, draw) for name, draw in out.items()}
+
+
+def _drawing(function: str, *given: Any) -> Callable[[], Any]:
+    """A drawing by a function of this folder, ``file.name``."""
+    module, _, name = function.partition(".")
+    return partial(_call, f"{__package__}.{module}", name, *given)
+
+
+def _call(module: str, name: str, *given: Any) -> Any:
+    """Import a module and call its function: what draws takes a second to import, in the process that draws."""
+    return getattr(import_module(module), name)(*given)
 
 
 def _tried(name: str, draw: Callable[[], Any]) -> Any:
@@ -82,104 +93,14 @@ def load_drawing() -> None:
     """Import what all runs draw with, and let it find its fonts."""
     import xarray
 
-    from twin.main_job import light_path_plots, motion_map, spot_plots, summary_plot
+    from twin.main_job import light_path_plots, spot_plots, summary_plot
     from twin.pictures import scene_file
     from twin.run.svg import look, new_figure, to_svg
-    from twin.uncertainty import uncertainty_plot
+    from twin.uncertainty import uncertainty_report
 
-    _ = light_path_plots, motion_map, spot_plots, summary_plot, scene_file, uncertainty_plot
+    _ = light_path_plots, spot_plots, summary_plot, scene_file, uncertainty_report
     xarray.DataArray([0.0], dims="x", name="first").to_netcdf(engine="h5netcdf")
     with look("first"):
         figure = new_figure(1.0)
         figure.subplots().set_title("0 \N{MINUS SIGN}", fontweight="bold")
         to_svg(figure)
-
-
-def _motions(run: RenderRun) -> str:
-    from twin.main_job.motion_map import motion_map_svg
-
-    return motion_map_svg(run)
-
-
-def _spots(run: RenderRun, camera: str) -> str:
-    from twin.main_job.spot_plots import spots_svg
-
-    return spots_svg(run, camera)
-
-
-def _residuals(run: RenderRun) -> str:
-    from twin.main_job.spot_plots import residuals_svg
-
-    return residuals_svg(run)
-
-
-def _side(instrument: Instrument, paths: LightPaths) -> str:
-    from twin.main_job.light_path_plots import side_view_svg
-
-    return side_view_svg(instrument, paths)
-
-
-def _footprints(instrument: Instrument, paths: LightPaths) -> str:
-    from twin.main_job.light_path_plots import footprints_svg
-
-    return footprints_svg(instrument, paths)
-
-
-def _summary(run: RenderRun) -> bytes:
-    from twin.main_job.summary_plot import summary_png
-
-    return summary_png(run)
-
-
-def _irradiance(run: RenderRun) -> bytes:
-    from twin.main_job.render_files import irradiance_file
-
-    return irradiance_file(run)
-
-
-def _scene(instrument: Instrument, state: State, paths: LightPaths) -> bytes:
-    from twin.pictures.scene_file import scene_bytes
-
-    return scene_bytes(instrument, state, paths)
-
-
-def _course(run: RenderRun) -> str:
-    from twin.main_job.series_plots import parameters_svg
-
-    assert run.series is not None
-    return parameters_svg(run.series, {name: estimator.title for name, estimator in run.estimators.items()})
-
-
-def _temperatures(run: RenderRun) -> str:
-    from twin.main_job.series_plots import temperatures_svg
-
-    assert run.series is not None
-    return temperatures_svg(run.series)
-
-
-def _smoothed(run: RenderRun) -> str:
-    from twin.main_job.series_plots import smoothed_svg
-
-    assert run.series is not None
-    return smoothed_svg(run.series)
-
-
-def _targets(run: RenderRun, camera: str) -> str:
-    from twin.main_job.target_plots import images_svg
-
-    assert run.targets is not None
-    return images_svg(camera, run.targets.cameras[camera])
-
-
-def _mtf(run: RenderRun, camera: str) -> str:
-    from twin.main_job.target_plots import curves_svg
-
-    assert run.targets is not None
-    return curves_svg(camera, run.targets.cameras[camera])
-
-
-def _pupils(run: RenderRun) -> str:
-    from twin.main_job.target_plots import pupils_svg
-
-    assert run.quality is not None
-    return pupils_svg(run.quality)

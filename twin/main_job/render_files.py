@@ -10,15 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scenes.specs.instrument import Channel
-from twin.main_job.heat_section import heat_numbers, heated_of
-from twin.main_job.job_tables import (
-    config_text,
-    deformation_numbers,
-    faces_of,
-    finish_names,
-    finish_tables,
-    table_names,
-)
+from twin.main_job import job_tables
 from twin.main_job.render_results import RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
@@ -26,7 +18,7 @@ from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_f
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import TargetRun
-from twin.uncertainty.uncertainty_numbers import limits_numbers
+from twin.uncertainty.uncertainty_numbers import LIMITS
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -57,19 +49,19 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
     channels = run.experiment.path.channels
-    folder.write_text("config.yaml", config_text(run.resolved))
-    for (path, kind), name in table_names(run.resolved.job).items():
+    folder.write_text("config.yaml", job_tables.config_text(run.resolved))
+    for (path, kind), name in job_tables.table_names(run.resolved.job).items():
         given = getattr(run.resolved.job.perturb[path], kind)
         folder.write_bytes(name, Path(given.table).read_bytes())
-    finishes = finish_tables(run.resolved.job)
-    for key, name in finish_names(run.resolved.job).items():
+    finishes = job_tables.finish_tables(run.resolved.job)
+    for key, name in job_tables.finish_names(run.resolved.job).items():
         folder.write_bytes(name, Path(finishes[key].table).read_bytes())
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
     recovered = recovered_numbers(run)
     for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
     if run.limits is not None:
-        _write_numbers(folder, "uncertainty", limits_numbers(run.limits))
+        _write_numbers(folder, "uncertainty", LIMITS(run.limits))
     for i, channel in enumerate(channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             facts = _spot_facts(run, channel, "nominal" if when == "before" else "perturbed")
@@ -83,10 +75,10 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
         _write_series(run, run.series, folder)
     if run.targets is not None:
         _write_targets(run.targets, folder)
-    if faces_of(run):
-        _write_numbers(folder, "deformation", deformation_numbers(run))
-    if heated_of(run):
-        _write_numbers(folder, "temperature", heat_numbers(run))
+    if job_tables.faces_of(run):
+        _write_numbers(folder, "deformation", job_tables.table_numbers(run, "deformation"))
+    if job_tables.heated_of(run):
+        _write_numbers(folder, "temperature", job_tables.table_numbers(run, "temperature"))
     if run.quality is not None:
         _write_numbers(folder, "quality", quality_dict(run.quality))
 

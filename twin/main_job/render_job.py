@@ -56,7 +56,7 @@ TARGETS = "render the targets"
 QUALITY = "image quality"
 """And another."""
 
-FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
+_FREE_PUPILS = "obstruction: ignore: image quality and targets are those of free pupils, whatever stands in the beams"
 """Said where the job asks for it."""
 
 MIN_LIGHT = 0.5
@@ -182,7 +182,7 @@ def render_job(
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
             *(targets.warnings if targets is not None else ()),
             *(quality.warnings if quality is not None else ()),
-            *((FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
+            *((_FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
         ),
         series=series,
         stray=stray,

@@ -11,10 +11,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
-from analysis.monitor.ground_error import AXES
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import Recovery
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
@@ -88,37 +85,19 @@ class RenderRun:
     targets: TargetRun | None = None
     quality: ImageQuality | None = None
 
-    def true_parameters(self, camera: str) -> dict[str, float]:
-        """True change of a camera in the units of the keys."""
-        change = self.truth.cameras[camera]
-        values = np.array([change.d_alpha[0], change.d_beta[0], change.d_gamma[0], change.d_f[0]]) * PER_SI
-        # adding 0.0 turns a negative zero into a plain one
-        return {key: float(value) + 0.0 for key, value in zip(PARAMETERS, values, strict=True)}
-
     def truth_dict(self) -> dict[str, Any]:
         """Contents of truth.json."""
-        out: dict[str, Any] = {
-            "cameras": {
-                name: {
-                    **self.true_parameters(name),
-                    "principal_distance_mm": 1e3 * float(self.truth.principal_distance[name]),
-                }
-                for name in self.truth.cameras
-            }
-        }
-        if len(self.truth.cameras) == 2:
-            out["intersection_angle"] = {
-                "nominal_deg": float(np.degrees(self.truth.angle)),
-                "change_arcsec": float(self.truth.angle_change[0] / ARCSEC),
-            }
-        if self.experiment.ground is not None:
-            error = self.truth.ground_error(self.experiment.ground)[0]
-            out["ground"] = {f"{axis}_m": float(value) + 0.0 for axis, value in zip(AXES, error, strict=True)}
+        out = self.reading.table.true()
+        for name, group in out["cameras"].items():
+            group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
+        if "intersection_angle" in out:
+            nominal = {"nominal_deg": float(np.degrees(self.truth.angle))}
+            out["intersection_angle"] = nominal | out["intersection_angle"]
         return out
 
     @cached_property
     def reading(self) -> MonitorReading:
-        """What the images say, without the truth."""
+        """What the images say, beside the truth."""
         experiment = self.experiment
         return MonitorReading(
             channels=tuple((channel.camera, channel.side) for channel in experiment.path.channels),
@@ -129,6 +108,7 @@ class RenderRun:
             crosstalk=self.crosstalk,
             frames=self.frames,
             centroid=self.resolved.job.analysis.centroid,
+            truth=self.truth,
         )
 
     @property

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
-from analysis.monitor.monitoring import PER_SI
-from analysis.units import ARCSEC
+from analysis.monitor.parameters import GROUND_GROUP
 from scenes.specs.course import moment
 from twin.main_job.assumptions import assumed, course_agrees
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS
 from twin.main_job.systematics import joined, systematics
-from twin.main_job.verdict import Reading, readings, state_readings
+from twin.monitor.reading_table import Reading, ReadingTable
+from twin.monitor.time_series import TimeSeries
 from twin.run.artefact import (
     FAR,
     MINUS,
@@ -33,8 +32,8 @@ from twin.run.report import Section
 
 IN_PAGE = ""
 """File of what only the page shows."""
-GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
-ANGLE_TITLE = "Angle between the cameras"
+_GROUND_TITLE = "Points on the ground, located as if the cameras had not changed: error"
+_ANGLE_TITLE = "Angle between the cameras"
 
 
 def figure(
@@ -52,37 +51,34 @@ def shown_time(run: RenderRun) -> str:
 
 def result_tables(run: RenderRun) -> tuple[Table, ...]:
     """Recovered against true; of a course first the errors over all its times, then one of these times."""
-    state = [state_readings(run, estimator) for estimator in run.estimators]
     if run.series is None:
-        return (_state_table(run, state, "results", "Recovered against true"),)
-    over = [readings(run, estimator) for estimator in run.estimators]
-    return _course_table(run, over), _state_table(run, state, "shown_time", "")
+        return (_state_table(run, "results", "Recovered against true"),)
+    return _course_table(run, run.series), _state_table(run, "shown_time", "")
 
 
 def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:
     """What a reading and those beside it are about: a camera, the angle of two (``nominal``: and what it is), or points
     on the ground.
     """
-    if reading.parameter in GROUND:
-        return GROUND_TITLE
+    if reading.group == GROUND_GROUP:
+        return _GROUND_TITLE
     if reading.camera:
         return f"Camera {reading.camera}"
-    return f"{ANGLE_TITLE}, nominally {fixed(float(np.degrees(run.truth.angle)), 4)}°" if nominal else ANGLE_TITLE
+    return f"{_ANGLE_TITLE}, nominally {fixed(float(np.degrees(run.truth.angle)), 4)}°" if nominal else _ANGLE_TITLE
 
 
 def _label(reading: Reading) -> Marked:
-    return Marked(f"{reading.parameter.symbol} [{reading.parameter.unit}]", reading.parameter.meaning, "text")
+    return Marked(reading.parameter.label, reading.parameter.meaning, "text")
 
 
-def _all_digits(run: RenderRun, name: str, found: Sequence[Sequence[Reading]], over: bool) -> Table:
+def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> Table:
     """A row for each change: truth, and of each estimator value (over times its error), sigma and that of the noise."""
     heads = ["camera", "parameter", "unit", "true rms" if over else "true"]
     heads += _value_and_sigma(run, " error rms" if over else "")
     rows: list[list[Cell]] = []
-    for same in zip(*found, strict=True):
+    for same in found.by_change():
         first = same[0]
-        where = first.camera or ("ground" if first.parameter in GROUND else "both")
-        row: list[Cell] = [where, first.parameter.symbol, first.parameter.unit, first.true]
+        row: list[Cell] = [first.where, first.parameter.symbol, first.parameter.unit, first.true]
         for one in same:
             row += [one.error if over else one.value, one.sigma, one.noise]
         rows.append(row)
@@ -95,18 +91,18 @@ def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
     return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in said]
 
 
-def _state_table(run: RenderRun, found: Sequence[Sequence[Reading]], name: str, title: str) -> Table:
+def _state_table(run: RenderRun, name: str, title: str) -> Table:
+    found = run.reading.table
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
     good = dict.fromkeys(run.estimators, 0)
     stated = run.experiment.stated is not None
-    for same in zip(*found, strict=True):
+    for same in found.by_change():
         first, p = same[0], same[0].parameter
         heading = part_title(run, first)
         if heading not in bands.values():
             bands[len(rows)] = heading
-        group = "ground." if p in GROUND else f"{first.camera}." if first.camera else ""
-        key = "intersection_angle" if p == ANGLE else f"{group}{p.key}"
+        key = first.group if first.where == "both" else f"{first.group}.{p.key}"
         finest = min((one.sigma for one in same if one.sigma > 0), default=0.0)
         row: list[Cell] = [_label(first), Marked(fixed(first.true, decimals_for(finest)), "", "truth", f"{key}.true")]
         for one in same:
@@ -138,15 +134,13 @@ def _state_table(run: RenderRun, found: Sequence[Sequence[Reading]], name: str, 
     )
 
 
-def _course_table(run: RenderRun, found: Sequence[Sequence[Reading]]) -> Table:
-    series = run.series
-    assert series is not None
-    true = [PER_SI[k] * series.truth[camera][k] for camera in series.parameters for k in range(len(PARAMETERS))]
-    true += [series.angle_change / ARCSEC] if series.recovered_angle else []
+def _course_table(run: RenderRun, series: TimeSeries) -> Table:
     rows: list[list[Cell]] = []
     bands: dict[int, str] = {}
-    for same, values in zip(zip(*found, strict=True), true, strict=True):
+    found = series.readings.rms
+    for same in found.by_change():
         first = same[0]
+        values = series.readings.row(first.group, first.parameter.key, first.estimator).true
         heading = part_title(run, first, nominal=False)
         if heading not in bands.values():
             bands[len(rows)] = heading
@@ -161,7 +155,7 @@ def _course_table(run: RenderRun, found: Sequence[Sequence[Reading]]) -> Table:
     return Table(
         "errors",
         "Errors over all times: root mean square of (recovered − true), and of σ",
-        f"● error within {FAR:g} σ, ▲ beyond: more than σ allows. {_worst(run)}",
+        f"● error within {FAR:g} σ, ▲ beyond: more than σ allows. {_worst(run, series)}",
         ["Parameter", "true, range", *(estimator.title for estimator in run.estimators.values())],
         rows,
         bands=bands,
@@ -176,22 +170,16 @@ def _range(values: np.ndarray, places: int) -> str:
     return low if low == high else f"{low} … {high}"
 
 
-def _worst(run: RenderRun) -> str:
+def _worst(run: RenderRun, series: TimeSeries) -> str:
     """The camera that the judged estimator reads worst in Δα, by how much, when, and how much truly happened."""
-    series = run.series
-    assert series is not None
-    errors = {
-        name: (estimators[run.judged].vector[:, 0] - series.truth[name][0]) * PER_SI[0]
-        for name, estimators in series.parameters.items()
-    }
-    name = max(errors, key=lambda n: float(np.max(np.abs(errors[n]))))
-    k = int(np.argmax(np.abs(errors[name])))
-    places = decimals_for(float(series.parameters[name][run.judged].sigma[k, 0]) * PER_SI[0])
+    own = [row for row in series.readings.of(run.judged) if row.parameter.key == "d_alpha_arcsec"]
+    worst = max(own, key=lambda row: float(np.max(np.abs(row.error))))
+    k = int(np.argmax(np.abs(worst.error)))
+    places = decimals_for(float(worst.sigma[k]))
+    error, true = (fixed(float(number[k]), places, sign=True) for number in (worst.error, worst.true))
     return (
-        f"The largest error of Δα by {run.estimators[run.judged].title} is "
-        f"{fixed(float(errors[name][k]), places, sign=True)} arcsec, camera {name} at "
-        f"{moment(float(series.times[k]))}, where it truly is "
-        f"{fixed(float(series.truth[name][0, k]) * PER_SI[0], places, sign=True)} arcsec."
+        f"The largest error of Δα by {run.estimators[run.judged].title} is {error} arcsec, camera {worst.camera} at "
+        f"{moment(float(series.times[k]))}, where it truly is {true} arcsec."
     )
 
 
@@ -250,15 +238,12 @@ def _every_time(run: RenderRun) -> Table:
     """Every reading of every time, with all digits."""
     assert run.series is not None
     rows: list[list[Cell]] = []
-    for camera, estimators in run.series.parameters.items():
-        for k, p in enumerate(PARAMETERS):
-            for t, time in enumerate(run.series.times):
-                row: list[Cell] = [float(time), camera, p.symbol, p.unit]
-                row.append(float(run.series.truth[camera][k, t] * PER_SI[k]))
-                for found in estimators.values():
-                    columns = (found.vector, found.sigma, found.sigma_noise)
-                    row += [float(column[t, k] * PER_SI[k]) for column in columns]
-                rows.append(row)
+    for same in run.series.readings.by_change():
+        first = same[0]
+        columns = [first.true, *(number for row in same for number in (row.value, row.sigma, row.noise))]
+        told = (first.camera, first.parameter.symbol, first.parameter.unit)
+        times = zip(run.series.times, *columns, strict=True) if first.camera else ()
+        rows += [[float(time), *told, *map(float, numbers)] for time, *numbers in times]
     heads = ["time [s]", "camera", "parameter", "unit", "true", *_value_and_sigma(run, "")]
     return Table("course", "Course", "", heads, rows)
 
@@ -322,7 +307,7 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     rows: list[list[Cell]] = []
     full: list[list[Cell]] = []
     notes = []
-    own = [r for r in state_readings(run, run.judged) if r.camera]
+    own = [r for r in run.reading.table.of(run.judged) if r.camera]
     for name in run.experiment.instrument.cameras:
         found = systematics(run, name)
         for k, r in enumerate(one for one in own if one.camera == name):
@@ -331,7 +316,7 @@ def residual_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
             texts = (error, residual_text(residual(r.error, r.sigma)), expected, left)
             cells = [Marked(text, "", "number") for text in texts]
             judged = residual_cell("", residual(r.error - bias, r.noise), "")
-            rows.append([name, f"{r.parameter.symbol} [{r.parameter.unit}]", *cells, judged])
+            rows.append([name, r.parameter.label, *cells, judged])
             row: list[Cell] = [name, r.parameter.symbol, r.parameter.unit, r.error, r.sigma, r.noise]
             full.append([*row, bias, r.error - bias])
         outside, uncovered = joined(found.outside), joined(found.uncovered)

@@ -5,35 +5,21 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from analysis.monitor.monitoring import PER_SI
+from analysis.monitor import parameters
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.units import ARCSEC
 from scenes.specs.instrument import BASE
-from twin.main_job.report_labels import PARAMETERS
 from twin.main_job.spot_plots import marks
+from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
+from twin.run import svg
 from twin.run.artefact import MINUS
-from twin.run.svg import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    LIGHT,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    gridded,
-    look,
-    new_figure,
-    shared_legend,
-    to_svg,
-)
 
-COLOURS = (BLUE, VERMILION, GREEN, ORANGE, SKY, PURPLE, INK, GREY)
+COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, svg.INK, svg.GREY)
 """Of the nodes; after the last one they begin again, with the next line style."""
 STYLES = ("-", "--", ":")
 """Of the first nodes, and of those whose colour has been used before."""
-BESIDE = 0.12
+_BESIDE = 0.12
 """Distance of the marks of two estimators at one time, part of the distance of two times."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))
 """From how many seconds on a course is drawn in a unit, the unit in seconds, and its name."""
@@ -49,7 +35,7 @@ def time_unit(times: np.ndarray) -> tuple[float, str]:
     return next((size, unit) for least, size, unit in UNITS if span >= least)
 
 
-def time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
+def _time_axis(series: TimeSeries) -> tuple[np.ndarray, str]:
     """Times of a course in a unit that suits its length, and the axis label."""
     size, unit = time_unit(series.times)
     return series.times / size, f"time [{unit}]"
@@ -59,15 +45,15 @@ def temperatures_svg(series: TimeSeries) -> str:
     """Temperatures that were given, change at the origin and gradient along each axis of every node of the course, and
     below them its motions, rotation and shift.
     """
-    with look("temperatures"):
-        time, label = time_axis(series)
+    with svg.look("temperatures"):
+        time, label = _time_axis(series)
         nodes = list(dict.fromkeys((*series.temperatures, *series.motions)))
         looks = {
             path: {"color": COLOURS[k % len(COLOURS)], "ls": STYLES[k // len(COLOURS) % len(STYLES)], "lw": 1.4}
             for k, path in enumerate(nodes)
         }
         rows = 2 * bool(series.temperatures) + bool(series.motions)
-        figure = new_figure(0.6 + 1.75 * rows + 0.2 * -(-len(nodes) // 3))
+        figure = svg.new_figure(0.6 + 1.75 * rows + 0.2 * -(-len(nodes) // 3))
         panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
         titles: list[str] = []
         if series.temperatures:
@@ -96,7 +82,7 @@ def temperatures_svg(series: TimeSeries) -> str:
             axes.set_xlabel(label)
         handles = [panels[0, 0].plot([], [], label=path.removeprefix(f"{BASE}/"), **looks[path])[0] for path in nodes]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
@@ -106,37 +92,33 @@ def parameters_svg(series: TimeSeries, names: dict[str, str]) -> str:
         series: the course.
         names: estimator -> its name for readers.
     """
-    with look("course"):
-        time, label = time_axis(series)
-        cameras = list(series.parameters)
-        rows = len(PARAMETERS) + bool(series.recovered_angle)
-        figure = new_figure(0.7 + 1.5 * rows)
+    with svg.look("course"):
+        time, label = _time_axis(series)
+        groups = _by_group(series)
+        cameras = [name for name in groups if name not in (ANGLE_GROUP, GROUND_GROUP)]
+        rows = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups)
+        figure = svg.new_figure(0.7 + 1.5 * rows)
         grid = figure.add_gridspec(rows, len(cameras))
         for column, name in enumerate(cameras):
-            for row, parameter in enumerate(PARAMETERS):
+            for row, same in enumerate(groups[name]):
                 axes = figure.add_subplot(grid[row, column])
-                size = PER_SI[row]
-                values = {
-                    e: (size * p.vector[:, row], size * p.sigma[:, row]) for e, p in series.parameters[name].items()
-                }
-                _panel(axes, series, time, size * series.truth[name][row], values, names)
+                _panel(axes, series, time, same, names)
                 if column == 0:
-                    axes.set_ylabel(f"{parameter.symbol} [{parameter.unit}]")
+                    axes.set_ylabel(same[0].parameter.label)
                 if row == 0:
                     axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
                 axes.tick_params(labelbottom=row == rows - 1)
                 if row == rows - 1:
                     axes.set_xlabel(label)
-        if series.recovered_angle:
+        for same in groups.get(ANGLE_GROUP, ()):
             axes = figure.add_subplot(grid[-1, :])
-            angles = {e: (a.change_rad / ARCSEC, a.sigma_rad / ARCSEC) for e, a in series.recovered_angle.items()}
-            _panel(axes, series, time, series.angle_change / ARCSEC, angles, names)
-            axes.set_ylabel("Δθ [arcsec]")
+            _panel(axes, series, time, same, names)
+            axes.set_ylabel(same[0].parameter.label)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(label)
-        shared_legend(figure, figure.axes[0])
+        svg.shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def smoothed_svg(series: TimeSeries) -> str:
@@ -148,87 +130,84 @@ def smoothed_svg(series: TimeSeries) -> str:
     """
     together = series.smoothed
     assert together is not None
-    with look("smoothed"):
+    with svg.look("smoothed"):
         size, unit_name = time_unit(series.times)
         label = f"time [{unit_name}]"
-        cameras, every = list(series.parameters), np.append(series.times, together.times)
+        every = np.append(series.times, together.times)
         order = np.argsort(every)
-        grounded = series.true_ground is not None
-        rows = len(PARAMETERS) + bool(series.recovered_angle)
-        figure = new_figure(0.7 + 1.3 * rows)
+        groups = _by_group(series)
+        cameras = [name for name in groups if name not in (ANGLE_GROUP, GROUND_GROUP)]
+        rows = len(parameters.CAMERA_PARAMETERS) + (ANGLE_GROUP in groups)
+        figure = svg.new_figure(0.7 + 1.3 * rows)
         grid = figure.add_gridspec(rows, 2 * len(cameras))
 
-        def panel(axes: Axes, name: str, at: np.ndarray, between: np.ndarray, error: np.ndarray, row: int) -> None:
-            sigma = np.append(at, between)[order]
+        def panel(axes: Axes, name: str, one: Reading, row: int) -> None:
+            at, between = (
+                part.row(one.group, one.parameter.key, "smoothed") for part in (together.changes, together.between)
+            )
+            sigma = np.append(at.sigma, between.sigma)[order]
             time = every[order] / size
             _frame(axes, series, series.times / size)
-            axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=SKY, alpha=0.25, lw=0, label="2σ, smoothed")
-            axes.fill_between(time, -sigma, sigma, color=SKY, alpha=0.45, lw=0, label="σ, smoothed")
-            axes.plot(series.times / size, error, "o", color=INK, ms=3.0, label="smoothed − true")
+            axes.fill_between(time, -2.0 * sigma, 2.0 * sigma, color=svg.SKY, alpha=0.25, lw=0, label="2σ, smoothed")
+            axes.fill_between(time, -sigma, sigma, color=svg.SKY, alpha=0.45, lw=0, label="σ, smoothed")
+            axes.plot(series.times / size, at.value - one.true, "o", color=svg.INK, ms=3.0, label="smoothed − true")
             axes.set_ylabel(name)
             axes.tick_params(labelbottom=row == rows - 1)
             if row == rows - 1:
                 axes.set_xlabel(label)
 
         for column, name in enumerate(cameras):
-            at, between = (one.parameters[name]["smoothed"] for one in (together.changes, together.between))
-            for row, parameter in enumerate(PARAMETERS):
+            for row, same in enumerate(groups[name]):
                 axes = figure.add_subplot(grid[row, 2 * column : 2 * column + 2])
-                unit = PER_SI[row]
-                error = unit * (at.vector[:, row] - series.truth[name][row])
-                text = f"{parameter.symbol} [{parameter.unit}]" if column == 0 else ""
-                panel(axes, text, unit * at.sigma[:, row], unit * between.sigma[:, row], error, row)
+                panel(axes, same[0].parameter.label if column == 0 else "", same[0], row)
                 if row == 0:
                     axes.set_title(f"Camera {name}", loc="left", fontweight="bold")
-        if series.recovered_angle:
-            at_angle, between_angle = (one.angle["smoothed"] for one in (together.changes, together.between))
-            half = len(cameras) if grounded else 2 * len(cameras)
+        half = len(cameras) if GROUND_GROUP in groups else 2 * len(cameras)
+        for same in groups.get(ANGLE_GROUP, ()):
             axes = figure.add_subplot(grid[-1, :half])
-            error = (at_angle.change_rad - series.angle_change) / ARCSEC
-            panel(axes, "Δθ [arcsec]", at_angle.sigma_rad / ARCSEC, between_angle.sigma_rad / ARCSEC, error, rows - 1)
+            panel(axes, same[0].parameter.label, same[0], rows - 1)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
-        if series.true_ground is not None:
-            at_ground, between_ground = (one.ground["smoothed"] for one in (together.changes, together.between))
+        for same in groups.get(GROUND_GROUP, ())[-1:]:
             axes = figure.add_subplot(grid[-1, len(cameras) :])
-            error = at_ground.error_m[:, 2] - series.true_ground[:, 2]
-            panel(axes, "[m]", at_ground.sigma_m[:, 2], between_ground.sigma_m[:, 2], error, rows - 1)
+            panel(axes, f"[{same[0].parameter.unit}]", same[0], rows - 1)
             axes.set_title("Height on the ground", loc="left", fontweight="bold")
-        shared_legend(figure, figure.axes[0])
+        svg.shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
-def _panel(
-    axes: Axes,
-    series: TimeSeries,
-    time: np.ndarray,
-    true: np.ndarray,
-    values: dict[str, tuple[np.ndarray, np.ndarray]],
-    names: dict[str, str],
-) -> None:
+def _by_group(series: TimeSeries) -> dict[str, list[list[Reading]]]:
+    """Group -> its changes, each with the rows of all estimators."""
+    out: dict[str, list[list[Reading]]] = {}
+    for same in series.readings.by_change():
+        out.setdefault(same[0].group, []).append(same)
+    return out
+
+
+def _panel(axes: Axes, series: TimeSeries, time: np.ndarray, same: list[Reading], names: dict[str, str]) -> None:
     _frame(axes, series, time)
     # side by side, or the bars hide each other
-    step = BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
+    step = _BESIDE * float(np.min(np.diff(time), initial=np.inf)) if len(time) > 1 else 0.0
     for j, (estimator, (marker, colour)) in enumerate(marks(names).items()):
-        value, sigma = values[estimator]
+        one = next(row for row in same if row.estimator == estimator)
         place = time + (j - 0.5 * (len(names) - 1)) * step
         axes.errorbar(
-            place, value, sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
+            place, one.value, one.sigma, fmt=marker, color=colour, ms=4.0, mec="white", mew=0.4, elinewidth=0.8,
             label=names[estimator],
         )  # fmt: skip
-    axes.plot(time, true, color=INK, lw=1.5, label="true", zorder=1.5)
+    axes.plot(time, same[0].true, color=svg.INK, lw=1.5, label="true", zorder=1.5)
     low, high = axes.get_ylim()
     # noise alone must not fill a panel
-    least = 6.0 * max(float(np.max(sigma)) for _, sigma in values.values())
+    least = 6.0 * max(float(np.max(one.sigma)) for one in same)
     if high - low < least:
         middle = 0.5 * (low + high)
         axes.set_ylim(middle - 0.5 * least, middle + 0.5 * least)
 
 
 def _frame(axes: Axes, series: TimeSeries, time: np.ndarray) -> None:
-    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
-    axes.axvline(time[series.shown], color=GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
-    gridded(axes, "y")
+    axes.axhline(0.0, color=svg.LIGHT, lw=0.8, zorder=0)
+    axes.axvline(time[series.shown], color=svg.GREY, lw=0.9, ls=(0, (1, 2)), zorder=0)
+    svg.gridded(axes, "y")
     axes.yaxis.set_major_formatter(_number_text)
 
 

@@ -8,12 +8,13 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
+from twin.main_job.monitor_reading import CENTROID_NOTES
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import CENTROID_NOTES, PAPER
 from twin.main_job.result_sections import IN_PAGE
 from twin.run.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
 from twin.run.report import Section
 
+_PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
 ZERO_CELSIUS = 273.15
 
 
@@ -36,7 +37,7 @@ def facts(run: RenderRun) -> tuple[tuple[str, str], ...]:
     return (
         ("Assumptions", about),
         *((estimator.title, estimator.note) for estimator in run.estimators.values()),
-        ("Paper", PAPER),
+        ("Paper", _PAPER),
         ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name),
         (
             "Monitor",

@@ -2,47 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import cycle
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import AsinhNorm, Normalize
+from matplotlib.colors import AsinhNorm, Normalize, SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from analysis.monitor.estimators import ESTIMATORS
 from twin.main_job.render_results import RenderRun
 from twin.main_job.result_sections import part_title
-from twin.main_job.verdict import state_readings
-from twin.run.artefact import FAR, residual, tick_text
-from twin.run.svg import (
-    AFTER,
-    BEFORE,
-    BLUE,
-    GRAY,
-    GREEN,
-    GREY,
-    INK,
-    LIGHT,
-    ORANGE,
-    PURPLE,
-    SHADE,
-    SKY,
-    VERMILION,
-    look,
-    new_figure,
-    plain_axes,
-    shared_legend,
-    signed_map,
-    to_svg,
-)
+from twin.monitor.crosstalk import CameraCrosstalk
+from twin.run import svg
+from twin.run.artefact import FAR, SAME, residual, shown_unit, significant, tick_text
 
 STRETCH = 150.0
 """The asinh stretch is linear up to this fraction (1/STRETCH) of the peak."""
-LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
-LEAST_CORE = 7.0
+_LEGEND: dict[str, Any] = {"frameon": True, "facecolor": "black", "edgecolor": "none", "framealpha": 0.7}
+_LEAST_CORE = 7.0
 """Half-width of the core's window, pixels, when the spot moves less."""
 
 
@@ -71,7 +51,7 @@ def cross(axes: Axes, at: np.ndarray, colour: str, size: float, label: str | Non
 def core_window(before: np.ndarray, after: np.ndarray, radius: float) -> tuple[float, float, float]:
     """Centre (row, column) and half-width of a square that holds both centres, pixels."""
     centre = 0.5 * (before + after)
-    half = max(LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
+    half = max(_LEAST_CORE, 0.5 * float(np.max(np.abs(after - before))) + 0.75 * radius)
     return float(centre[0]), float(centre[1]), half
 
 
@@ -85,8 +65,8 @@ def airy_radius(run: RenderRun) -> float:
 
 def spots_svg(run: RenderRun, camera: str) -> str:
     """One camera's spots, a row per channel."""
-    with look(f"spots-{camera}"):
-        return to_svg(_draw(run, camera))
+    with svg.look(f"spots-{camera}"):
+        return svg.to_svg(_draw(run, camera))
 
 
 def _draw(run: RenderRun, camera: str) -> Figure:
@@ -95,7 +75,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
     norm = stretch(np.stack([before[channels], after[channels]]))
     difference = after - before
     largest = max(float(np.abs(difference[channels]).max()), 1.0)
-    figure = new_figure(0.5 + 2.62 * len(channels), {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01, "hspace": 0.02})
+    figure = svg.new_figure(0.5 + 2.62 * len(channels), {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01, "hspace": 0.02})
     grid = figure.subplots(len(channels), 4, squeeze=False)
     positions = run.recovery.before[0], run.recovery.after[0]
     radius = airy_radius(run)
@@ -105,18 +85,18 @@ def _draw(run: RenderRun, camera: str) -> Figure:
         moved = end - start
         row = grid[line]
         for axes, image in ((row[0], before[i]), (row[1], after[i])):
-            shown = axes.imshow(image, cmap=GRAY, norm=norm, interpolation="none")
+            shown = axes.imshow(image, cmap=svg.GRAY, norm=norm, interpolation="none")
         size = 0.11 * before.shape[-1]
-        cross(row[0], start, BEFORE, size)
-        cross(row[1], end, AFTER, size)
-        row[2].imshow(after[i], cmap=GRAY, norm=norm, interpolation="none")
+        cross(row[0], start, svg.BEFORE, size)
+        cross(row[1], end, svg.AFTER, size)
+        row[2].imshow(after[i], cmap=svg.GRAY, norm=norm, interpolation="none")
         y, x, half = core_window(start, end, radius)
-        cross(row[2], start, BEFORE, 0.3 * half, "before")
-        cross(row[2], end, AFTER, 0.3 * half, "after")
+        cross(row[2], start, svg.BEFORE, 0.3 * half, "before")
+        cross(row[2], end, svg.AFTER, 0.3 * half, "after")
         row[2].xaxis.set_major_locator(MaxNLocator(5, integer=True))
         row[2].yaxis.set_major_locator(MaxNLocator(5, integer=True))
         row[2].set(xlim=(x - half, x + half), ylim=(y + half, y - half))
-        map_of = signed_map(row[3], difference[i], largest, interpolation="none")
+        map_of = svg.signed_map(row[3], difference[i], largest, interpolation="none")
         side = run.experiment.path.channels[i].side
         row[0].set_ylabel(f"{side} channel\nrow [px]")
         title = f"moved {moved[0]:+.3f} px in row, {moved[1]:+.3f} px in column".replace("-", "\N{MINUS SIGN}")
@@ -125,7 +105,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
             row[0].set_title("before")
             row[1].set_title("after")
             row[3].set_title("after \N{MINUS SIGN} before")
-            row[2].legend(loc="upper left", labelcolor="white", handlelength=1.2, borderaxespad=0.3, **LEGEND)
+            row[2].legend(loc="upper left", labelcolor="white", handlelength=1.2, borderaxespad=0.3, **_LEGEND)
         for axes in row[[1, 3]]:
             axes.tick_params(labelleft=False)
         for axes in row:
@@ -144,7 +124,7 @@ def _draw(run: RenderRun, camera: str) -> Figure:
     bar.minorticks_off()
     figure.colorbar(map_of, ax=list(grid[:, 3]), label="difference [DN]", aspect=13, ticks=MaxNLocator(4), **bars)
     for axes in grid.ravel():
-        axes.tick_params(length=2.5, color=INK)
+        axes.tick_params(length=2.5, color=svg.INK)
     return figure
 
 
@@ -158,8 +138,8 @@ def _dn_ticks(norm: Normalize) -> list[float]:
 
 
 _MARKS = (
-    *(("s", ORANGE), ("^", VERMILION), ("D", GREEN), ("o", BLUE)),
-    *(("v", PURPLE), ("P", SKY), ("X", GREY), ("*", INK)),
+    *(("s", svg.ORANGE), ("^", svg.VERMILION), ("D", svg.GREEN), ("o", svg.BLUE)),
+    *(("v", svg.PURPLE), ("P", svg.SKY), ("X", svg.GREY), ("*", svg.INK)),
 )
 
 
@@ -177,12 +157,12 @@ def residuals_svg(run: RenderRun) -> str:
     """Residuals of all estimators in sigma, a panel for each camera, the angle and the ground."""
     names = {name: estimator.title for name, estimator in run.estimators.items()}
     panels: dict[str, dict[str, dict[str, float | None]]] = {}
-    for same in zip(*(state_readings(run, name) for name in names), strict=True):
+    for same in run.reading.table.by_change():
         panel = panels.setdefault(part_title(run, same[0]), {})
         panel[same[0].parameter.symbol] = {one.estimator: residual(one.error, one.sigma) for one in same}
-    with look("residuals"):
+    with svg.look("residuals"):
         rows = [len(panel) for panel in panels.values()]
-        figure = new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))
+        figure = svg.new_figure(1.0 + 0.36 * sum(rows) + 0.32 * len(rows))
         heights = [n + 0.4 for n in rows]
         all_axes = figure.subplots(len(rows), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
         largest = max(
@@ -197,17 +177,17 @@ def residuals_svg(run: RenderRun) -> str:
             decades = [10.0**k for k in range(1, int(np.ceil(np.log10(max(largest, 10.0)))) + 1)]
             axes.set_xticks([*(-d for d in decades[::-1]), -FAR, 0.0, FAR, *decades], minor=False)
             axes.minorticks_off()
-            axes.grid(axis="x", color=LIGHT, lw=0.6)
+            axes.grid(axis="x", color=svg.LIGHT, lw=0.6)
             axes.set_axisbelow(True)
         label = "(recovered \N{MINUS SIGN} true) / sigma        linear inside the band, logarithmic outside"
         all_axes[-1].set_xlabel(label)
-        shared_legend(figure, all_axes[0])
-        return to_svg(figure)
+        svg.shared_legend(figure, all_axes[0])
+        return svg.to_svg(figure)
 
 
 def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], names: dict[str, str]) -> None:
-    axes.axvspan(-FAR, FAR, color=SHADE, lw=0)
-    axes.axvline(0.0, color=GREY, lw=0.8)
+    axes.axvspan(-FAR, FAR, color=svg.SHADE, lw=0)
+    axes.axvline(0.0, color=svg.GREY, lw=0.8)
     place = {label: k for k, label in enumerate(panel)}
     found = marks(names)
     for j, (estimator, (marker, colour)) in enumerate(found.items()):
@@ -219,6 +199,55 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
     axes.set_ylim(len(place) - 0.5, -0.5)
     axes.set_title(title, loc="left", fontweight="bold")
     for k in range(1, len(place)):
-        axes.axhline(k - 0.5, color=LIGHT, lw=0.6)
+        axes.axhline(k - 0.5, color=svg.LIGHT, lw=0.6)
     axes.tick_params(axis="y", length=0)
-    plain_axes(axes)
+    svg.plain_axes(axes)
+
+
+ROW = 0.168
+"""Height of a row, inches."""
+_DECADES = 3
+"""Of the colours' logarithmic part, below the largest number."""
+_MOST_LEVEL = 4
+"""Names of columns that have room beside one another."""
+_STRONG = 0.55
+"""Depth of a colour from which the number in it is white."""
+
+
+def motion_map_svg(run: RenderRun) -> str:
+    """Micrometres on the area CCD per unit of motion: a row for each motion, a panel for each camera."""
+    pitch = 1e6 * run.experiment.path.pitch
+    tables = list(run.crosstalk.items())
+    largest = max(float(np.abs(table.spot_shift).max()) for _, table in tables) * pitch
+    norm = SymLogNorm(largest * 10.0**-_DECADES, linscale=0.4, vmin=-largest, vmax=largest)
+    rows = max(len(table.motions) for _, table in tables)
+    labels = [_labels(table) for _, table in tables]
+    with svg.look("motions"):
+        figure = svg.new_figure(1.1 + ROW * rows, {"w_pad": 0.03, "h_pad": 0.03, "wspace": 0.01})
+        panels = figure.subplots(1, len(tables), squeeze=False)[0]
+        for k, (axes, (name, table)) in enumerate(zip(panels, tables, strict=True)):
+            _motion_panel(axes, pitch * table.spot_shift.T, table.coordinates, norm)
+            axes.set_yticks(range(len(table.motions)), labels[k])
+            # told once where all cameras have the same motions
+            axes.tick_params(labelleft=k == 0 or labels[k] != labels[0])
+            axes.set_title(f"Camera {name}", fontweight="bold", pad=4)
+        return svg.to_svg(figure)
+
+
+def _labels(table: CameraCrosstalk) -> list[str]:
+    return [f"{motion.label}, 1 {shown_unit(motion.unit)}" for motion in table.motions]
+
+
+def _motion_panel(axes: Axes, values: np.ndarray, names: Sequence[str], norm: SymLogNorm) -> None:
+    axes.imshow(values, cmap=svg.DIVERGING, norm=norm, aspect="auto", interpolation="nearest")
+    axes.xaxis.set_ticks_position("top")
+    # many are told below one another
+    turn = 90.0 if len(names) > _MOST_LEVEL else 0.0
+    axes.set_xticks(range(values.shape[1]), [f"{name} [µm]" for name in names], rotation=turn)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    for (row, column), value in np.ndenumerate(values):
+        deep = abs(float(norm(value)) - 0.5) * 2.0
+        colour = "white" if deep > _STRONG else svg.INK
+        text = significant(float(value), 2, floor=SAME)
+        axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)

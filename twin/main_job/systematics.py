@@ -7,15 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitor.monitoring import PER_SI
+from analysis.chi_square import limit_of
+from analysis.monitor.disturbances import FALSE_ALARM, Disturbances
+from analysis.monitor.limits import quantities, split
+from analysis.monitor.parameters import rows_of
 from optics.geometry.tree import Motion
+from scenes.models.job_state import motions_of
 from scenes.specs.instrument import BASE, CENTRAL_PRISM
 from twin.main_job.render_results import RenderRun
 from twin.monitor.crosstalk import CameraCrosstalk
+from twin.monitor.line_curvature import LOST, traced_states
 from twin.monitor.motions import ElementaryMotion
-from twin.run.artefact import plain, shown_unit
+from twin.run.artefact import plain, shown_unit, significant
+from twin.uncertainty.monitor_limits import short_text, unit_text
 
-FAMILY = 4
+_FAMILY = 4
 """The first motions of a crosstalk table are the family that the estimators of paper 001 assume."""
 SHOWN = 1e-3
 """Least amount of a motion, in its table unit, that is spoken of."""
@@ -30,9 +36,9 @@ class Systematics:
     """What the crosstalk tables make of a run's motions, for one camera.
 
     Attributes:
-        bias: estimator -> (4,) reading minus truth, to first order, in the units of the results.
+        bias: estimator -> (P,) reading minus truth, to first order, of every reading of the camera, in its unit.
         outside: motions of this camera outside the family, as text with amounts.
-        parts: motion, as text with its amount -> its share of the judged estimator's bias, (4,); also motions of other
+        parts: motion, as text with its amount -> its share of the judged estimator's bias, (P,); also motions of other
             cameras where that estimator takes all spots together.
         uncovered: what was moved but is in no row of the table.
     """
@@ -53,8 +59,9 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
     moved = np.concatenate([table.spot_shift @ amounts[name] for name, table in run.crosstalk.items()])
     table = run.crosstalk[camera]
     true = table.true @ amounts[camera]
-    bias = {e: PER_SI * (gain[rows] @ moved) - true for e, gain in run.gains.items()}
-    others = [i for i in range(FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
+    unit = rows_of(run.reading.cameras[camera])
+    bias = {e: unit @ (gain[rows] @ moved) - true for e, gain in run.gains.items()}
+    others = [i for i in range(_FAMILY, len(table.motions)) if abs(amounts[camera][i]) > SHOWN]
     outside = tuple(_told(table.motions[i], amounts[camera][i]) for i in others)
     return Systematics(bias, outside, _parts(run, camera, amounts), _uncovered(run, camera, table))
 
@@ -62,9 +69,10 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Of each motion that the judged estimator does not read as it is."""
     names = list(run.crosstalk)
-    gain = PER_SI[:, None] * run.gains[run.judged][4 * names.index(camera) : 4 * names.index(camera) + 4]
+    k = names.index(camera)
+    gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]
     # what weighs all motions by what is stated takes none of them as it is
-    known = 0 if run.estimators[run.judged].stated else FAMILY
+    known = 0 if run.estimators[run.judged].stated else _FAMILY
     out: dict[tuple[str, str, int], tuple[str, np.ndarray]] = {}
     own = {name: run.experiment.instrument.coordinates_of(name) for name in names}
     for name, table in run.crosstalk.items():
@@ -137,3 +145,61 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
 def joined(names: Sequence[str]) -> str:
     """``a; b; c`` without repetitions."""
     return "; ".join(dict.fromkeys(names))
+
+
+BLIND = 4.0
+"""Sigmas by which a reading is wrong from which on it is told that no spot says so. Of what is drawn from the statement
+itself a motion does as much in one of 20 000 runs."""
+
+
+def perturbed_unseen(run: RenderRun) -> tuple[str, ...]:
+    """A warning for each perturbed body by which readings are wrong while the spots do not show it: what the
+    perturbation of that body alone does to spots and cameras, traced, against what would be read of it.
+
+    Args:
+        run: of a state, or of the time of a course that is shown.
+    """
+    job, noise = run.resolved.job, run.recovery.shift_covariance[0]
+    shown = None if run.series is None else run.series.shown
+    if not np.any(noise):
+        return ()
+    moved = {path: motion for path, motion in motions_of(job, shown).items() if motion != Motion(pivot=motion.pivot)}
+    if not moved:
+        return ()
+    try:
+        found = traced_states(run.experiment.path, run.experiment.sight, [{path: m} for path, m in moved.items()])
+    except LOST:
+        # together with others the body may keep its light; alone there is nothing to be said
+        return ()
+    reading, stated = run.reading, run.reading.disturbances
+    gain = run.gains[run.judged]
+    every = quantities(reading.cameras, reading.ground)
+    rows = np.stack([quantity.row for quantity in every])
+    sigma = _sigmas(rows, stated, noise, gain)
+    spread = noise if stated is None else stated.spot_covariance + noise
+    limit = float(limit_of(FALSE_ALARM, len(noise))) - len(noise)
+    out = []
+    for path, shift, true in zip(moved, found.spots, found.parameters, strict=True):
+        wrong = rows @ (gain @ shift - true)
+        far = np.abs(wrong) / np.where(sigma > 0.0, sigma, np.inf)
+        worst = int(np.argmax(far))
+        still = float(np.max(np.abs(shift) / np.sqrt(np.diag(noise))))
+        told = float(shift @ np.linalg.solve(spread, shift))
+        if far[worst] < BLIND or (still > BLIND if stated is None else told > limit):
+            continue
+        how = "moves no spot beyond its noise" if still < 1.0 else "moves the spots as likelier motions do"
+        unit = unit_text(every[worst])
+        is_, read = (significant(float(rows[worst] @ value), 3) for value in (true, gain @ shift))
+        out.append(
+            f"{path}: what is perturbed of it {how}; {short_text(every[worst])} changes by {is_} {unit} and {read} "
+            f"{unit} are read, wrong by {far[worst]:.1f} σ; neither σ nor a test of the shifts can show it: of this "
+            "body σ holds as far as its statement does"
+        )
+    return tuple(out)
+
+
+def _sigmas(rows: np.ndarray, stated: Disturbances | None, noise: np.ndarray, gain: np.ndarray) -> np.ndarray:
+    """(Q,) of the readings by an estimator."""
+    if stated is not None:
+        return split(rows, stated, noise, gain).sigma
+    return np.sqrt(np.einsum("qd,de,qe->q", rows @ gain, noise, rows @ gain))

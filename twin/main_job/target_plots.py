@@ -17,11 +17,11 @@ COLOURS = {"before": BLUE, "after": VERMILION}
 MARKS = {"before": "o", "after": "D"}
 BAND = 2.0
 """Half width of the band about zero, sigma."""
-LEAST_SPAN = 4.0
+_LEAST_SPAN = 4.0
 """Half height of the panels of differences at least, thousandths."""
 EVERY = 2
 """Every how many-th frequency gets a dot."""
-IMAGE_NAMES = {
+_IMAGE_NAMES = {
     "knife_edge_along": "knife edge, along line,\nmiddle 40 px",
     "knife_edge_track": "knife edge, along track,\nmiddle 40 px",
     "bars_along": "bars, along line",
@@ -32,7 +32,7 @@ IMAGE_NAMES = {
 """Of the images that are shown, with the direction of their MTF; other targets are shown by their names, even fields
 are not.
 """
-CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
+_CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Side of what is shown, pixels; the others are shown whole."""
 STRETCH = 100.0
 """The pinhole's stretch is linear up to this fraction (1/STRETCH) of the peak."""
@@ -70,7 +70,7 @@ def curves_svg(name: str, camera: CameraTargets) -> str:
                     below.set_xlabel("frequency [cycles/mm]")
         for below in panels[1::2, 0]:
             # about zero, and noise alone does not fill a panel
-            span = max(LEAST_SPAN, *(abs(limit) for limit in below.get_ylim()))
+            span = max(_LEAST_SPAN, *(abs(limit) for limit in below.get_ylim()))
             below.set_ylim(-span, span)
         handles, labels = panels[0, 0].get_legend_handles_labels()
         figure.align_ylabels()
@@ -120,7 +120,7 @@ def _norm(target: str, image: np.ndarray) -> Normalize:
 def images_svg(name: str, camera: CameraTargets) -> str:
     """Mean images, a row for each target, and before and after side by side for each place."""
     columns = [(place, when) for place in camera.places for when in COLOURS]
-    names = [name for name in next(iter(camera.places.values())).before.frames if name in {*IMAGE_NAMES, *TARGETS}]
+    names = [name for name in next(iter(camera.places.values())).before.frames if name in {*_IMAGE_NAMES, *TARGETS}]
     with look(f"targets-{name}"):
         figure = new_figure(0.45 + 1.68 * len(names), {"w_pad": 0.02, "h_pad": 0.02, "wspace": 0.01, "hspace": 0.01})
         grid = figure.subplots(len(names), len(columns), squeeze=False)
@@ -129,7 +129,7 @@ def images_svg(name: str, camera: CameraTargets) -> str:
             for row, target in enumerate(names):
                 axes = grid[row, column]
                 mean = np.asarray(shots.frames[target].mean(axis=0))
-                skip = (len(mean) - CROPS.get(target, len(mean))) // 2
+                skip = (len(mean) - _CROPS.get(target, len(mean))) // 2
                 shown = mean[skip : len(mean) - skip, skip : len(mean) - skip]
                 axes.imshow(shown, cmap="gray", interpolation="none", norm=_norm(target, shown))
                 axes.set_xticks([])
@@ -137,7 +137,7 @@ def images_svg(name: str, camera: CameraTargets) -> str:
                 if row == 0:
                     axes.set_title(f"{place}, {when}")
                 if column == 0:
-                    axes.set_ylabel(IMAGE_NAMES.get(target, target.replace("_", " ")))
+                    axes.set_ylabel(_IMAGE_NAMES.get(target, target.replace("_", " ")))
         return to_svg(figure)
 
 

@@ -3,103 +3,49 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from analysis.monitor import parameters
 from analysis.monitor.monitoring import PER_SI
-from analysis.units import ARCSEC
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.geometry.tree import Motion
 from scenes.models.job_state import beyond_statement
 from scenes.specs.course import moment
 from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_results import RenderRun
-from twin.main_job.report_labels import ANGLE, GROUND, PARAMETERS, Parameter
-from twin.main_job.systematics import joined, systematics
-from twin.main_job.unseen_motions import perturbed_unseen
+from twin.main_job.systematics import joined, perturbed_unseen, systematics
 from twin.monitor.image_quality import ImageQuality
+from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
-from twin.run.artefact import FAR, SAME, decimals_for, fixed, plain, residual_text, significant
+from twin.run.artefact import FAR, SAME, plain, residual_text, significant
 
 __all__ = [
     "FALSE_ALARM",
     "Judgement",
-    "Reading",
     "alarm_limit",
     "judge",
     "limited",
     "readings",
     "recovered_numbers",
     "sharpness_lost",
-    "state_readings",
 ]
 
 FALSE_ALARM = 1e-3
 """Chance that noise and disturbances as stated make any warning of a misreading in a run."""
-EXPLAINED = 0.2
+_EXPLAINED = 0.2
 """Share of an error that may be left over where it is called explained to first order."""
-SOFTER = 0.05
+_SOFTER = 0.05
 """Relative loss of MTF at Nyquist from which it is spoken of."""
 MOST_FRAMES = 10_000
 """More frames than that are no advice."""
-DIMMED = 0.5
+_DIMMED = 0.5
 """Share of its nominal light below which a spot counts as dimmed, as for the warning about it."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """What an estimator reads of one change beside what truly happened, in the parameter's unit.
-
-    Over a course, true, value and error are root mean squares over its times.
-
-    Attributes:
-        camera: whose; empty for the angle between the cameras and for errors on the ground.
-        parameter: which of its changes.
-        estimator: who reads it.
-        true, value, sigma, error: error is value minus true; sigma is the total one.
-        noise: of sigma what the noise of the images does.
-    """
-
-    camera: str
-    parameter: Parameter
-    estimator: str
-    true: float
-    value: float
-    sigma: float
-    error: float
-    noise: float
-
-    @property
-    def ratio(self) -> float:
-        """Error in sigmas; without noise it is infinite unless it is rounding."""
-        if self.sigma > 0.0:
-            return self.error / self.sigma
-        return 0.0 if abs(self.error) < SAME else math.copysign(math.inf, self.error)
-
-    @property
-    def far(self) -> bool:
-        """Whether reports mark it."""
-        return abs(self.ratio) > FAR
-
-    @property
-    def name(self) -> str:
-        """``Δα of forward``."""
-        if self.parameter in GROUND:
-            return f"{self.parameter.symbol} on the ground"
-        return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
-
-    def shown(self, value: float, sign: bool = False) -> str:
-        """A number of this reading with the digits that its sigma deserves."""
-        return fixed(value, decimals_for(self.sigma), sign)
-
-    @property
-    def read(self) -> str:
-        """Value, sigma and unit."""
-        return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
 
 @dataclass(frozen=True)
@@ -111,58 +57,10 @@ class Judgement:
 
 
 def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """All readings of an estimator: four of each camera, then the angle and the errors on the ground; over a course
+    """All readings of an estimator: those of each camera, then the angle and the errors on the ground; over a course
     root mean squares.
     """
-    return tuple(_series_readings(run.series, estimator)) if run.series else state_readings(run, estimator)
-
-
-def state_readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
-    """All readings of an estimator of the one state that a run shows in full."""
-    return tuple(_state_readings(run, estimator))
-
-
-def _state_readings(run: RenderRun, estimator: str) -> Iterator[Reading]:
-    recovered, truth = run.recovered_dict(), run.truth_dict()
-    for camera, estimators in recovered["cameras"].items():
-        for p in PARAMETERS:
-            yield _reading(camera, p, estimator, truth["cameras"][camera], estimators[estimator])
-    if "intersection_angle" in truth:
-        yield _reading("", ANGLE, estimator, truth["intersection_angle"], recovered["intersection_angle"][estimator])
-    if "ground" in truth:
-        for p in GROUND:
-            yield _reading("", p, estimator, truth["ground"], recovered["ground"][estimator])
-
-
-def _reading(
-    camera: str, p: Parameter, estimator: str, truth: Mapping[str, float], found: Mapping[str, float]
-) -> Reading:
-    true, value = truth[p.key], found[p.key]
-    sigma, noise = found[f"{p.key}_sigma"], found[f"{p.key}_sigma_noise"]
-    return Reading(camera, p, estimator, true, value, sigma, value - true, noise)
-
-
-def _series_readings(series: TimeSeries, estimator: str) -> Iterator[Reading]:
-    for camera, estimators in series.parameters.items():
-        found = estimators[estimator]
-        for k, p in enumerate(PARAMETERS):
-            both = found.sigma[:, k], found.sigma_noise[:, k]
-            columns = (PER_SI[k] * v for v in (series.truth[camera][k], found.vector[:, k], *both))
-            yield _rms_reading(camera, p, estimator, *columns)
-    if series.recovered_angle:
-        angle = series.recovered_angle[estimator]
-        columns = (v / ARCSEC for v in (series.angle_change, angle.change_rad, angle.sigma_rad, angle.noise_rad))
-        yield _rms_reading("", ANGLE, estimator, *columns)
-
-
-def _rms_reading(camera: str, p: Parameter, estimator: str, *columns: np.ndarray) -> Reading:
-    """Of true values, readings, their sigmas and those of the noise over the times."""
-    true, value, sigma, noise = columns
-    return Reading(camera, p, estimator, *map(_rms, (true, value, sigma, value - true, noise)))
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
 def judge(run: RenderRun) -> Judgement:
@@ -204,7 +102,7 @@ def _moves(motion: Motion) -> bool:
 def _hidden(run: RenderRun, found: tuple[Reading, ...]) -> str:
     """The least changes that can be told from none, of the parameters of the cameras."""
     parts = []
-    for p in PARAMETERS:
+    for p in parameters.CAMERA_PARAMETERS:
         worst = max((r for r in found if r.parameter == p), key=lambda r: r.sigma)
         parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
     who = (
@@ -252,7 +150,7 @@ def _are(what: list[Reading]) -> str:
 
 def _changes(found: tuple[Reading, ...]) -> list[Reading]:
     """Without the errors on the ground, which follow from them."""
-    return [r for r in found if r.parameter not in GROUND]
+    return [r for r in found if r.group != GROUND_GROUP]
 
 
 def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> str:
@@ -301,8 +199,8 @@ def limited(run: RenderRun) -> str:
     if _noise_only(run):
         return ""
     found = readings(run, run.judged)
-    about = next((r for r in found if r.parameter == ANGLE), max(found, key=lambda r: abs(r.ratio)))
-    body, share = limits(run.reading, about.camera, about.parameter)
+    about = next((r for r in found if r.group == ANGLE_GROUP), max(found, key=lambda r: abs(r.ratio)))
+    body, share = limits(run.reading, about)
     what = body if body == NOISE else f"motions of {body}"
     return (
         f"σ of {about.name}, {significant(about.sigma, 2)} {about.parameter.unit}, is limited by {what} "
@@ -345,9 +243,9 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     cameras = list(run.crosstalk)
     found = {name: systematics(run, name) for name in cameras}
     # a change of one camera, or what the angle and the ground are made of, per unit of the results
-    weights = combination(run.reading, worst.camera, worst.parameter).reshape(-1, 4) / PER_SI
+    weights = combination(run.reading, worst.group, worst.parameter.key).reshape(-1, 4) / PER_SI
     used = [name for name, weight in zip(cameras, weights, strict=True) if np.any(weight)]
-    bias = sum(float(w @ found[name].bias[run.judged]) for name, w in zip(cameras, weights, strict=True))
+    bias = sum(float(w @ found[name].bias[run.judged][:4]) for name, w in zip(cameras, weights, strict=True))
     chance = _chance(worst.ratio, count)
     if chance > FALSE_ALARM and abs(bias) < 0.5 * abs(worst.error):
         advice = "look at more frames" if _noise_only(run) else "look at more measurements"
@@ -355,13 +253,13 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
     parts: dict[str, float] = {}
     for name in used:
         for text, vector in found[name].parts.items():
-            parts[text] = parts.get(text, 0.0) + float(weights[cameras.index(name)] @ vector)
-    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, EXPLAINED * abs(worst.error))
+            parts[text] = parts.get(text, 0.0) + float(weights[cameras.index(name)] @ vector[:4])
+    explained = worst.camera and abs(worst.error - bias) <= max(FAR * worst.noise, _EXPLAINED * abs(worst.error))
     if parts and explained:
         text, part = max(parts.items(), key=lambda pair: pair[1] / worst.error)
         share = part / worst.error
         if share > 0.5:
-            most = "the cause is" if share > 1.0 - EXPLAINED else "most of it is"
+            most = "the cause is" if share > 1.0 - _EXPLAINED else "most of it is"
             return (
                 f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
                 f"{worst.shown(part, sign=True)} {worst.parameter.unit}, which more frames do not cure: see Crosstalk"
@@ -414,7 +312,7 @@ def _series_verdict(run: RenderRun, series: TimeSeries, found: tuple[Reading, ..
 def _dimmed(run: RenderRun) -> str:
     """Spots that lost more than half of their light, of the state that is shown."""
     share = run.photons_after.sum(axis=(1, 2)) / run.photons_before.sum(axis=(1, 2))
-    lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < DIMMED]
+    lost = [(c.key, s) for c, s in zip(run.experiment.path.channels, share, strict=True) if s < _DIMMED]
     if not lost:
         return ""
     names = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in lost)
@@ -442,7 +340,7 @@ def _blurred(run: RenderRun) -> str:
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
-    return f"; the MTF at Nyquist {where}, falls {change}: see Image quality" if share > SOFTER else ""
+    return f"; the MTF at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
 
 
 def alarm_limit(count: int) -> float:

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from analysis.monitor import model_fit
+from analysis.monitor import model_fit, parameters
 from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.model_fit import ObservabilityReport
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.monitoring import PER_SI
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion, line_family, other_motions
 from twin.monitor.truth import truth_jacobian
 
-SEEN_WITHIN = 0.1
+_SEEN_WITHIN = 0.1
 """Relative error up to which the words say that a change is seen."""
 
 PRINTED = {
@@ -61,8 +61,8 @@ class CameraCrosstalk:
     Attributes:
         motions: the four of the paper's own family first.
         spot_shift: (2 n, M) px, row and column of one spot after the other.
-        true: (4, M) true change in the units of PARAMETERS.
-        readings: estimator -> (4, M), what it says.
+        true: (P, M) true change of every reading of a camera, in its unit.
+        readings: estimator -> (P, M), what it says.
         factors: of the printed formulas.
         observability: what the spots' coordinates can and cannot separate.
         channels: names of the camera's channels.
@@ -83,7 +83,7 @@ class CameraCrosstalk:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for crosstalk.json."""
-        rows = []
+        rows, keys = [], [one.key for one in parameters.CAMERA_PARAMETERS]
         for k, motion in enumerate(self.motions):
             rows.append(
                 {
@@ -91,8 +91,8 @@ class CameraCrosstalk:
                     "body": motion.body,
                     "per": motion.unit,
                     "spot_shift_px": self.spot_shift[:, k].tolist(),
-                    "true": dict(zip(PARAMETERS, self.true[:, k].tolist(), strict=True)),
-                    **{e: dict(zip(PARAMETERS, r[:, k].tolist(), strict=True)) for e, r in self.readings.items()},
+                    "true": dict(zip(keys, self.true[:, k].tolist(), strict=True)),
+                    **{e: dict(zip(keys, r[:, k].tolist(), strict=True)) for e, r in self.readings.items()},
                 }
             )
         return {
@@ -112,16 +112,16 @@ class CameraCrosstalk:
             true, seen = self.true[3, k], self.readings["derived"][3, k]
             false = self.readings["derived"][:3, k] - self.true[:3, k]
             worst = int(np.argmax(np.abs(false)))
-            if abs(seen - true) < SEEN_WITHIN * abs(true):
+            if abs(seen - true) < _SEEN_WITHIN * abs(true):
                 verdict = "the spots see it"
-            elif abs(seen) < SEEN_WITHIN * abs(true):
+            elif abs(seen) < _SEEN_WITHIN * abs(true):
                 verdict = "the spots do not see it"
             else:
                 verdict = "the spots see it wrongly"
             out.append(
                 f"{motion.label}: the principal distance changes by {true:+.3g} um per {motion.unit}, the spots read "
                 f"{seen:+.3g} um: {verdict}. Beside it they show {false[worst]:+.2g} arcsec of "
-                f"{PARAMETERS[worst].removesuffix('_arcsec')} that is not there."
+                f"{parameters.CAMERA_PARAMETERS[worst].key.removesuffix('_arcsec')} that is not there."
             )
         return tuple(out)
 
@@ -164,14 +164,19 @@ def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str
         geometry = experiment.geometry(name)
         size = np.array([motion.unit_size for motion in motions])
         moved = all_spots[:, :, own].reshape(-1, len(motions))
-        rows = slice(4 * k, 4 * k + 4)
-        readings = {e: (PER_SI[:, None] * (gain[rows] @ moved)) * size for e, gain in gains.items()}
-        true = PER_SI[:, None] * truth * size
+        rows, unit = slice(4 * k, 4 * k + 4), parameters.rows_of(experiment.cameras[name])
+        readings = {e: (unit @ (gain[rows] @ moved)) * size for e, gain in gains.items()}
+        true = unit @ truth * size
         f = geometry.focal_length_m
         ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
         factors = tuple(
             FormulaFactor(
-                where, e, PARAMETERS[p], motions[p].label, readings[e][p, p] / ideal[p], readings[e][p, p] / true[p, p]
+                where,
+                e,
+                parameters.CAMERA_PARAMETERS[p].key,
+                motions[p].label,
+                readings[e][p, p] / ideal[p],
+                readings[e][p, p] / true[p, p],
             )
             for (e, p), where in PRINTED.items()
             if e in readings

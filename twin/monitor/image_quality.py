@@ -55,7 +55,7 @@ WAVELENGTH = 650e-9
 RINGS = 7
 """Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
-DARKEST = 0.99
+_DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
 
 COLOURS = 5
@@ -290,7 +290,7 @@ class _CameraBench:
             if np.any(dark[own]):
                 out[:, s] = np.nan
                 reasons[s] = f"an aperture beside the stop cuts {np.max(dark[own]):.1%} of the beam"
-            elif np.any(values[5, own] > DARKEST):
+            elif np.any(values[5, own] > _DARKEST):
                 out[:5, s] = np.nan
                 reasons[s] = f"bodies in the beam take {np.max(values[5, own]):.1%} of it"
             elif np.any(rough[own]):
@@ -361,7 +361,7 @@ class _CameraBench:
             pupils = PupilStack.fit(u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, shadows=taken)
             lost[lit] = 1.0 - pupils.light
             smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
-            good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - DARKEST))
+            good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
                 otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)

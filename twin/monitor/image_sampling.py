@@ -26,7 +26,7 @@ SPOT_RANGES = (0.25, 0.5, 0.8)
 farther off a spot, the farther its farthest pixel, and the more nodes it needs. Beyond the last the estimators refuse
 it."""
 
-BLUR_STEP = 1.25
+_BLUR_STEP = 1.25
 """From one class to the next beyond ``SPOT_RANGES``, those of blurred spots."""
 
 MOST_PHASE = 400.0
@@ -38,10 +38,10 @@ BLUR_PHASE = 1.5
 direction; astigmatism and trefoil turn two and three times around the pupil, and their harmonics die out as much
 later (by comparison with 72 800 nodes: 3e-6 of the peak for trefoil, less for all other terms to Z37)."""
 
-SHARP_PHASE = 1.0
+_SHARP_PHASE = 1.0
 """Phase of a blur that the margins of ``quadrature.disk_for`` hold anyway, radians."""
 
-WIDER_BEAM = 1.001
+_WIDER_BEAM = 1.001
 """Growth of the beam's aperture that needs no more nodes."""
 
 GOOD = 1e-4
@@ -118,8 +118,8 @@ class NodeClasses:
         most = MOST_PHASE / (self.phase_per_pixel * float(np.hypot(*self.half)))
         steps = 1.0 + SPOT_RANGES[-1]
         out = [1.0 + share for share in SPOT_RANGES]
-        while steps * BLUR_STEP <= most:
-            steps *= BLUR_STEP
+        while steps * _BLUR_STEP <= most:
+            steps *= _BLUR_STEP
             out.append(steps)
         return np.array(out)
 
@@ -153,8 +153,8 @@ class NodeClasses:
             widening: of the beams' apertures against the nominal one, (C, S).
         """
         half = np.array(self.half)
-        wide = np.where(np.asarray(widening) > WIDER_BEAM, widening, 1.0)
-        more = np.maximum(BLUR_PHASE * (wide * blur - SHARP_PHASE / self.phase_per_pixel), 0.0)
+        wide = np.where(np.asarray(widening) > _WIDER_BEAM, widening, 1.0)
+        more = np.maximum(BLUR_PHASE * (wide * blur - _SHARP_PHASE / self.phase_per_pixel), 0.0)
         farthest = np.max(wide * np.linalg.norm(np.abs(place) + half + margin, axis=-1) + more, axis=0)
         return np.searchsorted(self.reached, farthest / np.linalg.norm(half))
 

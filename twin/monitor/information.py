@@ -23,8 +23,8 @@ from scenes.models.disturbances import motions_of_spec
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
+from twin.monitor.monitor_derivative import disturbances_of
 from twin.monitor.monitor_path import MonitorPath
-from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import ground_geometry
 from twin.sensors.area_detector import EmvaDetector
 

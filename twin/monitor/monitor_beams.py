@@ -124,17 +124,17 @@ SMOOTH = 1e-6
 TOO_ROUGH = 2e-5
 """Rest beside all terms beyond which no image is given: 1e-3 of the density of rays."""
 
-COARSE_RINGS = 6
+_COARSE_RINGS = 6
 """Rings of the quadrature for means: exact for polynomials to degree 23."""
 
-SCOUT_RINGS = 4
+_SCOUT_RINGS = 4
 """Rings of the rays that are aimed in every state to find out how far the others have to be turned."""
 
 AIM_TOLERANCE = 1e-9
 """Where a ray meets the aperture node, metres: it shifts a quadrature node, not the ray's own path, by 4e-8 of the
 radius."""
 
-CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
+_CLOSE_TOLERANCE = 0.01 * AIM_TOLERANCE
 """Likewise of the rays from which those of other states are predicted."""
 
 
@@ -181,12 +181,12 @@ class MonitorBeams:
     @cached_property
     def coarse(self) -> MonitorBeams:
         """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
-        return self._with(quadrature.disk(COARSE_RINGS))
+        return self._with(quadrature.disk(_COARSE_RINGS))
 
     @cached_property
     def scout(self) -> MonitorBeams:
         """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
-        return self._with(quadrature.disk(SCOUT_RINGS))
+        return self._with(quadrature.disk(_SCOUT_RINGS))
 
     @cached_property
     def nominal(self) -> Aimed:
@@ -253,9 +253,9 @@ class MonitorBeams:
     def _aim_nominal(self) -> Aimed:
         """Aim rays of the unperturbed instrument: at the middle of the face, then at the nodes around it."""
         fan, outgoing = self._outgoing(self.instrument.assembly.place(), [{}])
-        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=CLOSE_TOLERANCE)
+        middle, slope = aim(self.backend, outgoing, fan, np.zeros((1, 2)), tolerance=_CLOSE_TOLERANCE)
         near = middle + np.einsum("bnij,bpj->bpi", inverse(slope), self.target)
-        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, CLOSE_TOLERANCE)
+        q, slope = aim(self.backend, outgoing, fan, self.target, near, slope, _CLOSE_TOLERANCE)
         place, heading = fan.at(q)
         return Aimed(place, heading, fan.axes, q, slope)
 
@@ -276,7 +276,7 @@ class MonitorBeams:
         back = assemble(self.instrument.assembly, names, states, placed=placed)
         nominal = scout.nominal
         start, slope = (np.repeat(a, count, axis=0) for a in (nominal.parameters, nominal.jacobian))
-        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, CLOSE_TOLERANCE)
+        q, _ = aim(self.backend, outgoing, fan, scout.targets(count), start, slope, _CLOSE_TOLERANCE)
         turn = product(np.moveaxis(q - start, -1, 0), scout._smooth[0].T)
         uploaded = back.upload(self.backend)
         traced = trace(self.backend, uploaded, make_rays(self.backend, *fan.at(q)))

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from analysis.monitor.disturbances import Disturbances, TimeLaw
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
@@ -27,13 +28,17 @@ from optics.raytrace.derivatives import RayTangents, jvp, vjp
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.diffraction import PupilTangent, image_derivative
+from scenes.models.disturbances import Component, StatedMotions, state_of
 from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import ThermalModel
+from scenes.specs.disturbances import TimeLawSpec
 from twin.monitor.monitor_beams import AIM_TOLERANCE, MonitorBeams
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, pivot_states
+from twin.monitor.truth import trace_truth, truth_jacobian
 
 
-def size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
+def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
     """Derivative of the sizes of C bodies by the steps of M states, (C, M)."""
     return np.stack([placed.scale[:, placed.index[body]].imag for body in bodies]) / COMPLEX_STEP
 
@@ -64,9 +69,9 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
     outgoing = assemble(path.instrument.assembly, [f"{channel.key}/outgoing" for channel in path.channels])
     start = np.broadcast_to(nominal.position, nominal.direction.shape)
     axes, slopes = hit_slopes(path.backend, outgoing, start, nominal.direction)
-    faces = size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
+    faces = _size_steps(placed, [channel.face_body for channel in path.channels]).reshape(-1, 1, 1)
     q_step = turned(np.repeat(inverse(slopes), m, axis=0), faces * path.targets(m) - drift)
-    sizes = size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
+    sizes = _size_steps(placed, [channel.ccd_body for channel in path.channels]).ravel()
     return push("monitor", np.einsum("bnk,bnkx->bnx", q_step, np.repeat(axes, m, axis=0))), sizes
 
 
@@ -211,8 +216,8 @@ def spot_gradient(
     rays = max(chunk // len(path.channels), 1)
     size = monitor.size[once]
     pitch = path.pitch * monitor.size
-    face_steps = size_steps(placed, [channel.face_body for channel in path.channels])
-    chip_steps = size_steps(placed, [channel.ccd_body for channel in path.channels])
+    face_steps = _size_steps(placed, [channel.face_body for channel in path.channels])
+    chip_steps = _size_steps(placed, [channel.ccd_body for channel in path.channels])
     for start in range(0, path.nodes.count, rays):
         piece = slice(start, start + rays)
         place, heading = launch[:, piece], launched[:, piece]
@@ -327,3 +332,80 @@ def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
     fan = RayFan(place, nominal.direction, axes)
     q, _ = aim(path.backend, systems, fan, path.target, jacobian=slopes, tolerance=AIM_TOLERANCE)
     return fan.at(q)
+
+
+STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6}
+"""Half steps of the central differences, SI: spots move by some tenths of a pixel, where they are linear to 1e-6."""
+
+
+def disturbances_of(
+    stated: StatedMotions, path: MonitorPath, thermal: ThermalModel, instrument: Instrument, backend: Backend
+) -> Disturbances:
+    """Stated motions with their derivatives, as the analysis takes them.
+
+    Rigid motions, growth and figures are differentiated by automatic differentiation as all others of this program
+    are; temperatures and gradients of indices by central differences of the traced spots, since they reach light by
+    many bodies at once.
+
+    Args:
+        stated: the motions.
+        path: the monitor's light.
+        thermal: of the instrument.
+        instrument: nominal.
+        backend: where to trace.
+
+    Raises:
+        AimError, BeamMissedError: a step of a temperature loses the light.
+    """
+    spots = np.empty((2 * len(path.channels), len(stated.components)))
+    parameters = np.empty((4 * len(instrument.cameras), len(stated.components)))
+    moved = [k for k, c in enumerate(stated.components) if c.kind not in STEPS]
+    if moved:
+        motions = [_elementary(stated.components[k]) for k in moved]
+        spots[:, moved] = spot_jacobian(path, motions).reshape(-1, len(moved))
+        parameters[:, moved] = np.concatenate(list(truth_jacobian(instrument, backend, motions).values()))
+    stepped = [k for k, c in enumerate(stated.components) if c.kind in STEPS]
+    if stepped:
+        own = [stated.components[k] for k in stepped]
+        spots[:, stepped], parameters[:, stepped] = _by_differences(own, path, thermal, instrument, backend)
+    sigma = stated.sigma
+    return Disturbances(
+        name=stated.name,
+        labels=tuple(c.name for c in stated.components),
+        bodies=tuple(c.body for c in stated.components),
+        causes=tuple(c.cause for c in stated.components),
+        sigmas=np.array([c.sigma / c.unit_size for c in stated.components]),
+        units=tuple(c.unit for c in stated.components),
+        spots=spots * sigma,
+        parameters=parameters * sigma,
+        correlation=stated.correlation,
+        laws=tuple(_law(law) for law in stated.laws),
+    )
+
+
+def _elementary(component: Component) -> ElementaryMotion:
+    return ElementaryMotion(component.body, component.kind, component.axis, component.pivot, component.name)
+
+
+def _by_differences(
+    components: Sequence[Component],
+    path: MonitorPath,
+    thermal: ThermalModel,
+    instrument: Instrument,
+    backend: Backend,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of spots (2 C, M), px, and parameters (4 K, M) per SI unit."""
+    steps = np.array([STEPS[c.kind] for c in components])
+    # all bodies have a temperature of their own in every state, as in states that are drawn, so that none inherits one
+    states = [state_of(row, components, thermal) for row in np.concatenate([np.diag(steps), np.diag(-steps)])]
+    place = path.coarse_trace(states).place
+    count = len(components)
+    rows = np.moveaxis(place, 1, 2).reshape(-1, 2 * count)
+    truth = trace_truth(instrument, backend, states)
+    changes = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in truth.cameras.values()]
+    both = np.concatenate(changes)
+    return (rows[:, :count] - rows[:, count:]) / (2.0 * steps), (both[:, :count] - both[:, count:]) / (2.0 * steps)
+
+
+def _law(law: TimeLawSpec) -> TimeLaw:
+    return TimeLaw(law.kind == "white", law.drift, law.period)

@@ -36,11 +36,10 @@ from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.line_curvature import motion_models
 from twin.monitor.monitor_beams import SpotFocus
-from twin.monitor.monitor_derivative import spot_jacobian
+from twin.monitor.monitor_derivative import disturbances_of, spot_jacobian
 from twin.monitor.monitor_memory import MonitorSize, require_memory
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import line_family
-from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import LineSight, Truth, ground_geometry, truth_jacobian
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import EmvaDetector, FixedPattern

@@ -53,24 +53,24 @@ what the heap keeps of arrays that are freed; bytes.
 """
 DRAWN = 410e6
 """The same when it is drawn and written, the most of a small one; bytes."""
-PIXEL = 380.0
+_PIXEL = 380.0
 """Of a spot's image while it is measured and while it is worked out what limits that, for each pixel: photons 24, fixed
 pattern 16, mean frames and maps of the fits before and after 64, images and maps of a stated state 85, the fit at work
 190; bytes."""
-RAY = 600.0
+_RAY = 600.0
 """Of a traced ray with its derivatives, its aiming and the polynomials of the pupil at its node, bytes."""
 GREY = 2.0
 """Of a pixel of a recorded frame."""
-OF_COURSE = 6.0
+_OF_COURSE = 6.0
 """Of a pixel of each time of a course: expected photons in single precision, and a first frame."""
-IN_FILES = 2.0
+_IN_FILES = 2.0
 """Of a pixel of the frames of one channel, while they become a file."""
 WRITTEN = 60.0
 """Of a pixel of a spot's image when it is drawn and written: photons, their file, means."""
-OF_STATE = 24.0
+_OF_STATE = 24.0
 """Of a pixel of each state that is rendered at once: photons, and what its noise does to the spot."""
 
-ORDINARY = 600e6
+_ORDINARY = 600e6
 """A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
 gives must not depend on that.
 """
@@ -113,9 +113,9 @@ class MonitorSize:
         states = min(self.times, largest_piece(every * frames)) if self.times else 1
         threads = min(cores(), 8, self.spots * states)  # that expose images
         return {
-            "ccd": every * (PIXEL + (states - 1) * OF_STATE) + self.rays * RAY,
+            "ccd": every * (_PIXEL + (states - 1) * _OF_STATE) + self.rays * _RAY,
             "frames": (1 + states) * every * frames * GREY + threads * detector.exposing_bytes(frames, image),
-            "times": self.times * every * OF_COURSE,
+            "times": self.times * every * _OF_COURSE,
             "pictures": self.pictures * GREY,
         }
 
@@ -127,7 +127,7 @@ class MonitorSize:
         """
         parts = self.parts(detector)
         every = self.spots * self.rows * self.columns
-        written = every * (WRITTEN + 2.0 * self.frames * GREY) + every / self.spots * self.frames * IN_FILES
+        written = every * (WRITTEN + 2.0 * self.frames * GREY) + every / self.spots * self.frames * _IN_FILES
         return max(STARTED + sum(parts.values()), DRAWN + written + parts["times"] + parts["pictures"])
 
 
@@ -146,7 +146,7 @@ def require_memory(resolved: ResolvedJob, size: MonitorSize, detector: EmvaDetec
 
     def fits(other: MonitorSize) -> bool:
         need = other.bytes(detector)
-        return need <= ORDINARY or need - there <= free
+        return need <= _ORDINARY or need - there <= free
 
     if fits(size):
         return

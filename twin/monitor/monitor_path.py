@@ -35,7 +35,7 @@ from twin.monitor.image_sampling import (
 )
 from twin.monitor.monitor_beams import CcdRays, CoarseTrace, MonitorBeams
 
-MOST_RAYS = 400_000
+_MOST_RAYS = 400_000
 """Traced at once, to bound memory: blurred spots need many."""
 
 WIDEST = 1.1
@@ -295,7 +295,7 @@ class MonitorPath(MonitorBeams):
         number = 0
         while number <= np.max(chosen):
             own = np.flatnonzero(chosen == number)
-            for piece in np.array_split(own, -(-len(own) * self._rays_of(number) // MOST_RAYS) or 1):
+            for piece in np.array_split(own, -(-len(own) * self._rays_of(number) // _MOST_RAYS) or 1):
                 if len(piece):
                     self._require_class(number, coarse, int(piece[0]))
                     known = coarse.take(piece, self.backend)

@@ -27,14 +27,14 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
 
-CENTROID = "centroid"
+_CENTROID = "centroid"
 """The line that nothing causes but the noise of the image."""
 
 ALLOWED = 0.1 * ARCSEC
 """Error of one line that the inverse view asks for, 3 sigma, radians."""
 _SEARCH_STEPS = 4
 
-PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
+_PARAMETER_FIELDS = ("d_alpha_rad", "d_beta_rad", "d_gamma_rad", "d_f_m")
 
 Progress = Callable[[float, str], None]
 
@@ -99,9 +99,9 @@ class ErrorBudget:
         if stated is None or self.resolved.disturbances is None:
             raise ValueError("error budget: the job states no disturbances")
         self.stated = stated
-        if CENTROID in self.causes:
-            text = f"{CENTROID} is the line of the centroid's own noise"
-            raise self.resolved.disturbances.error(text, ("causes", CENTROID), allowed="another name of the cause")
+        if _CENTROID in self.causes:
+            text = f"{_CENTROID} is the line of the centroid's own noise"
+            raise self.resolved.disturbances.error(text, ("causes", _CENTROID), allowed="another name of the cause")
         self.seed = seed
 
     @property
@@ -112,7 +112,7 @@ class ErrorBudget:
     @property
     def lines(self) -> tuple[str, ...]:
         """Names of all lines."""
-        return (CENTROID, *self.causes)
+        return (_CENTROID, *self.causes)
 
     @cached_property
     def radians_per_pixel(self) -> float:
@@ -126,7 +126,7 @@ class ErrorBudget:
         Raises:
             ValueError: no such line.
         """
-        if name == CENTROID:
+        if name == _CENTROID:
             return self._centroid_line()
         value, unit = self.input_of(name)
         progress(0.0, f"{name}: states")
@@ -226,7 +226,7 @@ class ErrorBudget:
             slope = (size[-1] - size[-2]) / (share[-1] - share[-2])
             share.append(share[-1] + (target - size[-1]) / slope)
         light = self.spec.photons_per_frame
-        return self._line(CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
+        return self._line(_CENTROID, scatter, light, "photons per frame", light * float(np.exp(share[-1])))
 
     def _centroid_scatter(self, light: float) -> np.ndarray:
         """Energy centroids of single frames about their mean, px, (frames, C, 2), at a share of the light."""
@@ -262,7 +262,7 @@ class ErrorBudget:
         parameters: dict[str, dict[str, tuple[float, float]]] = {}
         for estimator in next(iter(pieces[0][1].parameters.values())):
             parameters[estimator] = {}
-            for name in PARAMETER_FIELDS:
+            for name in _PARAMETER_FIELDS:
                 values = [
                     np.concatenate(
                         [

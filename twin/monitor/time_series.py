@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.curvature import Curvature
-from analysis.monitor.ground_error import AXES, GroundError
-from analysis.monitor.intersection_angle import IntersectionAngleChange
-from analysis.monitor.monitoring import PARAMETERS, PER_SI, CameraParameters
-from analysis.monitor.recovery import Estimates, Recovery
+from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.recovery import Recovery, estimates_of
+from analysis.monitor.series_smoother import smooth, window_of
 from analysis.monitor.spot_evidence import SpotEvidence
-from analysis.spots.spot_positions import SpotError
-from analysis.units import ARCSEC
+from analysis.spots.spot_positions import NoiseParts, SeriesNoise, SpotError
 from optics.geometry.tree import Motion, State
+from optics.numerics.threads import one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError
@@ -27,8 +28,8 @@ from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
-from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
-from twin.monitor.truth import Truth
+from twin.monitor.reading_table import ReadingTable, reading_table
+from twin.run.quantity import Quantity, Record
 
 LARGEST_SERIES = 200_000_000
 """Pixels of one image per time and channel, which are kept: about 1.2 GB."""
@@ -43,13 +44,8 @@ class TimeSeries:
         temperatures: node path -> its change of temperature at each time, perturbation included.
         motions: node path -> its motion at each time, perturbation included; of the nodes that the course moves.
         shown: number of the time that the rest of the run shows in full.
-        truth: camera -> (4, T) true d_alpha, d_beta, d_gamma (rad) and d_f (m).
-        angle: of the nominal state, radians, NaN unless there are two cameras; angle_change: (T,), radians.
-        parameters: camera -> estimator -> changes, arrays (T,), against one nominal measurement.
-        recovered_angle: estimator -> change of the intersection angle, arrays (T,); empty unless there are two cameras.
-        true_ground: (T, 3) errors along the track, across it and up of points located by the nominal cameras, metres;
-            None unless the altitude of a pair is known.
-        recovered_ground: estimator -> the same as they are read, arrays (T,); empty likewise.
+        angle: between two cameras in the nominal state, radians; NaN unless there are two.
+        readings: true changes and what is read of them at all times, against one nominal measurement.
         smoothed: all measurements together; None where nothing is stated to move.
         shift: (T, 2 C) of the spots, in their order, px; shift_covariance: (T, 2 C, 2 C), px^2.
         photons: expected photons per pixel and frame, float32 (T, C, rows, columns).
@@ -64,13 +60,8 @@ class TimeSeries:
     temperatures: Mapping[str, tuple[Temperature, ...]]
     motions: Mapping[str, tuple[Motion, ...]]
     shown: int
-    truth: Mapping[str, np.ndarray]
     angle: float
-    angle_change: np.ndarray
-    parameters: Mapping[str, Mapping[str, CameraParameters]]
-    recovered_angle: Mapping[str, IntersectionAngleChange]
-    true_ground: np.ndarray | None
-    recovered_ground: Mapping[str, GroundError]
+    readings: ReadingTable
     smoothed: SmoothedCourse | None
     shift: np.ndarray
     shift_covariance: np.ndarray
@@ -114,53 +105,61 @@ class TimeSeries:
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of course.json: as truth.json and recovered.json, with a list over the times for each number."""
-        cameras: dict[str, Any] = {}
-        changes = Estimates({name: {} for name in self.parameters}, {}, {})
-        if self.smoothed is not None:
-            changes = self.smoothed.changes
-        for name, estimators in self.parameters.items():
-            # adding 0.0 turns a negative zero into a plain one
-            values = {
-                k: (v + 0.0).tolist() for k, v in zip(PARAMETERS, self.truth[name] * PER_SI[:, None], strict=True)
-            }
-            every = {**estimators, **changes.parameters[name]}
-            cameras[name] = {"true": values, **{e: p.to_dict() for e, p in every.items()}}
-        out: dict[str, Any] = {
-            "times_s": self.times.tolist(),
-            "detail": self.shown,
-            "temperatures": {
-                path: {"change_K": [f.change for f in fields], "gradient_K_per_m": [list(f.gradient) for f in fields]}
-                for path, fields in self.temperatures.items()
-            },
-            "cameras": cameras,
-        }
-        if self.motions:
-            out["motions"] = {
-                path: {
-                    "pivot": moves[0].pivot,
-                    "rotate_arcsec": [[angle / ARCSEC for angle in motion.rotate] for motion in moves],
-                    "shift_um": [[1e6 * length for length in motion.shift] for motion in moves],
-                    "scale_ppm": [1e6 * motion.scale for motion in moves],
-                }
-                for path, moves in self.motions.items()
-            }
-        if self.recovered_angle:
-            out["intersection_angle"] = {
-                "nominal_deg": float(np.degrees(self.angle)),
-                "true": {"change_arcsec": (self.angle_change / ARCSEC + 0.0).tolist()},
-                **{e: a.to_dict() for e, a in {**self.recovered_angle, **changes.angle}.items()},
-            }
-        if self.true_ground is not None:
-            out["ground"] = {
-                "true": {f"{axis}_m": (v + 0.0).tolist() for axis, v in zip(AXES, self.true_ground.T, strict=True)},
-                **{e: g.to_dict() for e, g in {**self.recovered_ground, **changes.ground}.items()},
-            }
-        out["sigma_holds"] = self.sigma_holds.tolist()
-        if self.smoothed is not None:
-            out["disturbances"] = self.smoothed.to_dict()
-            if len(self.smoothed.times):
-                out["between"] = self.smoothed.between_dict()
-        return out
+        numbers: dict[str, Any] = COURSE(self)
+        return numbers
+
+    def group(self, name: str) -> dict[str, Any] | None:
+        """A group of readings as course.json has it, filtered and smoothed ones included; None where there is none.
+
+        Args:
+            name: ``cameras``, ``intersection_angle`` or ``ground``.
+        """
+        found, more = self.readings.groups("true"), {} if self.smoothed is None else self.smoothed.changes.groups()
+        if name == "cameras":
+            return {camera: own | more.get(name, {}).get(camera, {}) for camera, own in found[name].items()}
+        return found[name] | more.get(name, {}) if name in found else None
+
+
+def _angle(course: TimeSeries) -> dict[str, Any] | None:
+    found = course.group("intersection_angle")
+    return None if found is None else {"nominal_deg": float(np.degrees(course.angle))} | found
+
+
+_TEMPERATURES: Record[Sequence[Temperature]] = Record(
+    "The temperature of a body that was given, at each time, its perturbation included.",
+    Quantity("change_K", lambda fields: [one.change for one in fields], "change at the body's origin"),
+    Quantity("gradient_K_per_m", lambda fields: [one.gradient for one in fields], "gradient along the body's axes"),
+)
+_MOTIONS: Record[Sequence[Motion]] = Record(
+    "The motion of a body that was given, at each time, its perturbation included.",
+    Quantity("pivot", lambda moves: moves[0].pivot, "point that a rotation or a growth leaves in place"),
+    Quantity("rotate_arcsec", lambda moves: [one.rotate for one in moves], "rotation about X, Y and Z"),
+    Quantity("shift_um", lambda moves: [one.shift for one in moves], "shift along X, Y and Z"),
+    Quantity("scale_ppm", lambda moves: [one.scale for one in moves], "relative growth"),
+)
+COURSE: Record[TimeSeries] = Record(
+    "course.json: as truth.json and recovered.json, with a list over the times for each number.",
+    Quantity("times_s", lambda course: course.times, "times of the measurements"),
+    Quantity("detail", lambda course: course.shown, "number of the time that the run shows in full"),
+    Quantity("temperatures", lambda course: course.temperatures, "temperatures by body", record=_TEMPERATURES),
+    Quantity("cameras", lambda course: course.group("cameras"), "true changes of each camera and what is read of them"),
+    Quantity("motions", lambda course: course.motions or None, "motions by body", record=_MOTIONS, where_known=True),
+    Quantity("intersection_angle", _angle, "the angle between two cameras", where_known=True),
+    Quantity("ground", lambda course: course.group("ground"), "errors of points on the ground", where_known=True),
+    Quantity("sigma_holds", lambda course: course.sigma_holds, "whether the sigmas hold at each time"),
+    Quantity(
+        "disturbances",
+        lambda course: None if course.smoothed is None else course.smoothed.to_dict(),
+        "whether all measurements agree with what is stated to move",
+        where_known=True,
+    ),
+    Quantity(
+        "between",
+        lambda course: course.smoothed.between_dict() if course.smoothed and len(course.smoothed.times) else None,
+        "filtered and smoothed changes between the times",
+        where_known=True,
+    ),
+)
 
 
 def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
@@ -221,8 +220,8 @@ def run_series(
     first = np.empty(photons.shape, np.uint16)
     saturated = np.zeros(photons.shape[:2], bool)
     share = np.empty(photons.shape[:2])
-    shown_photons = np.empty(photons.shape[1:])
-    truths: list[Truth] = []
+    shown_photons, angle = np.empty(photons.shape[1:]), np.nan
+    tables: list[ReadingTable] = []
     recoveries: list[Recovery] = []
     together = CourseSmoother(experiment.disturbances, experiment.cameras, experiment.ground, course.times)
     record, size, done = one_detector(experiment, frames, seed), largest_piece(each * frames), 0
@@ -230,8 +229,10 @@ def run_series(
     try:
         for found in observe(experiment, states, how):
             piece, expected = slice(done, done + len(found.numbers)), found.light.photons
-            truths.append(found.truth)
+            told = found.recovery, experiment.cameras, found.truth, experiment.ground
+            tables.append(reading_table(*told))
             recoveries.append(together.add(found.recovery))
+            angle = found.truth.angle
             photons[piece], first[piece] = expected, found.after[:, :, 0]
             if piece.start <= course.shown < piece.stop:
                 shown_photons[:] = expected[course.shown - piece.start]
@@ -248,29 +249,14 @@ def run_series(
         k, spot = divmod(error.indices[0], len(channels))
         reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
         raise too_large(job, done + k, reason) from error
-    names = list(experiment.instrument.cameras)
     moves = [motions_of(job, k) for k in range(len(states))]
-    changes = {name: [t.cameras[name] for t in truths] for name in names}
     return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
         motions={path: tuple(every[path] for every in moves) for path in course.motion},
         shown=course.shown,
-        truth={
-            name: np.concatenate([np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in every], axis=1)
-            for name, every in changes.items()
-        },
-        angle=truths[0].angle,
-        angle_change=np.concatenate([t.angle_change for t in truths]),
-        parameters={
-            name: {e: _joined([r.parameters[name][e] for r in recoveries]) for e in recoveries[0].parameters[name]}
-            for name in names
-        },
-        recovered_angle={e: _joined_angle([r.angle[e] for r in recoveries]) for e in recoveries[0].angle},
-        true_ground=None
-        if experiment.ground is None
-        else np.concatenate([t.ground_error(experiment.ground) for t in truths]),
-        recovered_ground={e: _joined_ground([r.ground[e] for r in recoveries]) for e in recoveries[0].ground},
+        angle=angle,
+        readings=ReadingTable.joined(tables),
         smoothed=together.smoothed(),
         shift=np.concatenate([r.shift for r in recoveries]),
         shift_covariance=np.concatenate([r.shift_covariance for r in recoveries]),
@@ -302,27 +288,6 @@ def _course(job: JobSpec) -> CourseSpec:
     return job.course
 
 
-def _joined(parts: Sequence[CameraParameters]) -> CameraParameters:
-    total = [p.total for p in parts if p.total is not None]
-    return CameraParameters.from_vector(
-        np.concatenate([p.vector for p in parts]),
-        np.concatenate([p.covariance for p in parts]),
-        np.concatenate(total) if total else None,
-    )
-
-
-def _joined_angle(parts: Sequence[IntersectionAngleChange]) -> IntersectionAngleChange:
-    return IntersectionAngleChange(
-        np.concatenate([p.change_rad for p in parts]),
-        np.concatenate([p.sigma_rad for p in parts]),
-        np.concatenate([p.noise_rad for p in parts]),
-    )
-
-
-def _joined_ground(parts: Sequence[GroundError]) -> GroundError:
-    return GroundError(*(np.concatenate([getattr(p, field.name) for p in parts]) for field in fields(GroundError)))
-
-
 MIN_LIGHT = 0.5
 """Share of the nominal light on a CCD below which the user is warned."""
 
@@ -345,3 +310,115 @@ def _warnings(
                 "nominal light reaches the CCD"
             )
     return tuple(out)
+
+
+MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
+"""Times between two of a course, and in all, at which it is smoothed, too."""
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothedCourse:
+    """What all measurements of a course say together, by the laws in time of what is stated to move.
+
+    Attributes:
+        name: of the stated disturbances.
+        changes: at all times of the course, by the estimators `filtered`, from the measurements up to each time, and
+            `smoothed`, from all.
+        times: (F,) between those of the course, seconds; between: the changes there, likewise.
+        innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
+        consistency: chi-square of the whole series.
+    """
+
+    name: str
+    changes: ReadingTable
+    times: np.ndarray
+    between: ReadingTable
+    innovations: np.ndarray
+    each: int
+    consistency: Consistency
+
+    def between_dict(self) -> dict[str, Any]:
+        """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
+        return {"times_s": self.times.tolist(), **self.between.groups()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Do the measurements agree with what is stated?"""
+        found = self.consistency
+        return {
+            "name": self.name,
+            "chi_square": found.chi_square,
+            "degrees_of_freedom": found.degrees,
+            "limit": found.limit,
+            "false_alarm": FALSE_ALARM,
+            "chance": found.chance,
+            "agrees": found.agrees,
+            "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
+        }
+
+
+class CourseSmoother:
+    """Collects shifts and noise of all measurements, then reads them together.
+
+    Args:
+        stated: what moves, and how it goes on in time; None for nothing, of which nothing is smoothed.
+        cameras: what is calibrated of each.
+        ground: of a pair whose altitude is known, else None.
+        times: of the measurements, seconds, in order.
+    """
+
+    def __init__(
+        self,
+        stated: Disturbances | None,
+        cameras: Mapping[str, CameraCalibration],
+        ground: GroundGeometry | None,
+        times: Sequence[float],
+    ) -> None:
+        self._stated, self._cameras, self._ground = stated, cameras, ground
+        self._times = np.array(times)
+        self._shifts: list[np.ndarray] = []
+        self._noise: SeriesNoise | None = None
+
+    def add(self, found: Recovery) -> Recovery:
+        """Take what is needed of some states, and give them back without the maps.
+
+        Args:
+            found: the next states, with the parts of their noise.
+        """
+        if found.parts is None:
+            return found
+        self.take(found.shift, *found.parts)
+        return found.at(slice(None))
+
+    def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
+        """The same of states that were measured otherwise.
+
+        Args:
+            shift: (S, 2 C) after - before of the next states, px.
+            before: noise of the C spots before, the same at every call.
+            after: of the S C spots after, state by state.
+        """
+        if self._noise is None:
+            self._noise = SeriesNoise(before, window_of(shift.shape[1]))
+        self._noise.add(after)
+        self._shifts.append(shift)
+
+    def smoothed(self) -> SmoothedCourse | None:
+        """Of all that was taken; None where nothing is stated to move, and of a single time."""
+        stated, noise, times = self._stated, self._noise, self._times
+        if stated is None or noise is None or len(times) < 2:
+            return None
+        steps = min(MOST_BETWEEN, LARGEST_BETWEEN // (len(times) - 1)) + 1
+        shares = np.arange(1, steps) / steps
+        between = (times[:-1, None] + shares * np.diff(times)[:, None]).ravel()
+        with one_blas_thread():
+            found = smooth(stated, times, np.concatenate(self._shifts), noise, np.append(times, between))
+
+        def part(which: slice) -> ReadingTable:
+            every = {"filtered": found.filtered, "smoothed": found.smoothed}
+            own = {name: (one.values[which], one.noise[which], one.total[which]) for name, one in every.items()}
+            return reading_table(estimates_of(own, self._cameras, self._ground), self._cameras)
+
+        count = len(times)
+        each = found.consistency.degrees // count
+        at, rest = part(slice(count)), part(slice(count, None))
+        return SmoothedCourse(stated.name, at, between, rest, found.innovations, each, found.consistency)

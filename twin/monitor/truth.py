@@ -58,6 +58,15 @@ class Truth:
         lines = np.concatenate([self.lines[:, :1], self.lines[:, 1:][:, states]], axis=1)
         return replace(self, cameras=cameras, angle_change=self.angle_change[states], lines=lines)
 
+    def vector(self, camera: str) -> np.ndarray:
+        """(S, 4) true d_alpha, d_beta, d_gamma (rad) and d_f (m) of a camera.
+
+        Args:
+            camera: its name.
+        """
+        change = self.cameras[camera]
+        return np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
+
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
         """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.
 
@@ -206,7 +215,7 @@ def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State
     return LineSight(instrument, backend).truth(states)
 
 
-DIFFERENCE = 1e-6
+_DIFFERENCE = 1e-6
 """Half step of the central differences (rad, m or relative): truncation and rounding are both below 1e-8 of the
 result."""
 
@@ -220,10 +229,10 @@ def truth_jacobian(
     Returns:
         Camera -> (4, M): d_alpha, d_beta, d_gamma (rad) and d_f (m) per radian, metre or unit of scale.
     """
-    states = [m.state(DIFFERENCE) for m in motions] + [m.state(-DIFFERENCE) for m in motions]
+    states = [m.state(_DIFFERENCE) for m in motions] + [m.state(-_DIFFERENCE) for m in motions]
     truth = trace_truth(instrument, backend, states)
     out = {}
-    for name, change in truth.cameras.items():
-        rows = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f])
-        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * DIFFERENCE)
+    for name in truth.cameras:
+        rows = truth.vector(name).T
+        out[name] = (rows[:, : len(motions)] - rows[:, len(motions) :]) / (2.0 * _DIFFERENCE)
     return out

@@ -38,7 +38,7 @@ from twin.recover.measured_frames import ChannelFrames, StateFrames, cannot_meas
 
 __all__ = ["ChannelMeasurement", "ChannelResult", "SpotResult", "remedy"]
 
-DEAREST = 4.0
+_DEAREST = 4.0
 """Times that sigma may grow by what is missing, before a spot counts as lost."""
 _REMEDIES = (
     ("(saturation", "frames with less light or a shorter exposure"),
@@ -283,7 +283,7 @@ class ChannelMeasurement:
         if examined is None or examined.clean:
             positions = self._as_ever(screened, state)
         else:
-            if examined.fit.missing > DEAREST:
+            if examined.fit.missing > _DEAREST:
                 what = ", ".join(dict.fromkeys(f.kind for f in examined.findings if f.corrects))
                 grown = f"sigma would grow {1.0 + examined.fit.missing:.1f}-fold"
                 raise SpotError({0: f"too much of the spot is missing ({what}): {grown}"})

@@ -119,7 +119,7 @@ def _not_ascending(channel: ChannelFrames) -> int:
 
 Shape = tuple[int, int]
 
-MOST_GREY = 2.0**32
+_MOST_GREY = 2.0**32
 """Largest grey value, either sign: of a converter of 32 bits, beyond any that there is."""
 
 
@@ -277,9 +277,9 @@ def _stacked(test: Spec, files: tuple[str, ...], key: KeyPath) -> np.ndarray:
         except OSError as error:
             raise _told(test, key, f"{file}: {error.strerror or error}", "a file that can be read") from error
         largest = float(np.max(np.abs(parts[-1]), where=np.isfinite(parts[-1]), initial=0.0))
-        if largest > MOST_GREY:
+        if largest > _MOST_GREY:
             text = f"{file} has grey values up to {largest:.3g}"
-            raise _told(test, key, text, f"grey values of a converter, at most {MOST_GREY:g}")
+            raise _told(test, key, text, f"grey values of a converter, at most {_MOST_GREY:g}")
         if parts[-1].shape[1:] != parts[0].shape[1:]:
             sizes = (" x ".join(map(str, part.shape[1:])) for part in (parts[0], parts[-1]))
             text = f"{files[0]} and {file} have frames of different sizes, {' and '.join(sizes)}"

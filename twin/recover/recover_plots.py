@@ -15,22 +15,7 @@ from twin.main_job.series_plots import time_unit
 from twin.main_job.spot_plots import cross, stretch
 from twin.recover.channel_measurement import SpotResult
 from twin.recover.recover_run import RecoverRun, state_name
-from twin.run.svg import (
-    AFTER,
-    BEFORE,
-    BLUE,
-    DIVERGING,
-    GRAY,
-    INK,
-    LIGHT,
-    ORANGE,
-    SKY,
-    gridded,
-    look,
-    new_figure,
-    shared_legend,
-    to_svg,
-)
+from twin.run import svg
 
 LIMIT = 5.0
 """Of the colour scale of residuals, sigmas."""
@@ -59,30 +44,30 @@ def _extent(spot: SpotResult) -> tuple[float, float, float, float]:
 def _mark_unused(axes: Axes, spot: SpotResult) -> None:
     row, column = np.nonzero(~spot.used)
     at = spot.frames.offset
-    axes.plot(column + at[1], row + at[0], "s", ms=2.2, mfc="none", mec=ORANGE, mew=0.6, ls="none")
+    axes.plot(column + at[1], row + at[0], "s", ms=2.2, mfc="none", mec=svg.ORANGE, mew=0.6, ls="none")
 
 
 def spots_svg(run: RecoverRun, camera: str) -> str:
     """Mean frames of one camera, a row per channel."""
-    with look(f"measured-{camera}"):
+    with svg.look(f"measured-{camera}"):
         panels = _panels(run, camera)
         norm = stretch(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
         figure, grid = _grid(len(panels))
         shown = None
         for line, (side, states) in enumerate(panels):
             for axes, (name, spot, place) in zip(grid[line], states, strict=True):
-                shown = axes.imshow(spot.mean, cmap=GRAY, norm=norm, interpolation="none", extent=_extent(spot))
+                shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
                 _mark_unused(axes, spot)
-                cross(axes, place, BEFORE if name == "before" else AFTER, 0.11 * spot.mean.shape[1])
+                cross(axes, place, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
                 _labels(axes, f"{side}, {name}", line == len(panels) - 1)
         assert shown is not None
         _bar(figure, shown, grid, "mean frame [DN], asinh stretch")
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def residuals_svg(run: RecoverRun, camera: str) -> str:
     """Residuals of one camera's spots in standard deviations, a row per channel."""
-    with look(f"left-{camera}"):
+    with svg.look(f"left-{camera}"):
         panels = _panels(run, camera)
         figure, grid = _grid(len(panels))
         shown = None
@@ -90,17 +75,17 @@ def residuals_svg(run: RecoverRun, camera: str) -> str:
             for axes, (name, spot, _) in zip(grid[line], states, strict=True):
                 left = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
                 shown = axes.imshow(
-                    left, cmap=DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
+                    left, cmap=svg.DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
                 )
                 _mark_unused(axes, spot)
                 _labels(axes, f"{side}, {name}", line == len(panels) - 1)
         assert shown is not None
         _bar(figure, shown, grid, "frame \N{MINUS SIGN} fit [σ]")
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _grid(rows: int) -> tuple[Figure, Any]:
-    figure = new_figure(0.7 + 4.3 * rows, {"w_pad": 0.03, "h_pad": 0.03})
+    figure = svg.new_figure(0.7 + 4.3 * rows, {"w_pad": 0.03, "h_pad": 0.03})
     return figure, figure.subplots(rows, 2, squeeze=False)
 
 
@@ -111,7 +96,7 @@ def _labels(axes: Axes, title: str, last: bool) -> None:
         axes.set_xlabel("column [px]")
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
-    axes.tick_params(length=2.5, color=INK)
+    axes.tick_params(length=2.5, color=svg.INK)
 
 
 def _bar(figure: Figure, shown: Any, grid: Any, label: str) -> None:
@@ -141,13 +126,13 @@ def changes_svg(lines: Sequence[Line]) -> str:
     Args:
         lines: of every change.
     """
-    with look("measured-series"):
+    with svg.look("measured-series"):
         size, unit = time_unit(lines[0].marks[0])
         cameras = list(dict.fromkeys(line.camera for line in lines if line.camera))
         own = {camera: [line for line in lines if line.camera == camera] for camera in cameras}
         shared = [line for line in lines if not line.camera]
         rows = max(map(len, own.values())) + len(shared)
-        figure = new_figure(0.7 + 1.5 * rows)
+        figure = svg.new_figure(0.7 + 1.5 * rows)
         grid = figure.add_gridspec(rows, len(cameras))
         for column, camera in enumerate(cameras):
             for row, line in enumerate(own[camera]):
@@ -165,22 +150,30 @@ def changes_svg(lines: Sequence[Line]) -> str:
             axes.set_ylabel(line.name)
             axes.set_title("Angle between the cameras", loc="left", fontweight="bold")
             axes.set_xlabel(f"time [{unit}]")
-        shared_legend(figure, figure.axes[0])
+        svg.shared_legend(figure, figure.axes[0])
         figure.align_ylabels()
-        return to_svg(figure)
+        return svg.to_svg(figure)
 
 
 def _change(axes: Axes, line: Line, size: float) -> None:
-    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.axhline(0.0, color=svg.LIGHT, lw=0.8, zorder=0)
     if line.band is not None:
         time, value, sigma = line.band
         for times, alpha in ((2.0, 0.25), (1.0, 0.45)):
             low, high = value - times * sigma, value + times * sigma
             label = f"{'2' if times > 1.0 else ''}σ, smoothed"
-            axes.fill_between(time / size, low, high, color=SKY, alpha=alpha, lw=0, label=label)
-        axes.plot(time / size, value, color=BLUE, lw=1.0, label="smoothed")
+            axes.fill_between(time / size, low, high, color=svg.SKY, alpha=alpha, lw=0, label=label)
+        axes.plot(time / size, value, color=svg.BLUE, lw=1.0, label="smoothed")
     time, value, sigma = line.marks
     axes.errorbar(
-        time / size, value, sigma, fmt="o", color=INK, ms=3.0, elinewidth=0.8, capsize=2, label="each time by itself"
+        time / size,
+        value,
+        sigma,
+        fmt="o",
+        color=svg.INK,
+        ms=3.0,
+        elinewidth=0.8,
+        capsize=2,
+        label="each time by itself",
     )
-    gridded(axes, "y")
+    svg.gridded(axes, "y")

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
+from analysis.monitor import parameters
 from analysis.monitor.disturbances import FALSE_ALARM
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.course import moment
 from twin.main_job.assumptions import NOISE, assumed, contradicted, course_agrees, limits, share_text
-from twin.main_job.monitor_reading import MonitorReading, stated
-from twin.main_job.report_labels import ANGLE, CENTROID_NOTES, GROUND, PARAMETERS, Parameter
+from twin.main_job.monitor_reading import CENTROID_NOTES, stated
 from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
@@ -22,59 +21,6 @@ from twin.run.report import Report, Section, one_sentence
 __all__ = ["KIND", "recover_numbers", "recover_report"]
 
 KIND = "recovered"
-
-
-@dataclass(frozen=True)
-class Read:
-    """One change as the judged estimator reads it, in the parameter's unit.
-
-    Attributes:
-        camera: whose; empty for the angle between the cameras and for errors on the ground.
-        parameter: which.
-        value: read.
-        sigma: total.
-        noise: of sigma what the noise of the images does.
-    """
-
-    camera: str
-    parameter: Parameter
-    value: float
-    sigma: float
-    noise: float
-
-    @property
-    def ratio(self) -> float:
-        """Value in sigmas."""
-        return self.value / self.sigma if self.sigma > 0.0 else 0.0
-
-    @property
-    def name(self) -> str:
-        """``Δα of forward``."""
-        if self.parameter in GROUND:
-            return f"{self.parameter.symbol} on the ground"
-        return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
-
-    @property
-    def text(self) -> str:
-        """Value, sigma and unit."""
-        places = decimals_for(self.sigma)
-        return f"{fixed(self.value, places)} ± {fixed(self.sigma, places)} {self.parameter.unit}"
-
-
-def _reads(reading: MonitorReading, estimator: str) -> Iterator[Read]:
-    found = reading.recovered_dict()
-    for camera, estimators in found["cameras"].items():
-        for p in PARAMETERS:
-            yield _read(camera, p, estimators[estimator])
-    if "intersection_angle" in found:
-        yield _read("", ANGLE, found["intersection_angle"][estimator])
-    if "ground" in found:
-        for p in GROUND:
-            yield _read("", p, found["ground"][estimator])
-
-
-def _read(camera: str, p: Parameter, found: Mapping[str, float]) -> Read:
-    return Read(camera, p, found[p.key], found[f"{p.key}_sigma"], found[f"{p.key}_sigma_noise"])
 
 
 def recover_numbers(run: RecoverRun) -> dict[str, Any]:
@@ -96,7 +42,7 @@ def recover_numbers(run: RecoverRun) -> dict[str, Any]:
         out["series"] = [stated(reading.recovered_dict()) for reading in run.readings]
     if run.smoothed is not None:
         between = run.smoothed.between_dict()
-        out["smoothed"] = {**run.smoothed.at_dict(), "disturbances": run.smoothed.to_dict(), "between": between}
+        out["smoothed"] = {**run.smoothed.changes.groups(), "disturbances": run.smoothed.to_dict(), "between": between}
     return out
 
 
@@ -132,31 +78,31 @@ def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
 
 def _verdict(run: RecoverRun) -> str:
     reading = run.last
-    found = list(_reads(reading, reading.judged))
+    found = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
-    out = [one for one in found if abs(one.ratio) > FAR]
+    out = [one for one in found if abs(one.size) > FAR]
     when = f" at {moment(run.times[-1])}, the last of {len(run.times)} times" if run.times else ""
     basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
     if out:
-        clearest = max(out, key=lambda one: abs(one.ratio))
+        clearest = max(out, key=lambda one: abs(one.size))
         stand = "stands" if len(out) == 1 else "stand"
         first = (
             f"{len(out)} of {len(found)} changes that the {title} reads{when} {stand} out of {FAR:g} σ (σ: {basis}), "
-            f"the clearest is {clearest.name}, {clearest.text}"
+            f"the clearest is {clearest.name}, {clearest.read}"
         )
     else:
         parts = []
-        for p in PARAMETERS:
+        for p in parameters.CAMERA_PARAMETERS:
             worst = max((one for one in found if one.parameter == p), key=lambda one: one.sigma)
             parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
         first = (
             f"No change is seen{when}: none of the {len(found)} that the {title} reads stands out of {FAR:g} σ (σ: "
             f"{basis}), which hides changes below {', '.join(parts)}"
         )
-    about = next((one for one in found if one.parameter == ANGLE), max(found, key=lambda one: abs(one.ratio)))
+    about = next((one for one in found if one.group == ANGLE_GROUP), max(found, key=lambda one: abs(one.size)))
     limit = ""
     if reading.disturbances is not None:
-        body, share = limits(reading, about.camera, about.parameter)
+        body, share = limits(reading, about)
         what = body if body == NOISE else f"motions of {body}"
         size = f"{significant(about.sigma, 2)} {about.parameter.unit}"
         limit = f"σ of {about.name}, {size}, is limited by {what} ({share_text(share)} of its variance)"
@@ -230,17 +176,13 @@ def _frames_text(run: RecoverRun) -> str:
 def _summary(run: RecoverRun) -> Table:
     """What every estimator reads, with sigma of the judged one."""
     reading = run.last
-    names = list(reading.estimators)
-    every = {name: list(_reads(reading, name)) for name in names}
-    heads = ["camera", "change", *(reading.estimators[name].title for name in names), "σ", "σ of noise", "in σ"]
+    heads = ["camera", "change", *(one.title for one in reading.estimators.values()), "σ", "σ of noise", "in σ"]
     rows: list[list[Cell]] = []
-    for k, own in enumerate(every[reading.judged]):
-        group = own.camera or ("ground" if own.parameter in GROUND else "both")
-        places = decimals_for(own.sigma, 3)
-        values = [fixed(every[name][k].value, places) for name in names]
+    for same in reading.table.by_change():
+        own = next(row for row in same if row.estimator == reading.judged)
+        values = [fixed(row.value, decimals_for(own.sigma, 3)) for row in same]
         sigmas = [significant(own.sigma, 3, floor=0.0), significant(own.noise, 3, floor=0.0)]
-        label = f"{own.parameter.symbol} [{own.parameter.unit}]"
-        rows.append([group, label, *values, *sigmas, fixed(own.ratio, 1, sign=True)])
+        rows.append([own.where, own.parameter.label, *values, *sigmas, fixed(own.size, 1, sign=True)])
     at = f" at {moment(run.times[-1])}" if run.times else ""
     title = f"{_name(run)}: recovered from measured frames{at}"
     caption = f"σ and the last column are those of the {reading.estimators[reading.judged].title}."
@@ -310,9 +252,8 @@ def _estimators(run: RecoverRun) -> Section:
     heads = ["camera", "change", "unit"]
     for estimator in reading.estimators.values():
         heads += [estimator.title, f"{estimator.title} σ", f"{estimator.title} σ of noise"]
-    every = [list(_reads(reading, name)) for name in reading.estimators]
     rows: list[list[Cell]] = []
-    for same in zip(*every, strict=True):
+    for same in reading.table.by_change():
         row: list[Cell] = [same[0].camera or "both", same[0].parameter.symbol, same[0].parameter.unit]
         for one in same:
             row += [one.value, one.sigma, one.noise]
@@ -329,7 +270,7 @@ def _series(run: RecoverRun) -> Section:
     rows: list[list[Cell]] = [
         [time, one.camera or "both", one.parameter.symbol, one.parameter.unit, one.value, one.sigma, one.noise]
         for time, reading in zip(run.times, run.readings, strict=True)
-        for one in _reads(reading, reading.judged)
+        for one in reading.table.of(reading.judged)
     ]
     judged = run.last.estimators[run.last.judged].title
     caption = f"Value: as the {judged} reads each time by itself, against the same frames before."
@@ -337,13 +278,12 @@ def _series(run: RecoverRun) -> Section:
     text: tuple[str, ...] = ()
     if together is not None:
         heads += ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
-        every = together.at_dict()
-        reads = list(_reads(run.last, run.last.judged))
+        reads = run.last.table.of(run.last.judged)
         for number, row in enumerate(rows):
             k, one = divmod(number, len(reads))
             for estimator in ("filtered", "smoothed"):
-                found = _of_course(every, reads[one], estimator)
-                row += [found[reads[one].parameter.key][k], found[f"{reads[one].parameter.key}_sigma"][k]]
+                found = together.changes.row(reads[one].group, reads[one].parameter.key, estimator)
+                row += [float(found.value[k]), float(found.sigma[k])]
         caption += " Filtered: from all times up to it; smoothed: from all times."
         legend += (
             f" Line and bands: from all times together (smoothed), by how the disturbances {together.name} go on in "
@@ -354,37 +294,22 @@ def _series(run: RecoverRun) -> Section:
     return Section("Series", text, (figure, Table("times", "Every time", caption, heads, rows)), 1)
 
 
-def _of_course(changes: Mapping[str, Any], one: Read, estimator: str) -> Mapping[str, list[float]]:
-    """A group of changes over the times of a course."""
-    if one.camera:
-        return cast("Mapping[str, list[float]]", changes["cameras"][one.camera][estimator])
-    group = "ground" if one.parameter in GROUND else "intersection_angle"
-    return cast("Mapping[str, list[float]]", changes[group][estimator])
-
-
 def _drawn(run: RecoverRun) -> list[Line]:
     """What the figure of a series shows: changes of the cameras and of their angle."""
     assert run.times is not None
     out = []
-    every = [list(_reads(reading, reading.judged)) for reading in run.readings]
+    every = [reading.table.of(reading.judged) for reading in run.readings]
     for number, one in enumerate(every[-1]):
-        if one.parameter in GROUND:
+        if one.group == GROUND_GROUP:
             continue
-        key = one.parameter.key
         values, sigmas = ([getattr(reads[number], name) for reads in every] for name in ("value", "sigma"))
         band = None
         if run.smoothed is not None:
-            parts = (
-                (list(run.times), run.smoothed.at_dict()),
-                (run.smoothed.times.tolist(), run.smoothed.between_dict()),
-            )
-            found = [(times, _of_course(part, one, "smoothed")) for times, part in parts]
-            points = np.array(
-                [point for times, of in found for point in zip(times, of[key], of[f"{key}_sigma"], strict=True)]
-            )
+            parts = ((run.times, run.smoothed.changes), (run.smoothed.times, run.smoothed.between))
+            found = [(times, table.row(one.group, one.parameter.key, "smoothed")) for times, table in parts]
+            points = np.concatenate([np.stack([times, row.value, row.sigma], axis=1) for times, row in found])
             band = points[np.argsort(points[:, 0])].T
-        name = f"{one.parameter.symbol} [{one.parameter.unit}]"
-        out.append(Line(one.camera, name, np.array([run.times, values, sigmas]), band))
+        out.append(Line(one.camera, one.parameter.label, np.array([run.times, values, sigmas]), band))
     return out
 
 

@@ -29,7 +29,7 @@ from twin.main_job.monitor_reading import MonitorReading
 from twin.monitor.crosstalk import CameraCrosstalk, crosstalk
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import pieces
-from twin.monitor.smoothed_course import CourseSmoother, SmoothedCourse
+from twin.monitor.time_series import CourseSmoother, SmoothedCourse
 from twin.recover.channel_measurement import ChannelMeasurement, ChannelResult, SpotResult, remedy
 from twin.recover.measured_frames import (
     ChannelFrames,

@@ -101,10 +101,15 @@ class Quantity(Generic[S]):
         if self.record is None or found is None:
             return in_unit(found, self.unit) if self.converted else found
         if isinstance(found, Mapping):
-            return {name: self.record(one) for name, one in found.items()}
+            return _by_name(self.record, found)
         if isinstance(found, list | tuple):
             return [self.record(one) for one in found]
         return self.record(found)
+
+
+def _by_name(record: Record[Any], sources: Mapping[str, Any]) -> dict[str, Any]:
+    """A record of every source of a mapping; of one whose values are mappings, one level further down."""
+    return {k: _by_name(record, one) if isinstance(one, Mapping) else record(one) for k, one in sources.items()}
 
 
 class Record(Generic[S]):

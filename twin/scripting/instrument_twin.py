@@ -13,16 +13,17 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor import parameters
 from analysis.monitor.recovery import CENTROIDS, recover
-from optics.geometry.tree import State
+from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, NodeInfo, check_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
 from scenes.specs.load import load_camera as read_camera
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.main_job.monitor_reading import MonitorReading
@@ -30,9 +31,9 @@ from twin.main_job.render_job import render_job
 from twin.monitor.crosstalk import estimator_gains
 from twin.monitor.monitor_derivative import spot_jacobian
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.motions import ElementaryMotion
 from twin.monitor.truth import truth_jacobian
 from twin.run.reference_frames import frames_text
-from twin.scripting.motion_names import motion_named
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings
@@ -245,17 +246,18 @@ class InstrumentTwin:
         experiment = self._bench.experiment
         names = list(self.cameras)
         keys = [channel.key for channel in experiment.path.channels]
-        chosen = [motion_named(text, self._nodes) for text in motions]
+        chosen = [_motion_named(text, self._nodes) for text in motions]
         size = np.array([motion.unit_size for motion in chosen])
         spots = spot_jacobian(experiment.path, chosen)
         truth = truth_jacobian(experiment.instrument, self._bench.backend, chosen)
         gains = estimator_gains(experiment.cameras, experiment.disturbances)
         moved = spots.reshape(-1, len(chosen))
+        made_of = {name: parameters.rows_of(experiment.cameras[name]) for name in names}
         readings = [
-            [PER_SI[:, None] * (gain[4 * k : 4 * k + 4] @ moved) * size for gain in gains.values()]
-            for k in range(len(names))
+            [rows @ (gain[4 * k : 4 * k + 4] @ moved) * size for gain in gains.values()]
+            for k, rows in enumerate(made_of.values())
         ]
-        true = np.stack([PER_SI[:, None] * truth[name] * size for name in names])
+        true = np.stack([rows @ truth[name] * size for name, rows in made_of.items()])
         return xr.Dataset(
             {
                 "spots": (("channel", "axis", "motion"), spots * size, {"units": "px"}),
@@ -268,7 +270,7 @@ class InstrumentTwin:
                 "channel": keys,
                 "axis": ["row", "column"],
                 "camera": names,
-                "parameter": list(PARAMETERS),
+                "parameter": [one.key for one in parameters.CAMERA_PARAMETERS],
                 "estimator": list(gains),
             },
             attrs={"reference_frames": frames_text("crosstalk")},
@@ -371,3 +373,57 @@ def load_camera(what: str | Path, backend: str = "llvm") -> CameraView:
     from twin.camera.camera_view import CameraView
 
     return CameraView.alone(read_camera(what), load_backend(backend))
+
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+_FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; 'about PIVOT' may follow a turn or a scale"
+
+
+def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
+    """The elementary motion that a text names.
+
+    Args:
+        text: ``NODE shift x``, ``NODE rotate x``, ``NODE scale`` or ``NODE figure Z5``, then perhaps ``about PIVOT``.
+        nodes: path -> what may be done to it, for all bodies of the instrument.
+
+    Returns:
+        The motion, labelled with the text.
+
+    Raises:
+        InputError: not of this form, no such node or pivot, or a motion that the node does not have.
+    """
+    words = text.split()
+    pivot = ORIGIN
+    if len(words) > 2 and words[-2] == "about":
+        pivot, words = words[-1], words[:-2]
+    if len(words) < 2:
+        raise _wrong("not a motion of a node", text, _FORMS)
+    node, kind, *rest = words
+    if node not in nodes:
+        raise _wrong("no such node", node, names_text(sorted(nodes)), nearest(node, nodes))
+    info = nodes[node]
+    rigid = tuple(name for name in ("shift", "rotate", "scale", "figure") if name in info.allows)
+    if kind not in rigid:
+        raise _wrong(f"{node} cannot be differentiated by this", kind, names_text(rigid), nearest(kind, rigid))
+    known = tuple(dict.fromkeys((ORIGIN, *info.pivots)))
+    if pivot not in known:
+        raise _wrong(f"{node} has no such pivot", pivot, names_text(known), nearest(pivot, known))
+    return ElementaryMotion(node, kind, _axis(text, kind, rest), pivot, text)
+
+
+def _axis(text: str, kind: str, rest: list[str]) -> int:
+    if kind == "scale" and not rest:
+        return 0
+    if len(rest) == 1:
+        if kind == "figure":
+            try:
+                return noll(rest[0])
+            except Problem as problem:
+                raise InputError(Issue(problem.problem, found=problem.found, allowed=problem.allowed)) from None
+        if kind in ("shift", "rotate") and rest[0].lower() in _AXES:
+            return _AXES[rest[0].lower()]
+    raise _wrong("not a motion of a node", text, _FORMS)
+
+
+def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:
+    return InputError(Issue(problem, found=repr(found), allowed=allowed, suggestion=suggestion))

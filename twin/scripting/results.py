@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -13,9 +13,10 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from analysis.monitor import parameters
 from analysis.monitor.estimators import judged
-from analysis.monitor.ground_error import AXES
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.monitoring import CameraParameters
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.numerics.backend import Backend
 from twin.main_job.assumptions import contradicted
 from twin.main_job.monitor_reading import MonitorReading
@@ -26,9 +27,6 @@ from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
 from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import PlaceTargets
-
-ANGLE = "angle_change_arcsec"
-"""Name of the change of the angle between two cameras' lines of sight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +93,7 @@ class Shot:
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
         told = f"<p>{escape(self.verdict)}</p>"
-        return f"{told}{truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
+        return f"{told}{_truth_frame(self.truth).to_html()}{notes}{self.after._repr_html_()}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +162,14 @@ class Found:
         sigma, noise = self.sigma, self.sigma_noise
         rows = {}
         for camera in self.values.camera.values.tolist():
-            for key in PARAMETERS:
+            for key in self.values.parameter.values.tolist():
                 at = {"camera": camera, "parameter": key}
                 true = float(truth[key].sel(camera=camera))
                 rows[camera, key] = self._row(true, self.values.sel(at), sigma.sel(at), noise.sel(at))
-        pairs = [("both", ANGLE, self.angle, "change_arcsec")]
-        pairs += [("ground", f"ground_{axis}_m", self.ground, f"{axis}_m") for axis in AXES]
-        for where, key, found, name in pairs:
+        pairs = [("both", "angle", parameters.ANGLE, self.angle)]
+        pairs += [("ground", "ground", one, self.ground) for one in parameters.GROUND]
+        for where, start, one, found in pairs:
+            key, name = f"{start}_{one.key}", one.key
             if key in truth and found:
                 columns = (found[name], found[f"{name}_sigma"], found[f"{name}_sigma_noise"])
                 rows[where, key] = self._row(float(truth[key]), *columns)
@@ -187,11 +186,11 @@ class Found:
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<p>⚠ {escape(text)}</p>" for text in self.warnings)
-        return notes + reading_frame(self).to_html(escape=True)
+        return notes + _reading_frame(self).to_html(escape=True)
 
     def __repr__(self) -> str:
         notes = "".join(f"\nwarning: {text}" for text in self.warnings)
-        return reading_frame(self).to_string() + notes
+        return _reading_frame(self).to_string() + notes
 
 
 def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
@@ -203,7 +202,7 @@ def _edge_row(place: PlaceTargets, direction: str) -> dict[str, float]:
     return out
 
 
-def reading_frame(found: Found) -> pd.DataFrame:
+def _reading_frame(found: Found) -> pd.DataFrame:
     """Readings by camera and parameter, a column for each estimator, with the judged one's sigmas."""
     values = found.values.stack(row=("camera", "parameter")).transpose("row", "estimator").to_pandas()
     values.columns.name = None
@@ -212,9 +211,9 @@ def reading_frame(found: Found) -> pd.DataFrame:
     return values.assign(**{name: column.to_pandas() for name, column in own.items()})
 
 
-def truth_frame(truth: xr.Dataset) -> pd.DataFrame:
+def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     """True parameters, a row for each camera."""
-    return truth[list(PARAMETERS)].to_dataframe()
+    return truth[[one.key for one in parameters.CAMERA_PARAMETERS]].to_dataframe()
 
 
 def shot_of(run: RenderRun, backend: Backend, started: float) -> Shot:
@@ -253,10 +252,8 @@ def _truth(run: RenderRun) -> xr.Dataset:
     cameras = true["cameras"]
     keys = list(next(iter(cameras.values())))
     data: dict[str, Any] = {key: ("camera", [cameras[name][key] for name in cameras]) for key in keys}
-    if "intersection_angle" in true:
-        data[ANGLE] = true["intersection_angle"]["change_arcsec"]
-        data["angle_nominal_deg"] = true["intersection_angle"]["nominal_deg"]
-    data |= {f"ground_{key}": value for key, value in true.get("ground", {}).items()}
+    for start, group in (("angle", "intersection_angle"), ("ground", "ground")):
+        data |= {f"{start}_{key}": value for key, value in true.get(group, {}).items()}
     about = {"reference_frames": frames_text("truth")}
     return xr.Dataset(data, coords={"camera": list(cameras)}, attrs=about)
 
@@ -278,12 +275,9 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     if shares:
         from_statement.index = pd.MultiIndex.from_tuples(shares, names=["camera", "parameter"])
     estimators = list(recovery.parameters[cameras[0]])
-    parts = [[recovery.parameters[camera][name] for name in estimators] for camera in cameras]
-    values = [[np.asarray(p.vector)[0] * PER_SI for p in row] for row in parts]
-    per = np.outer(PER_SI, PER_SI)
-    total = [[np.asarray(p.error_covariance)[0] * per for p in row] for row in parts]
-    noise = [[np.asarray(p.covariance)[0] * per for p in row] for row in parts]
-    coords = {"camera": list(cameras), "estimator": estimators, "parameter": list(PARAMETERS)}
+    table, keys = reading.table, [one.key for one in parameters.CAMERA_PARAMETERS]
+    values = [[[table.row(camera, key, name).value for key in keys] for name in estimators] for camera in cameras]
+    coords = {"camera": list(cameras), "estimator": estimators, "parameter": keys}
     dims = ("camera", "estimator", "parameter")
     spots = {
         "before": recovery.before[0],
@@ -293,22 +287,28 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
     }
     about = {"reference_frames": frames_text("recovered")}
 
-    def spread(covariance: list[list[np.ndarray]]) -> xr.DataArray:
-        both = {**coords, "parameter_2": list(PARAMETERS)}
-        return xr.DataArray(np.array(covariance), dims=(*dims, "parameter_2"), coords=both)
+    def spread(of: Callable[[CameraParameters], np.ndarray]) -> xr.DataArray:
+        rows = {camera: parameters.rows_of(calibrated) for camera, calibrated in reading.cameras.items()}
+        found = [[made @ of(recovery.parameters[c][e])[0] @ made.T for e in estimators] for c, made in rows.items()]
+        both = {**coords, "parameter_2": keys}
+        return xr.DataArray(np.array(found), dims=(*dims, "parameter_2"), coords=both)
 
-    def by_estimator(found: Mapping[str, Any], keys: Sequence[str]) -> xr.Dataset:
-        told = [found[name].to_dict() for name in estimators] if found else []
-        names = [f"{key}{ending}" for key in keys for ending in ("", "_sigma", "_sigma_noise")]
-        data = {name: ("estimator", [float(np.ravel(one[name])[0]) for one in told]) for name in names if told}
-        return xr.Dataset(data, coords={"estimator": estimators} if told else {}, attrs=about)
+    def by_estimator(group: str) -> xr.Dataset:
+        data: dict[str, list[float]] = {}
+        for row in table:
+            if row.group == group:
+                told = zip(("", "_sigma", "_sigma_noise"), (row.value, row.sigma, row.noise), strict=True)
+                for ending, number in told:
+                    data.setdefault(f"{row.parameter.key}{ending}", []).append(number)
+        variables = {name: ("estimator", numbers) for name, numbers in data.items()}
+        return xr.Dataset(variables, coords={"estimator": estimators} if data else {}, attrs=about)
 
     return Found(
         values=xr.DataArray(np.array(values), dims=dims, coords=coords, name="reading", attrs=about),
-        covariance=spread(total),
-        covariance_noise=spread(noise),
-        angle=by_estimator(recovery.angle, ("change_arcsec",)),
-        ground=by_estimator(recovery.ground, [f"{axis}_m" for axis in AXES]),
+        covariance=spread(lambda found: found.error_covariance),
+        covariance_noise=spread(lambda found: found.covariance),
+        angle=by_estimator(ANGLE_GROUP),
+        ground=by_estimator(GROUND_GROUP),
         spots=xr.Dataset(
             {name: (("channel", "axis"), value, {"units": "px"}) for name, value in spots.items()},
             coords={"channel": list(channels), "axis": ["row", "column"]},

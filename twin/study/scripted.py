@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import xarray as xr
 
-from analysis.monitor.monitoring import PARAMETERS
+from analysis.monitor import parameters
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
@@ -145,7 +145,7 @@ def _responses(resolved: ResolvedJob) -> Tree:
     out: Tree = {}
     own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:
-        for key in PARAMETERS:
+        for key in (one.key for one in parameters.CAMERA_PARAMETERS):
             short = key.rpartition("_")[0]
             read = ["recovered", "cameras", camera, own, key]
             out[f"{camera}_{short}"] = _with_sigmas(read)

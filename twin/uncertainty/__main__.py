@@ -18,7 +18,7 @@ from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
-MOST_STATES = 100_000
+_MOST_STATES = 100_000
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -43,7 +43,7 @@ def main(
     states: Annotated[
         int,
         typer.Option(
-            "--states", min=0, max=MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
+            "--states", min=0, max=_MOST_STATES, help="Random states to render and recover: do the sigmas hold?"
         ),
     ] = 0,
     out: Out = None,
@@ -79,9 +79,9 @@ def main(
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
         from twin.run.provenance import checks_in
+        from twin.uncertainty.coverage import run_uncertainty
         from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
         from twin.uncertainty.uncertainty_report import uncertainty_report
-        from twin.uncertainty.uncertainty_run import run_uncertainty
 
         run = run_uncertainty(resolved, session.backend, states, session.advance)
         numbers = uncertainty_numbers(run)

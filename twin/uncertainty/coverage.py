@@ -1,29 +1,34 @@
-"""Do the stated sigmas hold? Random states of the stated disturbances, rendered, exposed, recovered and compared with
-the truth.
+"""What the command `python -m twin.uncertainty` works out: what limits a monitor, and whether the stated sigmas hold in
+random states of the stated disturbances, which are rendered, exposed, recovered and compared with the truth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import gammaincinv, ndtr
 
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.estimators import Shifts, applicable
-from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP, Quantity
-from analysis.monitor.monitoring import PARAMETERS, PER_SI
+from analysis.monitor.limits import Quantity
 from analysis.monitor.recovery import Recovery
-from analysis.units import ARCSEC
+from optics.numerics.backend import Backend
 from optics.numerics.threads import cores
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.disturbances import state_of
+from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import InputError, Issue
+from twin.monitor.image_sampling import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe
-from twin.monitor.truth import Truth
+from twin.monitor.reading_table import reading_table
 from twin.run.procedure import Advance, silent
 from twin.run.random_streams import stream
+from twin.sensors.area_detector import coarse_warnings
+from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
 
 LEVELS = (0.68, 0.95)
 """Of the intervals whose coverage is counted."""
@@ -160,6 +165,7 @@ def run_states(
     def record(photons: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return _exposed(experiment, photons, frames, seed, numbers)
 
+    estimators = applicable(experiment.cameras, disturbances)
     # what cannot be measured is left out, and counted by the difference to what is drawn
     how = Observing(record, experiment.resolved.job.analysis.centroid, CHUNK, leave=lambda number, why: None)
     for first in range(0, count, CHUNK):
@@ -169,10 +175,12 @@ def run_states(
         kept = np.flatnonzero(np.all(np.abs(place) <= half, axis=(0, 2)))
         # streams of its own for each state, whichever others were lost
         for found in observe(experiment, [states[k] for k in kept], how, first + kept):
-            true.append(_true(found.truth, experiment, quantities))
-            for name, values, sigmas in _read(found.recovery, quantities):
-                read.setdefault(name, []).append(values)
-                sigma.setdefault(name, []).append(sigmas)
+            table = reading_table(found.recovery, experiment.cameras, found.truth, experiment.ground)
+            for name in estimators:
+                own = [table.row(one.group, one.key, name) for one in quantities]
+                read.setdefault(name, []).append(np.stack([row.value for row in own], axis=1))
+                sigma.setdefault(name, []).append(np.stack([row.sigma for row in own], axis=1))
+            true.append(np.stack([row.true for row in own], axis=1))
             for name, chance in _chances(found.recovery, experiment, quantities).items():
                 chances.setdefault(name, []).append(chance)
             for k in range(len(found.numbers)):
@@ -244,31 +252,68 @@ def _chances(found: Recovery, experiment: MonitorExperiment, quantities: tuple[Q
     return out
 
 
-def _true(truth: Truth, experiment: MonitorExperiment, quantities: tuple[Quantity, ...]) -> np.ndarray:
-    """(N, Q)."""
-    values: dict[tuple[str, str], np.ndarray] = {}
-    for name, change in truth.cameras.items():
-        rows = (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)
-        for key, unit, row in zip(PARAMETERS, PER_SI, rows, strict=True):
-            values[name, key] = unit * row
-    values[ANGLE_GROUP, "change_arcsec"] = truth.angle_change / ARCSEC
-    if experiment.ground is not None:
-        for key, row in zip(("along_m", "across_m", "height_m"), truth.ground_error(experiment.ground).T, strict=True):
-            values[GROUND_GROUP, key] = row
-    return np.stack([values[quantity.group, quantity.key] for quantity in quantities], axis=1)
+_SPREAD = "what is stated to move"
+"""A part of the work."""
 
 
-def _read(found: Recovery, quantities: tuple[Quantity, ...]) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Estimator, its readings and their total sigmas, (N, Q)."""
-    cameras = list(found.parameters)
-    for name in found.parameters[cameras[0]]:
-        groups = {camera: found.parameters[camera][name].to_dict() for camera in cameras}
-        if name in found.angle:
-            groups[ANGLE_GROUP] = found.angle[name].to_dict()
-        if name in found.ground:
-            groups[GROUND_GROUP] = found.ground[name].to_dict()
-        both = [
-            np.stack([np.asarray(groups[quantity.group][quantity.key + ending]) for quantity in quantities], axis=1)
-            for ending in ("", "_sigma")
-        ]
-        yield name, both[0], both[1]
+@dataclass(frozen=True, eq=False)
+class UncertaintyRun:
+    """What was found.
+
+    Attributes:
+        resolved: the job with everything it names.
+        limits: of its instrument under its disturbances.
+        seed: of the random states.
+        coverage: of the random states, None if none were asked for.
+        warnings: blurred cameras, coarse grey values, and stated motions that no spot sees.
+        images: what the checks of its images found.
+    """
+
+    resolved: ResolvedJob
+    limits: MonitorLimits
+    seed: int
+    coverage: Coverage | None = None
+    warnings: tuple[str, ...] = ()
+    images: ImageChecks = field(default_factory=ImageChecks)
+
+
+def run_uncertainty(
+    resolved: ResolvedJob, backend: Backend, states: int = 0, advance: Advance = silent
+) -> UncertaintyRun:
+    """Work out what limits the readings of a job's instrument; what the job does to it is not looked at.
+
+    Args:
+        resolved: the job, with its seed and its number of frames.
+        backend: where to trace.
+        states: how many random states are drawn, rendered and recovered.
+        advance: told what is being done.
+
+    Raises:
+        InputError: nothing is stated to move, or what is stated cannot be.
+    """
+    if resolved.disturbances is None:
+        raise InputError(
+            Issue(
+                "nothing is stated to move, so that nothing can be said but the noise",
+                allowed="`disturbances: NAME` in the job or the instrument, or --disturbances NAME",
+            )
+        )
+    advance(_SPREAD, 0, 1)
+    experiment = MonitorExperiment(resolved, backend)
+    noise = expected_covariance(experiment, resolved.frames)
+    limits = find_limits(experiment, noise, resolved.frames, second_monitor=True)
+    if limits is None:
+        raise InputError(
+            Issue(
+                "nothing that is stated to move changes a camera, so that there is nothing to be measured",
+                found=str(resolved.disturbances.name),
+                allowed="disturbances of cameras, their mirrors or focal planes",
+            )
+        )
+    advance(_SPREAD, 1, 1)
+    seed, coverage = resolved.job.render.seed, None
+    if states:
+        coverage = run_states(experiment, limits.quantities, states, resolved.frames, seed, advance)
+    hidden = unseen_texts(limits.stated, noise, limits.quantities, limits.gain)
+    given = (*blur_warnings(resolved, backend), *coarse_warnings(resolved))
+    return UncertaintyRun(resolved, limits, seed, coverage, (*given, *hidden), experiment.path.checked)

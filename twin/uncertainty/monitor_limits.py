@@ -1,8 +1,8 @@
-"""What limits the readings of an instrument under its stated disturbances, and what would help."""
+"""What limits the readings of an instrument under its stated disturbances, what would help, and how reports say it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,19 +10,22 @@ import numpy as np
 
 from analysis.monitor import limits
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails
+from analysis.monitor.limits import Elasticity, HeavyTail, LeastSeen, Quantity, Split, elasticities, heavy_tails, unseen
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.monitor.recovery import MeasuredSpots, joint, judged_spots
 from analysis.spots.likelihood import EDGE_PX
 from analysis.spots.spot_positions import SpotError, difference_covariance
 from analysis.units import ARCSEC
 from scenes.models.disturbances import state_of
 from scenes.models.instrument_model import MisplacedError
+from scenes.specs.instrument import BASE
 from scenes.yaml.errors import InputError
 from twin.monitor.crosstalk import estimator_gains
+from twin.monitor.monitor_derivative import disturbances_of
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import LOST, Observing, observe
-from twin.monitor.stated_disturbances import disturbances_of
 from twin.monitor.truth import half_fields
+from twin.run.artefact import shown_unit, significant
 
 BEST = "posterior"
 """The estimator of the least variance: what it leaves only another measurement takes away."""
@@ -32,8 +35,8 @@ FIELD = 0.1 * ARCSEC
 """Standard deviation with which a test field fixes a direction of a camera: a quarter of a metre on the ground from
 500 km, what control points of that accuracy give."""
 DAY = 86400.0
-MORE_FRAMES = 4
-UNMOVED = 1e-8
+_MORE_FRAMES = 4
+_UNMOVED = 1e-8
 """Standard deviation before any measurement, arcsec, um or m, up to which a quantity is taken as one that nothing
 stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
@@ -186,14 +189,14 @@ def find_limits(
         return None
     cameras = experiment.cameras
     before = np.sqrt(np.diag(stated.parameter_covariance))
-    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > UNMOVED)
+    found = tuple(q for q in limits.quantities(cameras, experiment.ground) if float(np.abs(q.row) @ before) > _UNMOVED)
     if not found:
         return None
     rows = np.stack([quantity.row for quantity in found])
     gains = estimator_gains(cameras, stated, noise)
     splits = {name: limits.split(rows, stated, noise, gain) for name, gain in gains.items()}
     remedies = [
-        Remedy("more_frames", f"{MORE_FRAMES} times the frames", _left(rows, stated, noise / MORE_FRAMES)),
+        Remedy("more_frames", f"{_MORE_FRAMES} times the frames", _left(rows, stated, noise / _MORE_FRAMES)),
         Remedy("no_noise", "images without noise", _left(rows, stated, 0.0 * noise)),
     ]
     fields = half_fields(experiment.instrument, experiment.nominal_truth.principal_distance)
@@ -250,3 +253,87 @@ def _outside(experiment: MonitorExperiment, stated: Disturbances, noise: np.ndar
     shifts = np.random.default_rng(1).standard_normal((_DRAWS, len(root))) @ root.T
     place = middle + shifts.reshape(_DRAWS, *middle.shape)
     return float(np.mean(np.any(np.abs(place) > half, axis=(1, 2))))
+
+
+def quantity_text(quantity: Quantity) -> str:
+    """With its unit: ``forward Δα [arcsec]``."""
+    return f"{short_text(quantity)} [{unit_text(quantity)}]"
+
+
+def short_text(quantity: Quantity) -> str:
+    """Without its unit: ``forward Δα``, ``intersection angle``, ``height``."""
+    name = quantity.parameter.symbol
+    if quantity.group == ANGLE_GROUP:
+        return "intersection angle"
+    if quantity.group == GROUND_GROUP:
+        return name if name == "height" else f"{name} the track"
+    return f"{quantity.group} {name}"
+
+
+def unit_text(quantity: Quantity) -> str:
+    """Its unit."""
+    return quantity.parameter.unit
+
+
+def unseen_texts(
+    stated: Disturbances, noise: np.ndarray, quantities: Sequence[Quantity], gain: np.ndarray
+) -> tuple[str, ...]:
+    """A warning for each stated body whose motions have next to no derivative in the spots and yet make sigma.
+
+    Args:
+        stated: what moves.
+        noise: (D, D) of the shifts, px^2.
+        quantities: Q of them.
+        gain: (4 K, D) of the estimator that is judged by.
+    """
+    rows = np.stack([quantity.row for quantity in quantities])
+    out = []
+    for body, shares in unseen(rows, stated, noise, gain).items():
+        worst = int(np.argmax(shares))
+        out.append(
+            f"{body}: its motions that are stated move no spot; {100.0 * float(shares[worst]):.0f} % of the variance "
+            f"of {short_text(quantities[worst])} are from the statement, not from the spots, and nothing that is "
+            "measured can contradict it"
+        )
+    return tuple(out)
+
+
+def body_text(body: str) -> str:
+    """A body, or a motion of it, without the base that all stand on."""
+    return body.removeprefix(f"{BASE}/")
+
+
+def part_of(body: str) -> str:
+    """What a body is, whichever camera's it is: ``M2``, ``prism_180``, ``camera``, ``central_prism``."""
+    below = body.split("/")[1:]
+    if not below:
+        return "base"
+    if len(below) == 1:
+        return below[0] if below[0] == "central_prism" else "camera"
+    return below[-1]
+
+
+def combination_text(limits: MonitorLimits, number: int, most: int = 4) -> str:
+    """The motions that hide best, in words.
+
+    Args:
+        limits: of an instrument.
+        number: of the quantity.
+        most: motions that are named.
+    """
+    seen, quantity, stated = limits.least_seen[number], limits.quantities[number], limits.stated
+    order = sorted(range(len(seen.amounts)), key=lambda k: -abs(seen.amounts[k]))[:most]
+    named = [
+        f"{body_text(stated.labels[k])} {significant(seen.amounts[k] * stated.sigmas[k], 2, sign=True)} "
+        f"{shown_unit(stated.units[k])}"
+        for k in order
+        if seen.amounts[k]
+    ]
+    change = f"{significant(seen.change, 2)} {unit_text(quantity)}"
+    return f"{', '.join(named)}: {change}, while no spot moves by more than {_moved(seen)}"
+
+
+def _moved(seen: LeastSeen) -> str:
+    """How far spots move with a combination, beside their noise."""
+    moved, noise = float(abs(seen.spots).max()), float(seen.noise.max())
+    return f"{moved:.1g} px (noise {noise:.1g} px)"

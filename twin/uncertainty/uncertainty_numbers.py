@@ -2,249 +2,231 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
-from analysis.monitor.limits import Quantity
-from twin.run.plain_data import plain_data
-from twin.uncertainty.coverage import FALSE, LEVELS, Coverage
-from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits
-from twin.uncertainty.uncertainty_run import UncertaintyRun
+from analysis.monitor import limits
+from analysis.monitor.limits import Elasticity
+from twin.run.quantity import Quantity, Record
+from twin.uncertainty.coverage import FALSE, Coverage, UncertaintyRun
+from twin.uncertainty.monitor_limits import BEST, LINES, MonitorLimits, Remedy
 
-ByQuantity = Mapping[str, Mapping[str, Any]]
 SEEN = 8
 """Motions that are named of a combination."""
 
 
-@dataclass(frozen=True)
-class ShareNumbers:
-    """A motion's share of a variance."""
+@dataclass(frozen=True, eq=False)
+class _Limited:
+    """One quantity of an instrument: before the measurement, or as an estimator leaves it."""
 
-    motion: str
-    share: float
+    limits: MonitorLimits
+    q: int
+    estimator: str = ""
 
+    @property
+    def lines(self) -> list[tuple[str, float]]:
+        return self.limits.lines(self.estimator, self.q)
 
-@dataclass(frozen=True)
-class AmountNumbers:
-    """A motion's part of a combination, in its unit."""
+    @property
+    def sigma(self) -> float:
+        split = self.limits.splits[self.estimator or BEST]
+        return float((split.sigma if self.estimator else split.sigma_before)[self.q])
 
-    motion: str
-    amount: float
-    unit: str
+    @property
+    def noise(self) -> float:
+        return float(self.limits.splits[self.estimator].noise[self.q]) / self.sigma**2 if self.estimator else 0.0
 
+    @property
+    def after(self) -> dict[str, _Limited]:
+        return {name: _Limited(self.limits, self.q, name) for name in self.limits.splits}
 
-@dataclass(frozen=True)
-class SplitNumbers:
-    """A variance by motions, the largest first; ``rest`` of all that are not named, ``noise`` of the images.
+    @property
+    def known(self) -> dict[str, float]:
+        return {name: float(self.limits.known[name][self.q]) for name, _ in self.after[BEST].lines[:LINES]}
 
-    All are shares of ``sigma``'s square; those of motions that go together may be negative.
-    """
+    @property
+    def motions(self) -> list[tuple[str, float, str]]:
+        """Label, amount and unit of the motions that hide best."""
+        amounts, stated = self.limits.least_seen[self.q].amounts, self.limits.stated
+        order = np.argsort(-np.abs(amounts), kind="stable")[:SEEN]
+        return [(stated.labels[k], float(amounts[k] * stated.sigmas[k]), stated.units[k]) for k in order]
 
-    sigma: float
-    lines: tuple[ShareNumbers, ...]
-    rest: float
-    noise: float
+    def held(self, level: int) -> float:
+        return float(self.limits.heavy_tail.held[level, self.q])
 
-    @classmethod
-    def of(cls, limits: MonitorLimits, estimator: str, q: int) -> SplitNumbers:
-        """Of one quantity; no estimator: before the measurement."""
-        lines = limits.lines(estimator, q)
-        split = limits.splits[estimator or BEST]
-        sigma = float((split.sigma if estimator else split.sigma_before)[q])
-        noise = float(split.noise[q]) / sigma**2 if estimator else 0.0
-        first = tuple(ShareNumbers(*line) for line in lines[:LINES])
-        return cls(sigma, first, float(sum(share for _, share in lines[LINES:])), noise)
-
-
-@dataclass(frozen=True)
-class SeenNumbers:
-    """Motions that change a quantity by ``change`` and hide from the spots: how far these move, and their noise."""
-
-    change: float
-    motions: tuple[AmountNumbers, ...]
-    spots_px: np.ndarray
-    spots_noise_px: np.ndarray
-
-    @classmethod
-    def of(cls, limits: MonitorLimits, q: int) -> SeenNumbers:
-        """Of one quantity."""
-        seen, stated = limits.least_seen[q], limits.stated
-        order = np.argsort(-np.abs(seen.amounts), kind="stable")[:SEEN]
-        motions = tuple(
-            AmountNumbers(stated.labels[k], float(seen.amounts[k] * stated.sigmas[k]), stated.units[k]) for k in order
-        )
-        return cls(seen.change, motions, seen.spots, seen.noise)
+    @property
+    def followed(self) -> list[tuple[Elasticity, int]]:
+        """The stated numbers that make most of the variance, with the quantity's number."""
+        found = sorted(self.limits.elasticities, key=lambda one: -float(one.elasticity[self.q]))[:LINES]
+        return [(one, self.q) for one in found]
 
 
-@dataclass(frozen=True)
-class ElasticityNumbers:
-    """How sigma of the posterior follows a stated number of some bodies: relative change per relative change, and sigma
-    if the number is twice as large, unknown to the estimator (``doubled``) and stated so (``doubled_stated``).
-    """
-
-    number: str
-    stated: float
-    unit: str
-    bodies: int
-    elasticity: float
-    doubled: float
-    doubled_stated: float
-
-
-@dataclass(frozen=True)
-class HeavyTailNumbers:
-    """What the posterior leaves if each stated number is the scale of Student's distribution: rms of the error, half
-    widths that hold 68.3, 95.4 and 99.7 % of the errors, and the chance of one beyond 3 sigma (0.0027 if normal).
-    """
-
-    degrees: float
-    rms: float
-    held_68: float
-    held_95: float
-    held_997: float
-    beyond_3_sigma: float
-
-
-@dataclass(frozen=True)
-class QuantityNumbers:
-    """What limits one quantity, in the unit that its key ends in; ``known``: what is left if that motion is known;
-    ``from_statement``: share of the posterior's variance that no spot constrains.
-    """
-
-    before: SplitNumbers
-    after: Mapping[str, SplitNumbers]
-    known: Mapping[str, float]
-    least_seen: SeenNumbers
-    from_statement: float
-    elasticities: tuple[ElasticityNumbers, ...]
-    student_t: HeavyTailNumbers
-
-    @classmethod
-    def of(cls, limits: MonitorLimits, q: int) -> QuantityNumbers:
-        """Of one quantity."""
-        after = {name: SplitNumbers.of(limits, name, q) for name in limits.splits}
-        known = {line.motion: float(limits.known[line.motion][q]) for line in after[BEST].lines}
-        seen, share, tail = SeenNumbers.of(limits, q), float(limits.from_statement[q]), limits.heavy_tail
-        one, two, three = (float(width) for width in tail.held[:, q])
-        heavy = HeavyTailNumbers(tail.degrees, float(tail.rms[q]), one, two, three, float(tail.beyond[q]))
-        return cls(SplitNumbers.of(limits, "", q), after, known, seen, share, _followed(limits, q), heavy)
-
-
-def _followed(limits: MonitorLimits, q: int) -> tuple[ElasticityNumbers, ...]:
-    """The stated numbers that make most of a quantity's variance."""
-    found = sorted(limits.elasticities, key=lambda one: -float(one.elasticity[q]))[:LINES]
-    return tuple(
-        ElasticityNumbers(
-            one.number,
-            one.size,
-            one.unit,
-            len(one.bodies),
-            float(one.elasticity[q]),
-            float(one.doubled[q]),
-            float(one.told[q]),
-        )
-        for one in found
-    )
-
-
-@dataclass(frozen=True)
-class RemedyNumbers:
-    """What a further measurement would leave of every quantity."""
-
-    what: str
-    left: ByQuantity
-
-
-@dataclass(frozen=True)
-class LimitsNumbers:
-    """uncertainty.json. ``outside``: chance that a spot leaves its CCD."""
-
-    name: str
-    disturbances: str
-    frames: int
-    outside: float
-    quantities: ByQuantity
-    remedies: Mapping[str, RemedyNumbers]
-
-    @classmethod
-    def of(cls, limits: MonitorLimits) -> LimitsNumbers:
-        """Of an instrument."""
-        found = [QuantityNumbers.of(limits, q) for q in range(len(limits.quantities))]
-        remedies = {r.name: RemedyNumbers(r.what, by_quantity(limits.quantities, r.sigma)) for r in limits.remedies}
-        return cls(
-            name=limits.instrument,
-            disturbances=limits.stated.name,
-            frames=limits.frames,
-            outside=limits.outside,
-            quantities=by_quantity(limits.quantities, found),
-            remedies=remedies,
-        )
+SHARE: Record[tuple[str, float]] = Record(
+    "Share of a motion in a variance; the shares of motions that go together may be negative.",
+    Quantity("motion", itemgetter(0), "label of the motion"),
+    Quantity("share", itemgetter(1), "its share of the variance"),
+)
+_SPLIT: Record[_Limited] = Record(
+    "A variance by motions.",
+    Quantity("sigma", lambda one: one.sigma, "standard deviation, whose square is shared out"),
+    Quantity("lines", lambda one: one.lines[:LINES], "motions with the largest shares, largest first", record=SHARE),
+    Quantity("rest", lambda one: float(sum(share for _, share in one.lines[LINES:])), "share of all other motions"),
+    Quantity("noise", lambda one: one.noise, "share of the noise of the images"),
+)
+_AMOUNT: Record[tuple[str, float, str]] = Record(
+    "A motion in a combination of motions.",
+    Quantity("motion", itemgetter(0), "label of the motion"),
+    Quantity("amount", itemgetter(1), "its amount in the combination"),
+    Quantity("unit", itemgetter(2), "unit of the amount"),
+)
+_SEEN_LEAST: Record[_Limited] = Record(
+    "Motions that change a quantity and that the spots see least.",
+    Quantity("change", lambda one: one.limits.least_seen[one.q].change, "change of the quantity by all of them"),
+    Quantity("motions", lambda one: one.motions, "the largest of them", record=_AMOUNT),
+    Quantity("spots_px", lambda one: one.limits.least_seen[one.q].spots, "how far they move the spots"),
+    Quantity("spots_noise_px", lambda one: one.limits.least_seen[one.q].noise, "standard deviation of their noise"),
+)
+_ELASTICITY: Record[tuple[Elasticity, int]] = Record(
+    "How the posterior's standard deviation follows a stated number.",
+    Quantity("number", lambda one: one[0].number, "name of the stated number"),
+    Quantity("stated", lambda one: one[0].size, "the number as it is stated"),
+    Quantity("unit", lambda one: one[0].unit, "unit of the number"),
+    Quantity("bodies", lambda one: len(one[0].bodies), "how many bodies it is stated for"),
+    Quantity("elasticity", lambda one: float(one[0].elasticity[one[1]]), "relative change per relative change"),
+    Quantity(
+        "doubled",
+        lambda one: float(one[0].doubled[one[1]]),
+        "standard deviation if the number is twice as large, unknown to the estimator",
+    ),
+    Quantity(
+        "doubled_stated",
+        lambda one: float(one[0].told[one[1]]),
+        "standard deviation if the number is twice as large and stated so",
+    ),
+)
+_HEAVY_TAIL: Record[_Limited] = Record(
+    "Errors of the posterior if each stated number is the scale of Student's distribution.",
+    Quantity("degrees", lambda one: one.limits.heavy_tail.degrees, "degrees of freedom of that distribution"),
+    Quantity("rms", lambda one: float(one.limits.heavy_tail.rms[one.q]), "root mean square of the error"),
+    Quantity("held_68", lambda one: one.held(0), "half width of the interval that holds 68.3 % of the errors"),
+    Quantity("held_95", lambda one: one.held(1), "half width of the interval that holds 95.4 % of the errors"),
+    Quantity("held_997", lambda one: one.held(2), "half width of the interval that holds 99.7 % of the errors"),
+    Quantity(
+        "beyond_3_sigma",
+        lambda one: float(one.limits.heavy_tail.beyond[one.q]),
+        "chance of an error beyond 3 sigma; 0.0027 of a normal error",
+    ),
+)
+_LIMITED: Record[_Limited] = Record(
+    "What limits one quantity, in the unit that its key ends in.",
+    Quantity("before", lambda one: one, "variance before the measurement", record=_SPLIT),
+    Quantity("after", lambda one: one.after, "variance that each estimator leaves", record=_SPLIT),
+    Quantity("known", lambda one: one.known, "standard deviation that is left if that motion is known"),
+    Quantity("least_seen", lambda one: one, "motions that hide from the spots", record=_SEEN_LEAST),
+    Quantity(
+        "from_statement",
+        lambda one: float(one.limits.from_statement[one.q]),
+        "share of the posterior's variance that no spot constrains",
+    ),
+    Quantity("elasticities", lambda one: one.followed, "stated numbers that make most of it", record=_ELASTICITY),
+    Quantity("student_t", lambda one: one, "what a statement with heavy tails leaves", record=_HEAVY_TAIL),
+)
+_REMEDY: Record[tuple[Remedy, Sequence[limits.Quantity]]] = Record(
+    "A further measurement.",
+    Quantity("what", lambda one: one[0].what, "the measurement in words"),
+    Quantity("left", lambda one: _by_quantity(one[1], one[0].sigma), "standard deviation that it leaves of a quantity"),
+)
+LIMITS: Record[MonitorLimits] = Record(
+    "uncertainty.json",
+    Quantity("name", lambda found: found.instrument, "the instrument"),
+    Quantity("disturbances", lambda found: found.stated.name, "what is stated to move"),
+    Quantity("frames", lambda found: found.frames, "frames of each state"),
+    Quantity("outside", lambda found: found.outside, "chance that a spot leaves its CCD"),
+    Quantity(
+        "quantities",
+        lambda found: _by_quantity(found.quantities, [_Limited(found, q) for q in range(len(found.quantities))]),
+        "what limits each quantity",
+        record=_LIMITED,
+    ),
+    Quantity(
+        "remedies",
+        lambda found: {one.name: (one, found.quantities) for one in found.remedies},
+        "what further measurements would leave",
+        record=_REMEDY,
+    ),
+)
 
 
-@dataclass(frozen=True)
-class CountNumbers:
-    """Of one quantity by one estimator: rms of the errors, of errors over sigma; share of intervals of 68 and 95 % that
-    hold the truth, the share that is expected, and the limits of it.
-    """
+@dataclass(frozen=True, eq=False)
+class _Counted:
+    """One quantity as an estimator reads it in random states."""
 
-    rms: float
-    rms_over_sigma: float
-    held_68: float
-    held_95: float
-    expected_68: float
-    expected_95: float
-    limits_68: tuple[float, float]
-    limits_95: tuple[float, float]
+    coverage: Coverage
+    q: int
+    estimator: str
 
+    def held(self, level: int) -> float:
+        return float(self.coverage.held(self.estimator, level)[self.q]) / self.coverage.measured
 
-@dataclass(frozen=True)
-class StatesNumbers:
-    """Random states. ``false_alarm``: of the limits of all coverages together; ``outliers``: what is beyond them."""
+    def limits(self, level: int) -> np.ndarray:
+        return self.coverage.limits(self.estimator, level)[:, self.q] / self.coverage.measured
 
-    drawn: int
-    measured: int
-    false_alarm: float
-    estimators: Mapping[str, ByQuantity]
-    outliers: tuple[Mapping[str, Any], ...]
-    chi_square_mean: float
-    alarms: int
-    alarms_limit: int
-    doubted: int
-
-    @classmethod
-    def of(cls, coverage: Coverage) -> StatesNumbers:
-        """Of a run."""
-        n = coverage.measured
-        estimators = {}
-        for name in coverage.errors:
-            levels = range(len(LEVELS))
-            parts = (
-                coverage.rms(name).tolist(),
-                coverage.ratio(name).tolist(),
-                *((coverage.held(name, k) / n).tolist() for k in levels),
-                *(coverage.expected[name][k].tolist() for k in levels),
-                *((coverage.limits(name, k).T / n).tolist() for k in levels),
-            )
-            counts = [CountNumbers(*row) for row in zip(*parts, strict=True)]
-            estimators[name] = by_quantity(coverage.quantities, counts)
-        keys = ("estimator", "group", "key", "level", "held")
-        return cls(
-            drawn=coverage.drawn,
-            measured=n,
-            false_alarm=FALSE,
-            estimators=estimators,
-            outliers=tuple(dict(zip(keys, row, strict=True)) for row in coverage.outliers),
-            chi_square_mean=float(np.mean(coverage.chi_square)),
-            alarms=coverage.alarms,
-            alarms_limit=coverage.alarm_limit,
-            doubted=coverage.doubted,
-        )
+    def expected(self, level: int) -> float:
+        return float(self.coverage.expected[self.estimator][level][self.q])
 
 
-def by_quantity(quantities: Sequence[Quantity], values: Sequence[Any] | np.ndarray) -> dict[str, dict[str, Any]]:
+COUNT: Record[_Counted] = Record(
+    "Errors of one quantity by one estimator in random states.",
+    Quantity("rms", lambda one: float(one.coverage.rms(one.estimator)[one.q]), "root mean square of the errors"),
+    Quantity(
+        "rms_over_sigma",
+        lambda one: float(one.coverage.ratio(one.estimator)[one.q]),
+        "root mean square of the errors over their sigmas",
+    ),
+    Quantity("held_68", lambda one: one.held(0), "share of the intervals of 68 % that hold the truth"),
+    Quantity("held_95", lambda one: one.held(1), "share of the intervals of 95 % that hold the truth"),
+    Quantity("expected_68", lambda one: one.expected(0), "share of the intervals of 68 % that should hold the truth"),
+    Quantity("expected_95", lambda one: one.expected(1), "share of the intervals of 95 % that should hold the truth"),
+    Quantity("limits_68", lambda one: one.limits(0), "limits of held_68 if every sigma is right"),
+    Quantity("limits_95", lambda one: one.limits(1), "limits of held_95 if every sigma is right"),
+)
+_OUTLIER: Record[tuple[str, str, str, float, int]] = Record(
+    "A count that is beyond its limits.",
+    Quantity("estimator", itemgetter(0), "who reads the quantity"),
+    Quantity("group", itemgetter(1), "group of the quantity"),
+    Quantity("key", itemgetter(2), "key of the quantity"),
+    Quantity("level", itemgetter(3), "share of the truths that the intervals should hold"),
+    Quantity("held", itemgetter(4), "how many intervals hold the truth"),
+)
+STATES: Record[Coverage] = Record(
+    "What random states gave.",
+    Quantity("drawn", lambda found: found.drawn, "states that were drawn"),
+    Quantity("measured", lambda found: found.measured, "states whose spots stay on their CCDs"),
+    Quantity("false_alarm", lambda found: FALSE, "chance that any count falls out of its limits"),
+    Quantity(
+        "estimators",
+        lambda found: {
+            name: _by_quantity(found.quantities, [_Counted(found, q, name) for q in range(len(found.quantities))])
+            for name in found.errors
+        },
+        "errors of each quantity by each estimator",
+        record=COUNT,
+    ),
+    Quantity("outliers", lambda found: found.outliers, "counts that are beyond their limits", record=_OUTLIER),
+    Quantity("chi_square_mean", lambda found: float(np.mean(found.chi_square)), "mean chi-square of the shifts"),
+    Quantity("alarms", lambda found: found.alarms, "states whose chi-square is beyond its limit"),
+    Quantity("alarms_limit", lambda found: found.alarm_limit, "largest number of alarms by chance"),
+    Quantity("doubted", lambda found: found.doubted, "states for which sigma does not hold by what is measured"),
+)
+
+
+def _by_quantity(
+    quantities: Sequence[limits.Quantity], values: Sequence[Any] | np.ndarray
+) -> dict[str, dict[str, Any]]:
     """Group -> key -> value.
 
     Args:
@@ -257,16 +239,13 @@ def by_quantity(quantities: Sequence[Quantity], values: Sequence[Any] | np.ndarr
     return out
 
 
-def limits_numbers(limits: MonitorLimits) -> dict[str, Any]:
-    """What limits an instrument, as plain data."""
-    out: dict[str, Any] = plain_data(LimitsNumbers.of(limits))
-    return out
-
-
 def uncertainty_numbers(run: UncertaintyRun) -> dict[str, Any]:
-    """uncertainty.json of the command: the same, and under ``states`` what random states gave."""
-    out = limits_numbers(run.limits)
-    out["warnings"] = list(run.warnings)
+    """Contents of uncertainty.json of the command: those of the main job's, and ``states``, what random states gave.
+
+    Args:
+        run: of the command.
+    """
+    out = {**LIMITS(run.limits), "warnings": list(run.warnings)}
     if run.coverage is not None:
-        out["states"] = {"seed": run.seed, **plain_data(StatesNumbers.of(run.coverage))}
+        out["states"] = {"seed": run.seed, **STATES(run.coverage)}
     return out

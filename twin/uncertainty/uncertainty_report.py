@@ -1,21 +1,36 @@
-"""The report of what limits a monitor's readings, and the section of it in the main job's report."""
+"""The report of what limits a monitor's readings with its figure, and the section of it in the main job's report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis.monitor.disturbances import FALSE_ALARM
-from analysis.monitor.limits import ANGLE_GROUP, GROUND_GROUP
+from analysis.monitor.limits import Split
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.units import ARCSEC
+from twin.run import svg
 from twin.run.artefact import Cell, SvgFigure, Table, shown_unit, significant
 from twin.run.report import Report, Section, one_sentence
-from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage
-from twin.uncertainty.monitor_limits import BEST, FIELD, LINES, MonitorLimits
-from twin.uncertainty.uncertainty_plot import limits_svg
-from twin.uncertainty.uncertainty_run import UncertaintyRun
-from twin.uncertainty.words import body_text, combination_text, quantity_text, short_text, unit_text
+from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage, UncertaintyRun
+from twin.uncertainty.monitor_limits import (
+    BEST,
+    FIELD,
+    LINES,
+    MonitorLimits,
+    body_text,
+    combination_text,
+    part_of,
+    quantity_text,
+    short_text,
+    unit_text,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FEW = 3
 """Motions that are named of each quantity where the rest of a report is about something else."""
@@ -45,7 +60,7 @@ def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int =
         f"Stated disturbances: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
         "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
         "of both cameras together.",
-        limits_svg(limits),
+        _limits_svg(limits),
     )
     text = [_verdict(limits)]
     if limits.outside > RARE:
@@ -92,7 +107,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
     )
 
 
-def headline(limits: MonitorLimits) -> int:
+def _headline(limits: MonitorLimits) -> int:
     """Number of the quantity that an answer begins with: height, else the angle, else the first parameter."""
     keys = [(q.group, q.key) for q in limits.quantities]
     for wanted in ((GROUND_GROUP, "height_m"), (ANGLE_GROUP, "change_arcsec")):
@@ -103,7 +118,7 @@ def headline(limits: MonitorLimits) -> int:
 
 def _verdict(limits: MonitorLimits) -> str:
     """What is left of the headline quantity, what makes it up and what would help most."""
-    q = headline(limits)
+    q = _headline(limits)
     quantity, split = limits.quantities[q], limits.splits[BEST]
     unit, name = unit_text(quantity), short_text(quantity)
     motion, share = limits.lines(BEST, q)[0]
@@ -234,8 +249,8 @@ def _statement(limits: MonitorLimits) -> Section:
         (None, None, 2, None, None, None, None, 2),
         3,
     )
-    most = max(limits.elasticities, key=lambda one: float(one.elasticity[headline(limits)]))
-    q = headline(limits)
+    most = max(limits.elasticities, key=lambda one: float(one.elasticity[_headline(limits)]))
+    q = _headline(limits)
     unit = unit_text(limits.quantities[q])
     text = (
         f"The sigmas are as good as the stated numbers. The {short_text(limits.quantities[q])} follows "
@@ -322,3 +337,98 @@ def _states(coverage: Coverage) -> Section:
     places = (None, None, None, 3, 1, None, 1, None)
     table = Table("coverage", "Random states", caption, (*heads, "limits of these"), rows, places, 3)
     return Section("Do the sigmas hold?", tuple(text), (table,))
+
+
+PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, svg.YELLOW)
+"""Of the bodies that make up most; the others are grey."""
+MARKS = "os^vDP*X"
+
+
+def _limits_svg(limits: MonitorLimits) -> str:
+    """Left, of every quantity the standard deviations of all estimators over that before the measurement; right, the
+    variance that the posterior leaves by bodies.
+    """
+    with svg.look("limits"):
+        return svg.to_svg(_figure(limits))
+
+
+def _figure(limits: MonitorLimits) -> Figure:
+    count = len(limits.quantities)
+    figure = svg.new_figure(1.7 + 0.3 * count)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1.0, 1.15))
+    _reduced(left, limits)
+    _by_body(right, limits)
+    for axes in (left, right):
+        svg.plain_axes(axes)
+        groups = [quantity.group for quantity in limits.quantities]
+        for q in range(1, count):
+            if groups[q] != groups[q - 1]:
+                axes.axhline(q - 0.5, color=svg.LIGHT, lw=0.8, zorder=0)
+    left.set_yticks(range(count), [quantity_text(quantity) for quantity in limits.quantities])
+    left.set_ylim(count - 0.5, -0.5)
+    right.tick_params(left=False)
+    left.set_title("How much the measurement takes away")
+    right.set_title("Whose motions make up the rest")
+    svg.shared_legend(figure, left, "lower left", 3, columnspacing=1.2)
+    svg.shared_legend(figure, right, "lower right", 4, columnspacing=1.2)
+    return figure
+
+
+def _reduced(axes: Axes, limits: MonitorLimits) -> None:
+    """Ratios of standard deviations, with both in their units for the posterior."""
+    y = np.arange(len(limits.quantities))
+    before = limits.splits[BEST].sigma_before
+    for k, (name, split) in enumerate(limits.splits.items()):
+        best = name == BEST
+        axes.plot(
+            split.sigma / before,
+            y,
+            MARKS[k % len(MARKS)],
+            ms=6.5 if best else 4.5,
+            color=svg.VERMILION if best else svg.GREY,
+            mfc=svg.VERMILION if best else "none",
+            zorder=3 if best else 2,
+            label=name,
+        )
+    axes.axvline(1.0, color=svg.INK, lw=0.8, ls=":")
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, max(high, 1.2) * (max(high, 1.2) / low) ** 0.62)
+    for q, quantity in enumerate(limits.quantities):
+        ends = [significant(value, 2) for value in (before[q], limits.splits[BEST].sigma[q])]
+        text = f"{ends[0]} → {ends[1]} {unit_text(quantity)}"
+        axes.annotate(
+            text, (1.0, q), xycoords=("axes fraction", "data"), ha="right", va="center", fontsize=8, color=svg.INK
+        )
+    axes.set_xlabel("standard deviation after over before; numbers: before → after, posterior")
+
+
+def _by_body(axes: Axes, limits: MonitorLimits) -> None:
+    """Stacked shares of the posterior's variance, bodies of both cameras together; negative ones to the left."""
+    split = limits.splits[BEST]
+    total = split.sigma**2
+    parts = {
+        name: value / total
+        for name, value in Split.by(split.after, [part_of(body) for body in limits.stated.bodies]).items()
+    }
+    order = sorted(parts, key=lambda name: -float(np.sum(np.abs(parts[name]))))
+    named, others = order[: len(PALETTE)], order[len(PALETTE) :]
+    bars = [(name, parts[name], colour) for name, colour in zip(named, PALETTE, strict=False)]
+    if others:
+        bars.append(("other bodies", np.asarray(sum(parts[name] for name in others)), svg.GREY))
+    bars.append(("noise of the images", split.noise / total, svg.INK))
+    y = np.arange(len(total))
+    up, down = np.zeros(len(total)), np.zeros(len(total))
+    for name, share, colour in bars:
+        axes.barh(
+            y,
+            100.0 * share,
+            left=100.0 * np.where(share >= 0.0, up, down),
+            height=0.68,
+            color=colour,
+            label=name.replace("_", " "),
+        )
+        up, down = up + np.maximum(share, 0.0), down + np.minimum(share, 0.0)
+    axes.set_xlabel("share of the variance that the posterior leaves, %")
+    if np.any(down < -1e-3):
+        axes.axvline(0.0, color=svg.INK, lw=0.8)

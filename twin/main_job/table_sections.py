@@ -1,4 +1,4 @@
-"""The report's section on mirrors and faces that tables of displaced nodes deform: tables and maps."""
+"""The report's sections on bodies that tables of displaced nodes deform and that tables of temperatures warm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from analysis.units import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
-from twin.main_job.job_tables import faces_of
+from twin.main_job.job_tables import BENT, WARMED, faces_of, heated_of
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import Cell, SvgFigure, Table, plain
 from twin.run.report import Section
@@ -20,6 +20,14 @@ from twin.run.svg import look, new_figure, signed_map, to_svg
 NAMED = 1e-10
 """Terms smaller than this, metres rms, are left out of the report's table."""
 _PIXELS = 220
+_HEADS = (
+    *("body", "nodes", "spacing [mm]", "change [K]", "gradient x [K/m]", "gradient y [K/m]", "gradient z [K/m]"),
+    *("not linear [K rms]", "largest [K]", "nodes left out [K rms]", "outside [%]", "farthest [mm]"),
+)
+_FACES = (
+    *("face", "rotate x [arcsec]", "rotate y [arcsec]", "shift z [nm]", "figure [nm rms]"),
+    *("not carried [nm rms]", "coarser elements [nm rms]"),
+)
 
 
 def deformation_section(run: RenderRun) -> Section | None:
@@ -31,27 +39,24 @@ def deformation_section(run: RenderRun) -> Section | None:
         *("body", "nodes", "not used", "spacing [mm]", "rotate x [arcsec]", "rotate y [arcsec]", "rotate z [arcsec]"),
         *("shift x [µm]", "shift y [µm]", "shift z [µm]", "growth [ppm]"),
     )
+    found = {path: BENT(face) for path, face in faces.items()}
     rows: list[tuple[Cell, ...]] = [
         (
-            *(path, len(face.weight), face.others, 1e3 * face.spacing),
-            *(turn / ARCSEC for turn in face.rotate),
-            *(1e6 * move for move in face.shift),
-            1e6 * face.growth,
+            *(path, told["nodes"], told["nodes_not_used"], told["spacing_mm"]),
+            *(*told["rotate_arcsec"], *told["shift_um"], told["growth_ppm"]),
         )
-        for path, face in faces.items()
+        for path, told in found.items()
     ]
     parts = ("body", "change [nm rms]", "PV [nm]", "after Zernike [nm rms]", "PV [nm]", "after grid [nm rms]")
+    sizes = ("change_rms_nm", "change_pv_nm", "residual_rms_nm", "residual_pv_nm", "not_carried_rms_nm")
     left: list[tuple[Cell, ...]] = [
-        (
-            path,
-            *(1e9 * f(v) for v in (face.change, face.residual) for f in (face.rms, face.range)),
-            1e9 * face.rms(face.lost),
-            1e9 * face.between,
-        )
-        for path, face in faces.items()
+        (path, *(told[key] for key in (*sizes, "between_nodes_rms_nm"))) for path, told in found.items()
     ]
     terms = [
-        (path, f"Z{j}", 1e9 * a) for path, face in faces.items() for j, a in face.figure.items() if abs(a) >= NAMED
+        (path, term, size)
+        for path, told in found.items()
+        for term, size in told["figure_nm"].items()
+        if abs(size) >= 1e9 * NAMED
     ]
     about = (
         "Displacements of the nodes are taken apart, each part by what the one before leaves: the rigid motion and "
@@ -137,3 +142,56 @@ def _maps(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
         bar = figure.colorbar(picture, ax=one, shrink=0.8, pad=0.02)
         bar.ax.tick_params(labelsize=7)
     axes[0].set_ylabel("y, mm")
+
+
+def heat_section(run: RenderRun) -> Section | None:
+    """Numbers of all bodies that tables of temperatures warm; None where there are none."""
+    bodies = heated_of(run)
+    if not bodies:
+        return None
+    rows: list[tuple[Cell, ...]] = [
+        (
+            *(path, told["nodes"], told["spacing_mm"], told["linear_change_k"], *told["linear_gradient_k_per_m"]),
+            *(told["not_linear_rms_k"], told["not_linear_largest_k"], told["between_nodes_rms_k"]),
+            *(("", "") if body.coverage is None else (100.0 * told["outside_share"], told["farthest_mm"])),
+        )
+        for (path, body), told in zip(bodies.items(), map(WARMED, bodies.values()), strict=True)
+    ]
+    faces: list[tuple[Cell, ...]] = [
+        (
+            *(face, change.motion.rotate[0] / ARCSEC, change.motion.rotate[1] / ARCSEC, 1e9 * change.motion.shift[2]),
+            *(1e9 * change.figure_rms, 1e9 * change.lost, 1e9 * change.unmeshed),
+        )
+        for body in bodies.values()
+        for face, change in body.faces.items()
+    ]
+    tables = [
+        Table(
+            "temperature_tables",
+            "Temperatures, and what of them is linear",
+            "Changes from the instrument's temperature. Outside: share of the body's volume beyond the nodes; farthest "
+            "from any node. Nodes left out: how well every second one is foretold by the others.",
+            _HEADS,
+            rows,
+            (),
+            4,
+        )
+    ]
+    if faces:
+        tables.append(
+            Table(
+                "temperature_faces",
+                "What is not linear does to optical faces",
+                "In the face's own nominal axes. Coarser elements: by how much these would differ.",
+                _FACES,
+                faces,
+                (),
+                4,
+            )
+        )
+    about = (
+        "Temperatures are linear between the nodes. The linear field nearest to them over the body's volume acts like "
+        "every linear temperature: growth, bending, index, and what the body carries. The rest deforms the body's own "
+        "finite elements, held at three points."
+    )
+    return Section("Bodies warmed by tables", (about,), tuple(tables), 1)

@@ -1,0 +1,104 @@
+"""What a monitor reads of an instrument, declared once: the one place to which a further reading is added.
+
+Files, tables, figures, the terminal, scripts, studies and the live page take keys, symbols, meanings and digits from
+here (`twin.monitor.reading_table`), and budgets take the rows (`analysis.monitor.limits.quantities`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from analysis.monitor.calibration import CameraCalibration
+from analysis.units import ARCSEC, UM_PER_M
+
+__all__ = ["ANGLE", "ANGLE_GROUP", "CAMERA_PARAMETERS", "GROUND", "GROUND_GROUP", "Parameter", "rows_of"]
+
+Array = NDArray[np.float64]
+ANGLE_GROUP, GROUND_GROUP = "intersection_angle", "ground"
+"""Keys of files under which the readings of two cameras together stand; those of a camera stand under its name."""
+_PER_SI: Mapping[str, float] = MappingProxyType(
+    {"arcsec": 1 / ARCSEC, "m": 1.0, "mm": 1e3, "um": UM_PER_M, "nm": 1e9, "ppm": 1e6, "percent": 1e2}
+)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A change that is read and whose truth is traced.
+
+    Attributes:
+        key: its name in files, which ends in its unit.
+        symbol: its name in tables, figures and sentences.
+        meaning: what it is, with its sign.
+        decimals: that the terminal shows.
+        of: of a camera: what it is made of, (4,) SI units per rad and m of d_alpha, d_beta, d_gamma and d_f, given the
+            camera's calibration; None for a reading of two cameras together.
+    """
+
+    key: str
+    symbol: str
+    meaning: str
+    decimals: int
+    of: Callable[[CameraCalibration], ArrayLike] | None = None
+
+    @property
+    def file_unit(self) -> str:
+        """Unit as keys write it: ``um``."""
+        return self.key.rpartition("_")[2]
+
+    @property
+    def unit(self) -> str:
+        """Unit as readers see it: ``µm``."""
+        return self.file_unit.replace("um", "µm")
+
+    @property
+    def label(self) -> str:
+        """Head of its column: ``Δα [arcsec]``."""
+        return f"{self.symbol} [{self.unit}]"
+
+    @property
+    def per_si(self) -> float:
+        """How many of its unit make one SI unit."""
+        return _PER_SI[self.file_unit]
+
+
+CAMERA_PARAMETERS = (
+    Parameter(
+        "d_alpha_arcsec", "Δα", "turn of the camera about its Y, right-handed, perturbed minus nominal", 4,
+        lambda camera: (1.0, 0.0, 0.0, 0.0),
+    ),
+    Parameter(
+        "d_beta_arcsec", "Δβ", "turn of the camera about its X, right-handed, perturbed minus nominal", 4,
+        lambda camera: (0.0, 1.0, 0.0, 0.0),
+    ),
+    Parameter(
+        "d_gamma_arcsec", "Δγ", "turn of the camera about its Z, the line of sight, perturbed minus nominal", 3,
+        lambda camera: (0.0, 0.0, 1.0, 0.0),
+    ),
+    Parameter(
+        "d_f_um", "Δf", "change of the principal distance, in pixels of the line CCD, longer positive", 2,
+        lambda camera: (0.0, 0.0, 0.0, 1.0),
+    ),
+)  # fmt: skip
+"""What is read of every camera. The first four are what estimators estimate; a further one is a combination of them."""
+ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
+"""What is read of the angle between two cameras."""
+GROUND = (
+    Parameter("along_m", "along", "error on the ground along the track", 3),
+    Parameter("across_m", "across", "error on the ground across the track, to the right", 3),
+    Parameter("height_m", "height", "error in height, up", 3),
+)
+"""Errors of a pair's points on the ground that are located as if the cameras had not changed."""
+
+
+def rows_of(camera: CameraCalibration) -> Array:
+    """What the readings of a camera are made of, (P, 4): each in its unit per rad and m of the four parameters.
+
+    Args:
+        camera: its calibration.
+    """
+    return np.array([one.per_si * np.array(one.of(camera)) for one in CAMERA_PARAMETERS if one.of is not None])

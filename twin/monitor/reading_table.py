@@ -1,0 +1,278 @@
+"""The table of readings of one or several states: what every estimator reads of every change, its sigmas and the truth.
+
+The table is made once for a state or a course. JSON files, the terminal, reports, CSV tables, scripts, studies and the
+live page are views of it. What is read is declared in `analysis.monitor.parameters`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from analysis.monitor import parameters
+from analysis.monitor.calibration import CameraCalibration
+from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
+from analysis.monitor.recovery import Estimates, Recovery
+from analysis.units import ARCSEC
+from twin.monitor.truth import Truth
+from twin.run.artefact import FAR, SAME, decimals_for, fixed
+
+__all__ = ["Reading", "ReadingTable", "reading_table"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What one estimator reads of one change: a row of the table, in the parameter's unit.
+
+    Numbers are arrays over the states (S,), or floats of one state. Over a course as a whole they are root mean
+    squares.
+
+    Attributes:
+        group: the camera, or the group of what two cameras read together.
+        parameter: which change.
+        estimator: who reads it.
+        true: by the exact trace; NaN of a measurement.
+        value: what is read.
+        error: value minus true.
+        sigma: total standard deviation of the error.
+        noise: of it what the noise of the images does.
+    """
+
+    group: str
+    parameter: Parameter
+    estimator: str
+    true: Any
+    value: Any
+    error: Any
+    sigma: Any
+    noise: Any
+
+    @property
+    def camera(self) -> str:
+        """Whose change it is; empty for what two cameras read together."""
+        return "" if self.group in (ANGLE_GROUP, GROUND_GROUP) else self.group
+
+    @property
+    def where(self) -> str:
+        """The camera; ``both`` for the angle between two, ``ground`` for errors on the ground."""
+        return {ANGLE_GROUP: "both"}.get(self.group, self.group)
+
+    @property
+    def name(self) -> str:
+        """How sentences call it: ``Δα of forward``."""
+        if self.group == GROUND_GROUP:
+            return f"{self.parameter.symbol} on the ground"
+        return f"{self.parameter.symbol} of {self.camera}" if self.camera else self.parameter.symbol
+
+    @property
+    def ratio(self) -> float:
+        """Error in sigmas; without noise it is infinite unless it is rounding."""
+        if self.sigma > 0.0:
+            return float(self.error / self.sigma)
+        return 0.0 if abs(self.error) < SAME else math.copysign(math.inf, self.error)
+
+    @property
+    def size(self) -> float:
+        """Value in sigmas."""
+        return float(self.value / self.sigma) if self.sigma > 0.0 else 0.0
+
+    @property
+    def far(self) -> bool:
+        """Whether reports mark its error."""
+        return abs(self.ratio) > FAR
+
+    def shown(self, value: float, sign: bool = False) -> str:
+        """A number of this reading with the digits that its sigma deserves.
+
+        Args:
+            value: the number, in the parameter's unit.
+            sign: whether a plus is written.
+        """
+        return fixed(value, decimals_for(self.sigma), sign)
+
+    @property
+    def read(self) -> str:
+        """Value, sigma and unit."""
+        return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
+
+    def each(self, of: Callable[[Any], Any]) -> Reading:
+        """The same row with its numbers replaced.
+
+        Args:
+            of: array of a number over the states -> what takes its place.
+        """
+        numbers = {name: of(getattr(self, name)) for name in ("true", "value", "error", "sigma", "noise")}
+        return replace(self, **numbers)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingTable:
+    """All readings of S states.
+
+    Attributes:
+        rows: group by group, of each change by change, of each estimator by estimator.
+        left: estimator -> what correcting by its readings leaves on the ground, RMS over the line, (S,): further keys
+            of its group in files.
+    """
+
+    rows: tuple[Reading, ...]
+    left: Mapping[str, Mapping[str, Any]]
+
+    def __iter__(self) -> Iterator[Reading]:
+        """Its rows."""
+        return iter(self.rows)
+
+    def at(self, state: int) -> ReadingTable:
+        """The table of one state, whose numbers are floats.
+
+        Args:
+            state: its number.
+        """
+        left = {e: {key: float(value[state]) for key, value in own.items()} for e, own in self.left.items()}
+        return ReadingTable(tuple(row.each(lambda number: float(number[state])) for row in self.rows), left)
+
+    @property
+    def rms(self) -> ReadingTable:
+        """Root mean squares over the states, of cameras and their angle."""
+        rows = (row.each(lambda number: float(np.sqrt(np.mean(np.square(number))))) for row in self.rows)
+        return ReadingTable(tuple(row for row in rows if row.group != GROUND_GROUP), {})
+
+    def of(self, estimator: str) -> tuple[Reading, ...]:
+        """The rows of one estimator.
+
+        Args:
+            estimator: its name.
+        """
+        return tuple(row for row in self.rows if row.estimator == estimator)
+
+    def by_change(self) -> list[list[Reading]]:
+        """For each change the rows of all estimators."""
+        out: dict[tuple[str, str], list[Reading]] = {}
+        for row in self.rows:
+            out.setdefault((row.group, row.parameter.key), []).append(row)
+        return list(out.values())
+
+    def row(self, group: str, key: str, estimator: str) -> Reading:
+        """One row.
+
+        Args:
+            group: of the change.
+            key: of the change.
+            estimator: who reads it.
+        """
+        wanted = (group, key, estimator)
+        return next(row for row in self.rows if (row.group, row.parameter.key, row.estimator) == wanted)
+
+    def groups(self, truth: str = "") -> dict[str, Any]:
+        """The table as JSON files nest it: ``cameras`` by name, ``intersection_angle`` and ``ground``; in each the
+        estimators with their numbers.
+
+        Args:
+            truth: key under which the true changes stand beside the estimators; empty to leave them out.
+        """
+        out: dict[str, Any] = {"cameras": {}}
+        for row in self.rows:
+            key = row.parameter.key
+            group = out["cameras"].setdefault(row.camera, {}) if row.camera else out.setdefault(row.group, {})
+            if truth:
+                group.setdefault(truth, {}).setdefault(key, plain(row.true))
+            read = group.setdefault(row.estimator, {})
+            read |= {key: plain(row.value), f"{key}_sigma": plain(row.sigma), f"{key}_sigma_noise": plain(row.noise)}
+        for estimator, left in self.left.items():
+            out[GROUND_GROUP][estimator] |= {key: plain(value) for key, value in left.items()}
+        return out
+
+    def true(self) -> dict[str, Any]:
+        """The true changes as JSON files nest them: as `groups`, without estimators."""
+        found = self.groups("true")
+        cameras = {name: group["true"] for name, group in found.pop("cameras").items()}
+        return {"cameras": cameras, **{name: group["true"] for name, group in found.items()}}
+
+    @staticmethod
+    def joined(parts: Sequence[ReadingTable]) -> ReadingTable:
+        """One table of the states of several.
+
+        Args:
+            parts: with the same rows.
+        """
+        names = ("true", "value", "error", "sigma", "noise")
+        rows = tuple(
+            replace(same[0], **{name: np.concatenate([getattr(row, name) for row in same]) for name in names})
+            for same in zip(*(part.rows for part in parts), strict=True)
+        )
+        left = {
+            estimator: {key: np.concatenate([part.left[estimator][key] for part in parts]) for key in own}
+            for estimator, own in parts[0].left.items()
+        }
+        return ReadingTable(rows, left)
+
+
+def plain(number: Any) -> Any:
+    """A float or nested lists, as JSON holds them; a negative zero becomes a plain one."""
+    return (np.asarray(number) + 0.0).tolist()
+
+
+def reading_table(
+    found: Estimates | Recovery,
+    cameras: Mapping[str, CameraCalibration],
+    truth: Truth | None = None,
+    ground: GroundGeometry | None = None,
+) -> ReadingTable:
+    """The table of what was estimated.
+
+    Args:
+        found: by all estimators.
+        cameras: what is calibrated of each.
+        truth: of the same states; None of a measurement.
+        ground: how a pair of known altitude sees the ground, for the truth there.
+    """
+    rows: list[Reading] = []
+
+    def add(
+        group: str, which: Sequence[Parameter], true: np.ndarray | None, read: Mapping[str, Sequence[np.ndarray]]
+    ) -> None:
+        """Rows of numbers (S, P)."""
+        for k, parameter in enumerate(which):
+            for estimator, (values, sigmas, noises) in read.items():
+                value = values[:, k]
+                own = np.full_like(value, np.nan) if true is None else true[:, k]
+                rows.append(Reading(group, parameter, estimator, own, value, value - own, sigmas[:, k], noises[:, k]))
+
+    units = np.array([one.per_si for one in parameters.CAMERA_PARAMETERS])
+    for name, estimators in found.parameters.items():
+        made_of = parameters.rows_of(cameras[name]) / units[:, None]
+        told: dict[str, Sequence[np.ndarray]] = {
+            estimator: [
+                units * number
+                for number in (
+                    one.vector @ made_of.T,
+                    _sigma(made_of, one.error_covariance),
+                    _sigma(made_of, one.covariance),
+                )
+            ]
+            for estimator, one in estimators.items()
+        }
+        true = None if truth is None else units * (truth.vector(name) @ made_of.T)
+        add(name, parameters.CAMERA_PARAMETERS, true, told)
+    if found.angle:
+        told = {
+            e: tuple(v[:, None] / ARCSEC for v in (a.change_rad, a.sigma_rad, a.noise_rad))
+            for e, a in found.angle.items()
+        }
+        add(ANGLE_GROUP, (parameters.ANGLE,), None if truth is None else truth.angle_change[:, None] / ARCSEC, told)
+    if found.ground:
+        told = {e: (g.error_m, g.sigma_m, g.sigma_noise_m) for e, g in found.ground.items()}
+        error = None if truth is None or ground is None else truth.ground_error(ground)
+        add(GROUND_GROUP, parameters.GROUND, error, told)
+    left = {e: {"left_plan_rms_m": g.plan_rms_m, "left_height_rms_m": g.height_rms_m} for e, g in found.ground.items()}
+    return ReadingTable(tuple(rows), left)
+
+
+def _sigma(made_of: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(S, P) standard deviations of combinations (P, 4) of parameters with covariances (S, 4, 4)."""
+    return np.asarray(np.sqrt(np.einsum("pi,sij,pj->sp", made_of, covariance, made_of)))
