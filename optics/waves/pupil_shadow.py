@@ -27,11 +27,11 @@ from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 
 RIM_SIDES = 256
-"""Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it
-takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
+"""Sides of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of
+it takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
 
 FEW_SIDES = 64
-"""The same for many pupils at once: 16 times the errors."""
+"""Sides of that polygon for many pupils at once: 16 times the errors."""
 
 LARGEST = 0.5
 """Size of a piece, in radii of the pupil: a wavefront is continued from a piece to its box, the corners of which may
@@ -83,7 +83,7 @@ class PupilShadow:
 
     @property
     def area(self) -> np.ndarray:
-        """Of each pupil's shadow, (B,), in p."""
+        """Area of each pupil's shadow, (B,), in p."""
         return np.asarray(np.sum(area(self.pieces), axis=-1))
 
     @cached_property
@@ -124,7 +124,7 @@ class PupilShadow:
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
     def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
-        """The same as ``overlap``, part by part."""
+        """Quadrature as ``overlap`` gives it, part by part."""
         moves = np.stack([shift.real, shift.imag], axis=-1)
         full = area(self.pieces) > SMALLEST
         points, weights = self.whole(count)
@@ -192,21 +192,26 @@ class ShadowParts:
     weights: np.ndarray
 
 
-def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
+def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarray, list[int]]:
     """Pieces that do not overlap.
 
     Args:
         polygons: convex, counterclockwise, (B, V, 2) each.
+        fewest: take the largest polygons first and cut each other one along the sides that cut off most, which leaves
+            few pieces of polygons with many sides.
 
     Returns:
         Pieces (B, K, W, 2), and of which polygon each is; what several share belongs to the first.
     """
     done: list[np.ndarray] = []
     owners: list[int] = []
-    for number, polygon in enumerate(polygons):
-        parts = [polygon]
+    order = range(len(polygons))
+    if fewest:
+        order = sorted(order, key=lambda number: -float(np.mean(area(polygons[number]))))
+    for number in order:
+        parts = [polygons[number]]
         for before in done:
-            parts = [rest for part in parts for rest in _without(part, before)]
+            parts = [rest for part in parts for rest in _without(part, before, fewest)]
         done += parts
         owners += [number] * len(parts)
     width = max((part.shape[1] for part in done), default=3)
@@ -214,17 +219,25 @@ def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
     return pieces, owners
 
 
-def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
+def _without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
     """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils."""
     empty = area(before) < SMALLEST
     if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
         return [part]
     whole = np.where(empty[:, None, None], part, part[:, :1])  # an empty polygon has no sides that could bound it
-    return [piece for piece in (whole, *difference(part, before)) if np.any(area(piece) > SMALLEST)]
+    if fewest:
+        normal, limit = sides(before)
+        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
+        pieces = difference(part, before, np.argsort(off)[::-1])
+    else:
+        pieces = difference(part, before)
+    # of a polygon that is empty but for rounding the sides are there, and would leave the part a second time
+    pieces = [np.where(empty[:, None, None], piece[:, :1], piece) for piece in pieces]
+    return [piece for piece in (whole, *pieces) if np.any(area(piece) > SMALLEST)]
 
 
 def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
+    """Cut shadows (B, K, V, 2) into pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
     of the K each is, (L,).
     """
     owners = np.arange(pieces.shape[1])

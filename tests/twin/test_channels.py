@@ -12,10 +12,10 @@ from optics.numerics.backend import Backend
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
-from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from scenes.specs.resolved import resolve
 from tests.scenes import monitor_layouts
+from tests.twin.path_bench import IDEAL
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource

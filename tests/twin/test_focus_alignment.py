@@ -18,9 +18,9 @@ from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus
-from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
+from twin.laboratory.focus_run import SimulatedFocus, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
 from twin.run.procedure import BenchError, silent
 from twin.targets.target_images import TRACK
@@ -62,12 +62,12 @@ def bench(backend) -> FocusBench:
 
 
 @pytest.fixture(scope="module")
-def alignments(bench) -> dict[int, Alignment]:
+def alignments(bench) -> dict[int, SimulatedFocus]:
     return {seed: align(bench, seed) for seed in SEEDS}
 
 
 @pytest.fixture(scope="module")
-def coarse(bench) -> Alignment:
+def coarse(bench) -> SimulatedFocus:
     """The first seed with shims ground in steps of 50 um, and a second round."""
     mount = bench.setup.test.mount.model_copy(update={"step": 50e-6})
     return align(with_test(bench, mount=mount, rounds=2), SEEDS[0])
@@ -178,8 +178,6 @@ def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse
 def test_a_second_round_goes_on_from_the_first(coarse) -> None:
     assert len(coarse.states) == 3
     first, second = (s.plan for s in coarse.shimmings)
-    assert first.thickness is not None
-    assert second.thickness is not None
     np.testing.assert_allclose(second.thickness - second.rounded_change, first.thickness, rtol=0.0, atol=1e-12)
     # what is left to do is what rounding left, and what the first plane was wrong by
     wrong = np.sqrt(np.diag(first.change_covariance))

@@ -12,7 +12,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
@@ -66,7 +66,7 @@ def light_of(instrument, backend, state, field: float) -> np.ndarray:
     ways = [assemble(assembly, [f"{CAMERA}/{w}"], [state], placed=placed) for w in ("image_to_stop", "image_to_object")]
     pixel = points_to_world(placed, f"{ROOT}/focal_plane/line", place_of(instrument, field)).real
     guess = model.toward_optics(placed.rotation[:, placed.index[f"{ROOT}/focal_plane"]].real)
-    return -chief_directions(backend, *ways, pixel, guess[:, None], np.array([0.0, 1.0, 0.0]))[0, 0]
+    return -chief_rays(backend, *ways, pixel, guess[:, None], np.array([0.0, 1.0, 0.0]))[1][0, 0]
 
 
 def launched(instrument, backend, state, direction: np.ndarray) -> np.ndarray:

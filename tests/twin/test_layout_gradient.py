@@ -22,8 +22,7 @@ from scenes.models.monitor_layout import (
     start_beams,
 )
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
-from twin.design.layout_gradient import LayoutNumber, Slope, known_of, numbers_of, slope_of
-from twin.design.layout_refinement import refined
+from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
 

@@ -32,9 +32,9 @@ from twin.main_job.render_job import render_job
 from twin.orbit.monitoring.monitoring_flight import states_of
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import InstrumentTwin
-from twin.study.runs.config_tree import with_values
-from twin.study.runs.perturbed_job import read_job
+from twin.study.runs.base_job import with_values
 from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import read_job
 from twin.study.runs.setup import resolve_study
 
 ROOT = Path(__file__).resolve().parents[2]

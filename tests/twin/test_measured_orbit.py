@@ -29,9 +29,8 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
-from twin.orbit.angle.angle_export import angle_exported
 from twin.orbit.angle.angle_run import run_angle
-from twin.orbit.angle.measured_angle import run_measured_angle
+from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
@@ -695,7 +694,7 @@ def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
     """
     from scenes.specs.measured.orbit_data_setup import resolve_check
     from tests.twin.orbit_file_bench import aem, check_files, sp3
-    from twin.orbit.conventions.check_export import exported as check_exported
+    from twin.orbit.conventions.check_run import exported as check_exported
     from twin.orbit.conventions.check_run import run_check
 
     spec = check_files(tmp_path)

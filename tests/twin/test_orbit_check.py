@@ -164,7 +164,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     """
     from scenes.specs.load import SCENES
     from scenes.specs.measured.orbit_data_setup import resolve_check, resolve_measured_calibration
-    from twin.orbit.conventions.check_export import measurements
+    from twin.orbit.conventions.check_run import measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
     from twin.orbit.measured.clock import Readings
     from twin.orbit.measured.measurement_tables import read_measurements

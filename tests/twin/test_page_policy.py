@@ -42,7 +42,7 @@ def page_of(evil: str = "", figure: str = "") -> str:
     told = Report(
         f"Test {evil}", "One sentence.", (f"Lead {evil}",), ((f"Label {evil}", evil),), table, sections, {}, (evil,) * 3
     )
-    how = RunFacts(evil, f"{evil}.yaml", evil, 1, 0.0, 1.0, "twin.lab", f"focus {evil}")
+    how = RunFacts(evil, "twin.lab", 0.0, 1.0, evil, 1, f"focus {evil}")
     return render_report("focus", replace(told, verdict=f"Verdict {evil.replace('.', '')}."), how)
 
 

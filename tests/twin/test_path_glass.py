@@ -16,8 +16,8 @@ from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scene_surface import Finishes, solid_surfaces
 from scenes.models.scenery import Scenery
+from scenes.models.scenery_parts import Finishes, solid_surfaces
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism, screen, slab
 from twin.path_tracing.families import Event, decode, nominal_codes

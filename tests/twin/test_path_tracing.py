@@ -16,10 +16,10 @@ from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scene_surface import IDEAL, Detector, detector_surface
 from scenes.models.scenery import FACING_THE_LIGHT, Scenery, build_scenery
+from scenes.models.scenery_parts import Detector, detector_surface
 from tests.optics.bench import disk_points
-from tests.twin.path_bench import scene_beam
+from tests.twin.path_bench import IDEAL, scene_beam
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes, signature
 from twin.path_tracing.sinks import NOMINAL

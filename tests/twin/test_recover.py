@@ -13,7 +13,7 @@ from astropy.io import fits
 from PIL import Image
 from typer.testing import CliRunner
 
-from analysis.images.recording_time import recorded
+from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve

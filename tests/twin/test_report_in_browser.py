@@ -66,7 +66,7 @@ def page_of_a_test(tmp_path_factory) -> Path:
     told = Report(
         "Test of a test", "One of one is right.", ("More of it.",), facts, table, (section,), {}, ("Mind it.",)
     )
-    how = RunFacts("", "test.yaml", "llvm", 1, 0.0, 1.0, "twin.lab", "focus")
+    how = RunFacts("", "twin.lab", 0.0, 1.0, "llvm", 1, "focus")
     page = tmp_path_factory.mktemp("test") / "report.html"
     page.write_text(render_test_report("focus", told, how), encoding="utf-8")
     return page

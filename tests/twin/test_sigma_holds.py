@@ -21,7 +21,7 @@ from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_sampling import WRONG
 from twin.monitor.state_reading import StateReader
 from twin.scripting import instrument_twin
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 
 BLURRED = {"base/forward/M1": {"figure": {"Z7": "2 um"}}}
 TURNED = {"base/forward/focal_plane": {"rotate": "0 0 300 arcsec"}}

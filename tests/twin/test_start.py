@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.twin.study_bench import ROOT
-from twin.run.ending_signals import ending_later
+from twin.run.durable import ending_later
 from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}

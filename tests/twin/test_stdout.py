@@ -15,7 +15,7 @@ from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from tests.twin.study_bench import ROOT
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 
 FULL = "/dev/full"
 LIST = ("twin.validate", "--list")

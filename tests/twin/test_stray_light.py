@@ -12,8 +12,9 @@ from scipy.stats import chi2, norm, t
 from optics.geometry.tree import Motion
 from optics.materials.finish import MIRROR, Finish
 from optics.materials.scatter import total_scatter
-from scenes.models.scene_surface import Finishes
-from scenes.models.scenery import build_scenery, focal_plane_housing
+from scenes.models.scenery import build_scenery
+from scenes.models.scenery_parts import Finishes
+from tests.twin.path_bench import focal_plane_housing
 from twin.path_tracing.families import Event
 from twin.path_tracing.path_result import Family
 from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY

@@ -137,7 +137,7 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
     folder, path, numbers = done
     plan = Plan.of(resolve_study(path))
     fault = plan.setup.error("states too much", ("responses", "df", "sigma"), "the noise alone")
-    made = StudyRun(numbers, "Seen.", folder, plan, (), fault)
+    made = StudyRun(numbers, "Seen.", folder, fault)
     monkeypatch.setattr(command, "run_study", lambda *_: made)
     result = run(path, "--out", tmp_path / "run")
     assert (result.exit_code, "df" in result.stdout, "Seen." in result.stdout) == (2, True, True)

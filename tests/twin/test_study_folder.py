@@ -195,7 +195,7 @@ class Killed(BaseException):
 
 
 @pytest.mark.second
-@pytest.mark.parametrize("at", ["put_in_place", "remove_run"])
+@pytest.mark.parametrize("at", ["durable.put_in_place", "run_folder.remove_run"])
 def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> None:
     """Just before both change places, and just after: a whole study stands there, and --resume comes to the end."""
     path = finish(tmp_path / "run", setup, "old")
@@ -204,10 +204,10 @@ def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> No
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"twin.study.runs.study_folder.{at}", kill)
+        patch.setattr(f"twin.run.{at}", kill)
         with pytest.raises(Killed):
             finish(path, setup, "new", force=True)
-    assert is_whole(path, "old" if at == "put_in_place" else "new")
+    assert is_whole(path, "old" if at == "durable.put_in_place" else "new")
     finish(path, setup, "newer", resume=True)
     assert is_whole(path, "newer")
     assert [place.name for place in tmp_path.iterdir()] == ["run"]

@@ -10,7 +10,7 @@ from scipy.stats import kstest, norm, truncnorm
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import STUDY, write_study
 from twin.study.runs import setup
-from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.base_job import leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK
 from twin.study.runs.sampling import unit_cube

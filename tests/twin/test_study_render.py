@@ -13,12 +13,10 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_path import MonitorPath
-from twin.study.runs.base_job import Failure, Run
-from twin.study.runs.block_result import BlockResult
-from twin.study.runs.config_tree import leaf
+from twin.study.runs.base_job import BlockResult, Failure, Run, leaf
 from twin.study.runs.engine import check_responses
-from twin.study.runs.perturbed_job import JobMaker, quantity_at, read_job
 from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import JobMaker, quantity_at, read_job
 from twin.study.runs.setup import resolve_study
 
 

@@ -10,9 +10,9 @@ import pytest
 from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
 from twin.run.report import one_sentence
-from twin.study.report import study_sections
+from twin.study.report import study_plots
 from twin.study.report.study_report import report_files
-from twin.study.report.study_runs import StudyRuns
+from twin.study.report.study_statistics import StudyRuns
 
 TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
 
@@ -186,7 +186,7 @@ def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     x = columns(study)
     data = dataset(study, {"y": x["a"] + 0.1 * np.arange(9), "z": np.arange(9) ** 2.0})
     whole = report_files(data, study)
-    monkeypatch.setattr(study_sections, "histogram_figure", fail)
+    monkeypatch.setattr(study_plots, "histogram_figure", fail)
     made = report_files(data, study)
     told = "the figure 'Histograms' could not be drawn: no such font"
     assert made.undrawn == (told,)

@@ -13,12 +13,13 @@ from scenes.specs.study import ParetoSpec
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report.linear_model import linear_model
 from twin.study.report.sensitivity_indices import axis_functions, sensitivity_indices
-from twin.study.report.stated_noise import impossible, noise_share
-from twin.study.report.study_analysis import convergences, pareto_front, ranks_of
-from twin.study.report.study_report import summary
-from twin.study.report.study_runs import Factor, StudyRuns
+from twin.study.report.study_analysis import convergences, pareto_front, ranks_of, summary
 from twin.study.report.study_statistics import (
+    Factor,
+    StudyRuns,
     describe,
+    impossible,
+    noise_share,
     quantile_interval,
     runs_for_quantile,
     share_interval,

@@ -21,8 +21,8 @@ from optics.numerics.backend import load_backend
 from scenes.specs.resolved import resolve_distortion, resolve_focus
 from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.focus_alignment import align
 from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_run import align
 from twin.validation import registry
 from twin.validation.checks.check import FAILED
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks

@@ -12,7 +12,7 @@ from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
-from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
+from twin.camera.camera_run import CameraRun, refocus_text, verdict
 from twin.camera.first_order_data import FIRST_ORDER
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
@@ -196,14 +196,7 @@ def _spots(run: CameraRun) -> Section:
 
 def _mtf(run: CameraRun) -> Section:
     if not run.mtfs:
-        why = f"No MTF is told of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing."
-        if run.optics.model.edges:
-            why = (
-                f"No MTF is told of a camera with edges beside its stop ({', '.join(run.optics.model.edges)}): the "
-                "pupil that they cut is no smooth function. Wavefronts, spots and focus are of the light that they "
-                "leave."
-            )
-        return Section("MTF", (why,))
+        return Section("MTF", (f"No MTF is told {run.without_mtf}.",))
     rows: list[list[Cell]] = []
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)

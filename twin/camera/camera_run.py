@@ -11,6 +11,7 @@ import xarray as xr
 
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.waves.pupil_stack import RoughWavefrontError
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
@@ -76,6 +77,7 @@ class CameraRun:
         waves: wavefront errors at GRID.
         spots: spots at GRID.
         mtfs: MTF of the optics at MTF_FIELDS and the design wavelength; empty for a camera too blurred for it.
+        without_mtf: why there is none, empty where there is.
         field: fields of the map of wavefront errors, (A, B, 2).
         errors: rms wavefront error there, waves, (A, B).
         distortion: over the field and along the line.
@@ -92,6 +94,7 @@ class CameraRun:
     waves: tuple[Wavefront, ...]
     spots: tuple[Spot, ...]
     mtfs: tuple[Mtf, ...]
+    without_mtf: str
     field: np.ndarray
     errors: np.ndarray
     distortion: field_maps.Distortion
@@ -157,14 +160,18 @@ def run_camera(
     field = field_maps.field_grid(ERROR_GRID)
     errors = FieldBeams.field_errors(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5, optics.cut)
     errors = errors.reshape(field.shape[:2])
-    # a pupil that edges cut has no smooth function, so no MTF
-    sharp = float(errors.max()) < MOST_WAVES and not optics.model.edges
+    sharp, why = (
+        float(errors.max()) < MOST_WAVES,
+        f"of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing",
+    )
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
     advance("MTF", 0, 1)
     try:
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
+    except UnphysicalError as error:  # of a pupil that edges cut
+        mtfs, sharp, why = (), False, f"of this pupil: {error}"
     except RoughWavefrontError:  # a telescope that is not made for diffraction's limit: no smooth pupil, no MTF
         mtfs, sharp = (), False
     focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
@@ -178,6 +185,7 @@ def run_camera(
         waves=waves,
         spots=spots,
         mtfs=mtfs,
+        without_mtf="" if mtfs else why,
         field=field,
         errors=errors,
         distortion=field_maps.distortion(optics),

@@ -15,7 +15,7 @@ from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
-from twin.study.runs.config_tree import Tree, leaf, with_values
+from twin.study.runs.base_job import Tree, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 

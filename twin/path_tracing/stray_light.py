@@ -21,8 +21,8 @@ from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
 from optics.waves.diffraction import Grid, image
 from scenes.models.instrument_model import Instrument
-from scenes.models.scene_surface import Finishes
 from scenes.models.scenery import Scenery, build_scenery
+from scenes.models.scenery_parts import Finishes
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
 from twin.monitor.monitor_beams import Aimed
