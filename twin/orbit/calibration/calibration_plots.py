@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from analysis.orbit.three_line_model import BIAS, misclosure
 from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors
+from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.schemes import RMS, values_of
+from twin.orbit.calibration.schemes import RMS, FieldErrors, values_of
 from twin.run.svg import (
     BLUE,
     GREEN,
@@ -43,7 +43,7 @@ def expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) 
     spec = run.campaign.simulated
     square = sum(one.angles[0] ** 2 for name, one in spec.drift.items() if name != "nadir")
     metres = found.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
-    return np.asarray(np.hypot(found.at(0.0).without.together.height, factor * metres))
+    return np.asarray(np.hypot(found.at(0.0).without.together.height_rms, factor * metres))
 
 
 def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
@@ -59,13 +59,13 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
         cases.items(), ([s.without for s in found.sizes], monitored), strict=True
     ):
         if rows:
-            height = [row.together.height for row in rows]
+            height = [row.together.height_rms for row in rows]
             left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
     unit = "σ of Δα of an outer line [arcsec]" if found.angle else "size of the drift against the file's"
     left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
     names = list(found.sizes[0].without.schemes)
     here = found.at(1.0)
-    bars: list[tuple[str, str, list[PooledErrors]]] = [
+    bars: list[tuple[str, str, list[FieldErrors]]] = [
         ("no drift", GREY, list(found.at(0.0).without.schemes.values())),
         ("without monitor", VERMILION, list(here.without.schemes.values())),
     ]
@@ -74,7 +74,7 @@ def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
     place, width = np.arange(len(names)), 0.8 / len(bars)
     for k, (label, colour, values) in enumerate(bars):
         at = place + (k - 0.5 * (len(bars) - 1)) * width
-        right.bar(at, [v.height for v in values], 0.92 * width, color=colour, label=label)
+        right.bar(at, [v.height_rms for v in values], 0.92 * width, color=colour, label=label)
     title = "Without ground control, the file's drift"
     right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points [m]")
     right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.attitude_drift import DriftNumbers, drift_warnings
-from twin.orbit.calibration.calibration_numbers import unit
-from twin.orbit.calibration.calibration_run import CalibrationRun
+from twin.orbit.calibration.calibration_run import CalibrationRun, unit
 from twin.orbit.calibration.calibration_sections import (
     monitor_gain,
     rests_on_launch,
@@ -18,12 +16,10 @@ from twin.orbit.calibration.calibration_sections import (
     sections,
     strip_gain,
 )
-from twin.orbit.calibration.chip_steps import StepNumbers, step_warnings
-from twin.orbit.calibration.influences import SURPRISE
+from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
 from twin.orbit.calibration.measured_sections import measured_facts, measured_warnings
 from twin.orbit.calibration.observations import any_effect, light_effects
-from twin.orbit.calibration.scheme_numbers import meets, schemes_within
-from twin.orbit.calibration.schemes import values_of
+from twin.orbit.calibration.schemes import meets, values_of
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, one_sentence
 
@@ -36,7 +32,7 @@ def calibration_report(run: CalibrationRun) -> Report:
     setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
-    good = schemes_within(run)
+    good = run.within_limits
     # of averaged parameters the scheme with most fields; the last one lets each field use its own
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
@@ -68,7 +64,7 @@ def _summary(run: CalibrationRun) -> Table:
     for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
         plan, height = (values_of(errors, what) for what in ("plan_rms", "height_rms"))
         numbers = (plan.mean(), plan.std(), plan.max(), height.mean(), height.std(), height.max())
-        meets_limits = "yes" if meets(errors, limits.plan, limits.height) else "no"
+        meets_limits = "yes" if meets(errors, limits) else "no"
         rows.append((name, *(float(v) for v in numbers), meets_limits))
     return Table(
         "schemes",
@@ -142,8 +138,8 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
             "the times, for the fit need not show such an error"
         )
-    assumptions += drift_warnings(run.campaign, DriftNumbers.of(run.campaign, found))
-    assumptions += step_warnings(StepNumbers.of(run.campaign, found))
+    assumptions += drift_warnings(run.campaign, run.drift)
+    assumptions += step_warnings(run.chip_steps)
     if resting := rests_on_launch(found):
         assumptions.append(
             f"{', '.join(resting)}: known from launch.bias and launch.interior, not from the points; these sigmas are "

@@ -143,6 +143,12 @@ class FieldPass:
         return self.truth.drift
 
     @property
+    def tie_count(self) -> int:
+        """How many tie points there are: those that calibrate, and those that are kept apart for the strip."""
+        apart = {int(number) for row in self.tie_images.values() for number in row.point}
+        return int((~self.is_control).sum()) + len(apart)
+
+    @property
     def middle(self) -> float:
         """Mean time at which control points were seen, seconds of the trajectory."""
         sensors = self.data.sensors

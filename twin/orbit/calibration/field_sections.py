@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import astuple
+from typing import Any
+
 import numpy as np
 
 from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.calibration_numbers import IMAGES
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
-from twin.orbit.calibration.field_images import FieldImages
-from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
 from twin.orbit.calibration.influences import SURPRISE, DatumRow, LightRow
-from twin.orbit.calibration.repeatability import repeatability
 from twin.orbit.images.imaged_ground import BEYOND
 from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import points_png
@@ -40,7 +42,7 @@ def fields_section(run: CalibrationRun) -> Section:
         rows,
         (None, 1, *(3,) * (len(BIAS) + len(truth) + 1)),
     )
-    found = repeatability(run)
+    found = run.repeatability
     if not found:
         return Section("Fields", ("One field alone does not repeat.",), (table,))
     scatter: list[tuple[Cell, ...]] = []
@@ -171,8 +173,8 @@ def images_section(campaign: Campaign) -> Section:
     assert campaign.images is not None
     spec = campaign.simulated.images
     assert spec is not None
-    total = ImageTotals.of(campaign.images)
-    matching = _matching(campaign.images)
+    data = IMAGES(campaign)
+    total = data["total"]
     rows: list[tuple[Cell, ...]] = []
     for one in campaign.images:
         s = one.screening
@@ -210,13 +212,13 @@ def images_section(campaign: Campaign) -> Section:
     counts = [len(p.control_ground[p.control.control]) for p in campaign.passes]
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total.found} places that matching found, {total.wrong_found} are wrong "
-        f"({100.0 * total.wrong_found / total.found:.1f}%), mostly on fields that look different in the "
-        f"orthophoto; thresholds of the matching leave {total.wrong_matched} of {total.matched}, the "
-        f"neighbours' agreement {total.wrong_accepted} of {total.accepted}, the adjustment "
-        f"{total.wrong_left} of {total.left} image points ({total.check_left} check points: "
-        f"{total.wrong_check_left}). The neighbours' test costs {total.right_rejected_by_consensus} right ones, "
-        f"the adjustment {total.right_rejected_by_adjustment}.",
+        f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
+        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on fields that look different in the "
+        f"orthophoto; thresholds of the matching leave {total['wrong_matched']} of {total['matched']}, the "
+        f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
+        f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
+        f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
+        f"the adjustment {total['right_rejected_by_adjustment']}.",
         f"{' and '.join(str(c) for c in counts)} control points are left. Their image points weigh by the covariances "
         f"of the matching and {BEYOND:g} px beyond them, for what no fit shows. Matches of the three "
         "lines with one piece of the orthophoto err alike, by its noise and its "
@@ -236,16 +238,17 @@ def images_section(campaign: Campaign) -> Section:
         )
         for sort, points in first.patches[0].points.sorts.items()
     ]
-    return Section("Points in images", text, (matching, screened, *figures))
+    return Section("Points in images", text, (_matching(data["fields"]), screened, *figures))
 
 
-def _matching(images: tuple[FieldImages, ...]) -> Table:
+def _matching(fields: Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]) -> Table:
+    keys = ("right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
     rows: list[tuple[Cell, ...]] = []
-    for one in images:
-        for sort, lines in MatchingNumbers.by_line(one).items():
+    for field, sorts in fields.items():
+        for sort, lines in sorts.items():
             for line, n in lines.items():
-                cells = (n.right_rejected_by_consensus, n.rms_lines_px, n.rms_pixels_px, n.chi_square_ratio)
-                rows.append((one.name, _SORTS[sort], line, *n.wrong_shares, *cells))
+                wrong = [f"{n[f'wrong_{passed}']} of {n[passed]}" for passed in ("found", "matched", "accepted")]
+                rows.append((field, _SORTS[sort], line, *wrong, *(n[key] for key in keys)))
     return Table(
         "image-matching",
         "Matching",
@@ -283,7 +286,9 @@ def light_section(run: CalibrationRun) -> Section:
             sizes.append((name, *moved))
         inner, turned = row.most(run.campaign.inner), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
         shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
-        rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *shifts, row.p_value))
+        rows.append(
+            (f"{name} left in" if row.left else name, *astuple(row.before), *astuple(row.after), *shifts, row.p_value)
+        )
     pixels = Table(
         "light-pixels",
         "How far image points move",
@@ -321,8 +326,9 @@ def light_section(run: CalibrationRun) -> Section:
         "thousandths of a pixel, most of it because the heights of check points, which refraction depends on, are "
         "first known to 100 m.",
         "Left in, they do hardly any harm where a camera is used as it was calibrated: biases and principal points "
-        f"take them up, the mean error in plan goes from {run.light[0].after[0]:.3f} m to {left.after[0]:.3f} m. But "
-        f"parameters are then wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the "
+        f"take them up, the mean error in plan goes from {run.light[0].after.plan_rms:.3f} m to "
+        f"{left.after.plan_rms:.3f} m. But parameters are then "
+        f"wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the "
         "fit need not show, and they are no longer those of the camera: seen from another height, or by a satellite "
         "that tilts, the light does something else.",
         "The corrections use the same models of the atmosphere and of the light as the simulation: they show that the "
@@ -350,7 +356,7 @@ def datum_section(run: CalibrationRun) -> Section:
                 *map(float, row.offset),
                 row.fit,
                 row.p_value,
-                *row.after,
+                *astuple(row.after),
             )
         )
     table = Table(

@@ -10,8 +10,8 @@ from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.measured_quality import ground_sample, meeting_of
 from twin.orbit.calibration.observations import any_effect
+from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.run.artefact import Cell, Table
 from twin.run.report import Section
 
@@ -43,7 +43,7 @@ def measured_section(run: CalibrationRun) -> Section:
             (
                 one.name,
                 int(one.is_control.sum()),
-                int((~one.is_control).sum()) + _count(one.tie_images),
+                one.tie_count,
                 len(one.check_ground),
                 *lost,
                 alone.chi_square / max(alone.degrees_of_freedom, 1),
@@ -97,11 +97,6 @@ def _factors(found: Mapping[str, float]) -> str:
     if len(set(texts.values())) == 1:
         return next(iter(texts.values()))
     return ", ".join(f"{line} {v}" for line, v in texts.items())
-
-
-def _count(images: object) -> int:
-    rows = list(images.values()) if hasattr(images, "values") else []
-    return len({int(p) for row in rows for p in row.point})
 
 
 def _screening(run: CalibrationRun) -> tuple[str, ...]:

@@ -93,7 +93,7 @@ def height_figure(run: MonitorRun) -> Figure:
 def smoothed_figure(run: MonitorRun) -> Figure:
     """Mean height error of the cameras smoothed and interpolated, with the sigma that the smoother states."""
     spec = run.flight.spec
-    minutes, chosen = run.flight.times / 60.0, run.smoothing[spec.interval]
+    minutes, chosen = run.flight.times / 60.0, run.smoothed
     figure = new_figure(3.8)
     axes = figure.subplots()
     axes.axhline(0.0, color=GREY, lw=0.7)

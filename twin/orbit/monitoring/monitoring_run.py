@@ -22,7 +22,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
 from twin.orbit.flight.line_camera import look_angle
 from twin.orbit.monitoring.monitor_series import Readings
-from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
+from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight, fly_monitored, in_analysis
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -228,6 +228,20 @@ class MonitorRun:
     def angle_change(self) -> np.ndarray:
         """(T,) true, radians."""
         return np.asarray(self.flight.angle - self.flight.angle[self.flight.spec.referred])
+
+    @property
+    def smoothed(self) -> Smoothing:
+        """Heights smoothed from the measurements at the file's interval; there is none without a prior."""
+        return self.smoothing[self.flight.spec.interval]
+
+    def cause_heights(self, cause: Cause) -> tuple[float, float]:
+        """Height errors that a cause alone makes at its time, metres: without monitoring, and by what the monitor
+        misreads.
+        """
+        flight, mask = self.flight, _mask(self.flight)
+        slopes = {n: self.slopes[n][flight.worst] for n in flight.pair}
+        without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
+        return without, sum(float(slopes[n] @ (mask * cause.error[n])) for n in flight.pair)
 
 
 def rms(values: np.ndarray) -> float:
