@@ -49,6 +49,13 @@ CHECKS: Mapping[str, tuple[int, float, str]] = {
     "001.eq5": (4, 1.0, ""),
     "001.eq7": (4, 1.0, ""),
     "001.table1.d_f": (5, 1.0, ""),
+    "001.table3.centroid": (4, 1.0, "arcsec"),
+    "001.table3.coordinate_thermal": (4, 1.0, "arcsec"),
+    "001.table3.prism_180_thermal": (3, 1.0, "arcsec"),
+    "001.table3.prism_0_thermal": (4, 1.0, "arcsec"),
+    "001.table3.prism_180_rotation": (4, 1.0, "arcsec"),
+    "001.table3.prism_0_rotation": (4, 1.0, "arcsec"),
+    "001.table3.central_prism_thermal": (5, 1.0, "arcsec"),
     "001.table4.root_sum": (3, 1.0, "arcsec"),
     "001.table4.together": (3, 1.0, "arcsec"),
     "001.table5.d_alpha": (3, 1.0, "arcsec"),
@@ -73,31 +80,123 @@ CHECKS: Mapping[str, tuple[int, float, str]] = {
 """Check of a paper -> decimals, factor from the summary's unit, unit."""
 
 
-def _angle(run: Path, key: str) -> float:
-    """A number of what the posterior reads of the intersection angle."""
-    tree = json.loads((run / "recovered.json").read_text("utf-8"))
-    return float(tree["intersection_angle"]["posterior"][f"change_arcsec_{key}"])
+Read = Callable[[Path], float]
+"""Run folder -> a number in it."""
 
 
-def _share(run: Path) -> float:
-    """Of the backward M2's motions in that reading's variance, per cent."""
-    tree = json.loads((run / "uncertainty.json").read_text("utf-8"))
-    lines = tree["quantities"]["intersection_angle"]["change_arcsec"]["after"]["posterior"]["lines"]
-    return 100.0 * sum(one["share"] for one in lines if one["motion"].startswith("base/backward/M2 "))
+def _at(file: str, *keys: str, per: float = 1.0) -> Read:
+    """The number below these keys of a JSON file, times ``per``."""
+
+    def read(run: Path) -> float:
+        found = json.loads((run / file).read_text("utf-8"))
+        for key in keys:
+            found = found[key]
+        return per * float(found)
+
+    return read
+
+
+def _share(quantity: tuple[str, ...], motion: str) -> Read:
+    """Share of the motions whose names begin so in the variance of what `posterior` reads, per cent."""
+
+    def read(run: Path) -> float:
+        found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]
+        for key in quantity:
+            found = found[key]
+        lines = found["after"]["posterior"]["lines"]
+        return 100.0 * sum(one["share"] for one in lines if one["motion"].startswith(motion))
+
+    return read
 
 
 def _false_turn(run: Path) -> float:
-    """About Y that the forward camera's spots show and that is not there, arcseconds."""
+    """Turn about Y that the forward camera's spots show and that is not there, arcseconds."""
     read, true = (json.loads((run / f"{name}.json").read_text("utf-8"))["cameras"] for name in ("recovered", "truth"))
     return abs(float(read["forward"]["model"]["d_alpha_arcsec"] - true["forward"]["d_alpha_arcsec"]))
 
 
-RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Callable[[Path], float]]]] = {
+ANGLE = ("intersection_angle", "change_arcsec")
+HEIGHT = ("ground", "height_m")
+CHANGES = {"d_alpha": ("arcsec", 2), "d_beta": ("arcsec", 2), "d_gamma": ("arcsec", 2), "d_f": ("um", 1)}
+GROUND = ("along", "across", "height")
+
+
+def _readings() -> dict[str, tuple[int, str, Read]]:
+    """What is true in the example job, what `posterior` reads, and both sigmas: backward camera, angle between the
+    cameras and a point on the ground.
+    """
+    out: dict[str, tuple[int, str, Read]] = {
+        "launch.angle_true": (3, "arcsec", _at("truth.json", *ANGLE)),
+        "launch.angle_read": (2, "arcsec", _at("recovered.json", "intersection_angle", "posterior", "change_arcsec")),
+    }
+    for name, (unit, digits) in CHANGES.items():
+        key = f"{name}_{unit}"
+        read = ("recovered.json", "cameras", "backward", "posterior")
+        out |= {
+            f"launch.{name}_true": (3 if unit == "arcsec" else 1, unit, _at("truth.json", "cameras", "backward", key)),
+            f"launch.{name}_read": (digits, unit, _at(*read, key)),
+            f"launch.{name}_sigma": (digits, unit, _at(*read, f"{key}_sigma")),
+            f"launch.{name}_noise": (4 if digits == 2 else 2, unit, _at(*read, f"{key}_sigma_noise")),
+        }
+    for name in GROUND:
+        ground = ("recovered.json", "ground", "posterior")
+        out |= {
+            f"launch.{name}_true": (2, "m", _at("truth.json", "ground", f"{name}_m")),
+            f"launch.{name}_read": (2, "m", _at(*ground, f"{name}_m")),
+            f"launch.{name}_sigma": (2, "m", _at(*ground, f"{name}_m_sigma")),
+        }
+    return out
+
+
+def _limits(prior: str) -> dict[str, tuple[int, str, Read]]:
+    """Sigmas of the forward camera before and after a measurement, and of the angle and the height."""
+    places = {name: ("forward", f"{name}_{unit}") for name, (unit, _) in CHANGES.items()}
+    places |= {"angle": ANGLE, "height": HEIGHT}
+    out: dict[str, tuple[int, str, Read]] = {}
+    for name, place in places.items():
+        unit = {"angle": "arcsec", "height": "m"}.get(name) or CHANGES[name][0]
+        below = ("uncertainty.json", "quantities", *place)
+        digits = {"um": 1, "m": 2}.get(unit, 3 if name in ("d_alpha", "d_beta", "angle") else 2)
+        out[f"{prior}.{name}.before"] = (digits, unit, _at(*below, "before", "sigma"))
+        for estimator in ("paper_single", "model", "posterior"):
+            out[f"{prior}.{name}.{estimator}"] = (digits, unit, _at(*below, "after", estimator, "sigma"))
+    return out
+
+
+_HEIGHT = ("uncertainty.json", "quantities", *HEIGHT)
+
+
+def _doubt(of: str) -> Read:
+    """What the height's sigma says of the stated number that it follows most: under 'elasticities'."""
+
+    def read(run: Path) -> float:
+        found = json.loads((run / "uncertainty.json").read_text("utf-8"))["quantities"]["ground"]["height_m"]
+        return float(found["elasticities"][0][of])
+
+    return read
+
+
+RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
     ("twin.render", "scenes/examples/perturb.yaml", "--seed", "1"): {
-        "launch.angle_sigma": (2, "arcsec", lambda run: _angle(run, "sigma")),
-        "launch.angle_noise": (4, "arcsec", lambda run: _angle(run, "sigma_noise")),
-        "launch.angle_share": (0, "%", _share),
+        **_readings(),
+        "launch.angle_sigma": (2, "arcsec", _at("recovered.json", ANGLE[0], "posterior", "change_arcsec_sigma")),
+        "launch.angle_noise": (4, "arcsec", _at("recovered.json", ANGLE[0], "posterior", "change_arcsec_sigma_noise")),
+        "launch.angle_share": (0, "%", _share(ANGLE, "base/backward/M2 ")),
         "launch.false_turn": (3, "arcsec", _false_turn),
+    },
+    ("twin.uncertainty", "gf7_pair"): {
+        **_limits("orbit"),
+        "orbit.d_alpha.share": (0, "%", _share(("forward", "d_alpha_arcsec"), "base/forward/M2 figure Z7")),
+        "orbit.d_gamma.share": (0, "%", _share(("forward", "d_gamma_arcsec"), "base/forward/monitor/")),
+        "orbit.d_f.share": (0, "%", _share(("forward", "d_f_um"), "base/forward/M3 figure Z4")),
+        "orbit.height.share": (0, "%", _share(HEIGHT, "base/forward/M2 figure Z7")),
+        "orbit.height.elasticity": (2, "", _doubt("elasticity")),
+        "orbit.height.doubled": (2, "m", _doubt("doubled")),
+        "orbit.height.held_997": (1, "m", _at(*_HEIGHT, "student_t", "held_997")),
+        "orbit.height.beyond": (1, "%", _at(*_HEIGHT, "student_t", "beyond_3_sigma", per=100.0)),
+    },
+    ("twin.uncertainty", "gf7_pair", "--disturbances", "launch"): {
+        name: one for name, one in _limits("after_launch").items() if not name.endswith("paper_single")
     },
 }
 """Command that makes a run folder -> its figures: decimals, unit, and how it is read there."""
@@ -146,7 +245,7 @@ def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
         with tempfile.TemporaryDirectory(prefix="figures-") as place:
             run = Path(place, "run")
             subprocess.run([sys.executable, "-m", *words, "--quiet", "--out", str(run)], cwd=ROOT, check=True)
-            seed = int(words[words.index("--seed") + 1])
+            seed = int(words[words.index("--seed") + 1]) if "--seed" in words else None
             for name, (digits, unit, read) in wanted.items():
                 out[name] = Figure(float(f"{read(run):.6g}"), None, unit, digits, f"python -m {' '.join(words)}", seed)
     return out
