@@ -14,7 +14,8 @@ import pandas as pd
 import xarray as xr
 
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
-from analysis.monitor.recovery import CENTROIDS, recover
+from analysis.monitor.recovery import recover
+from analysis.spots.centroid import CENTROIDS
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings

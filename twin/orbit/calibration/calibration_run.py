@@ -306,7 +306,7 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
     }
     for one in campaign.passes:
         known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
-        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
+        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.truth.offset, strict=True)}
     rates = [(one.truth.bias_at(1.0) - one.truth.bias_at(-1.0)) / 2.0 for one in campaign.passes]
     known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
     for one, own in zip(campaign.passes, rates, strict=True):

@@ -11,18 +11,11 @@ from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration import field_sections
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
 from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun, unit
 from twin.orbit.calibration.camera_drift import Monitoring, Treatment
-from twin.orbit.calibration.field_sections import (
-    biases_section,
-    datum_section,
-    fields_section,
-    images_section,
-    light_section,
-)
 from twin.orbit.calibration.influences import steps_table
-from twin.orbit.calibration.measured_sections import measured_section
 from twin.orbit.calibration.schemes import RMS, FieldErrors, Repeats, SchemeMeans, meets, values_of
 from twin.orbit.calibration.strip import Strips
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
@@ -43,7 +36,7 @@ def monitor_gain(found: Monitoring) -> str:
     return f"{text}; with the on-board monitor's readings, {here.monitored.schemes[scheme].height_rms:.2f} m."
 
 
-def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
+def _monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     """Errors by size of the drift and by scheme."""
     spec = run.campaign.simulated
     drifts = "; ".join(
@@ -99,34 +92,17 @@ def _by_size(found: Monitoring) -> Table:
 
 def _by_scheme(found: Monitoring) -> Table:
     none, here = found.at(0.0).without, found.at(1.0)
-    rows: list[tuple[Cell, ...]] = []
-    for scheme, still in none.schemes.items():
-        blind = here.without.schemes[scheme]
-        monitored = None if here.monitored is None else here.monitored.schemes[scheme]
-        rows.append(
-            (
-                scheme,
-                still.plan_rms,
-                blind.plan_rms,
-                None if monitored is None else monitored.plan_rms,
-                still.height_rms,
-                blind.height_rms,
-                None if monitored is None else monitored.height_rms,
-            )
-        )
+    cases = {"no drift": none.schemes, "no monitor": here.without.schemes}
+    cases["monitor"] = {} if here.monitored is None else here.monitored.schemes
+    rows: list[tuple[Cell, ...]] = [
+        (scheme, *(getattr(case.get(scheme), what, None) for what in RMS for case in cases.values()))
+        for scheme in none.schemes
+    ]
     return Table(
         "monitor-schemes",
         "Schemes without ground control, with the file's drift",
         "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
-        (
-            "scheme",
-            "plan, no drift",
-            "plan, no monitor",
-            "plan, monitor",
-            "height, no drift",
-            "height, no monitor",
-            "height, monitor",
-        ),
+        ("scheme", *(f"{what}, {case}" for what in ("plan", "height") for case in cases)),
         rows,
         (None, 2, 2, 2, 2, 2, 2),
     )
@@ -151,7 +127,7 @@ def strip_gain(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -
     )
 
 
-def strips_section(run: CalibrationRun, found: Strips) -> Section:
+def _strips_section(run: CalibrationRun, found: Strips) -> Section:
     """Errors before and after, and what tie points cannot tell."""
     rows: list[tuple[Cell, ...]] = []
     for scheme, fields in found.schemes.items():
@@ -212,14 +188,20 @@ def sections(run: CalibrationRun) -> tuple[Section, ...]:
     if run.repeats is not None:
         found.append(_repeats(run, run.repeats))
     if run.truth is None:
-        found.append(measured_section(run))
+        found.append(field_sections.measured_section(run))
     if run.campaign.images is not None:
-        found.append(images_section(run.campaign))
+        found.append(field_sections.images_section(run.campaign))
     if run.monitoring is not None:
-        found.append(monitoring_section(run, run.monitoring))
+        found.append(_monitoring_section(run, run.monitoring))
     if run.strips is not None:
-        found.append(strips_section(run, run.strips))
-    found += [_parameters(run), fields_section(run), biases_section(run), light_section(run), datum_section(run)]
+        found.append(_strips_section(run, run.strips))
+    found += [
+        _parameters(run),
+        field_sections.fields_section(run),
+        field_sections.biases_section(run),
+        field_sections.light_section(run),
+        field_sections.datum_section(run),
+    ]
     return (*found, _rank(run), _data(run))
 
 
@@ -312,12 +294,7 @@ def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
         "from campaign to campaign; spread over the fields; in how many campaigns every field meets 1:50 000.",
         (
             "parameters",
-            "plan [m]",
-            "± campaign",
-            "spread of fields",
-            "height [m]",
-            "± campaign",
-            "spread of fields",
+            *(h for w in ("plan", "height") for h in (f"{w} [m]", "± campaign", "spread of fields")),
             "1:50 000",
         ),
         rows,

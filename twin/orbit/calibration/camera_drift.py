@@ -129,7 +129,7 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
 
 
 def without_monitor(campaign: Campaign) -> Treatment:
-    """As if nothing drifted."""
+    """Adjust a campaign as if no camera drifted."""
     found = simultaneous(campaign)
     errors = [tested(campaign, p, found.cameras, found.bias(p.name)) for p in campaign.passes]
     schemes = schemes_tested(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
@@ -138,7 +138,9 @@ def without_monitor(campaign: Campaign) -> Treatment:
 
 
 def with_monitor(campaign: Campaign) -> Treatment:
-    """With the monitor's readings: as observations where a field is calibrated, and as they are where it is tested."""
+    """Adjust a campaign with the monitor's readings, which are observations where a field is calibrated and correct the
+    cameras where it is tested.
+    """
     found = adjust_with_readings(campaign)
     errors = [tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes]
     alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
@@ -163,7 +165,7 @@ def adjust_field_with_readings(campaign: Campaign, one: FieldPass) -> Adjustment
         [one.control],
         campaign.laboratory,
         campaign.noise,
-        unknowns=Unknowns(drift="field"),
+        unknowns=Unknowns(drift=True),
         priors=_reading_priors(campaign, one),
         gauge=gauge_of(campaign),
     )

@@ -103,7 +103,7 @@ class DatumRow:
 
     @property
     def size(self) -> float:
-        """Of the shift, metres, or of the time, seconds."""
+        """Size of the shift, metres, or of the delay, seconds."""
         return abs(self.late) or float(np.linalg.norm(self.shift))
 
     @property
@@ -130,7 +130,7 @@ class Surprise:
 
     @property
     def ratio(self) -> float:
-        """In sigmas of what is expected."""
+        """Size of the change in sigmas of what is expected."""
         return abs(self.change) / self.expected
 
 
@@ -215,7 +215,7 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
 
 
 def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
-    """How large a cause of this size (metres or seconds) and these changes must be for `surprises` to tell it."""
+    """Size from which on `surprises` tells a cause that makes these changes at one size (metres or seconds)."""
     known = _expected(campaign)
     ratio = max((abs(change.get(name, 0.0)) / sigma for name, (_, sigma) in known.items()), default=0.0)
     return SURPRISE * size / ratio if ratio > 0.0 else None
@@ -276,7 +276,7 @@ class AttitudeDrift:
 
     @classmethod
     def of(cls, campaign: Campaign, found: Adjustment) -> Self:
-        """Of the adjustment of all fields."""
+        """What the adjustment of all fields shows of a drift."""
         seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
         effect = seen = unseen = None
         chance = None
@@ -354,7 +354,7 @@ class ChipStep:
 
     @classmethod
     def of(cls, campaign: Campaign, together: Adjustment) -> tuple[Self, ...]:
-        """Of all lines of a campaign, by the adjustment of all fields."""
+        """Steps of all lines of a campaign, by the adjustment of all fields."""
         steps = Steps(_joints(campaign))
         unseen = together.unseen(steps)
         limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))

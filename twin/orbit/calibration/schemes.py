@@ -39,7 +39,7 @@ class FieldErrors:
 
     @classmethod
     def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
-        """Over all check points, so that a field weighs by the number of its points."""
+        """RMS errors over all check points, so that a field weighs by the number of its points."""
         rows = list(errors)
         count = [e.count for e in rows]
         plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
@@ -73,7 +73,7 @@ class SchemeMeans:
 
     @classmethod
     def of(cls, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> SchemeMeans | None:
-        """None for a single scheme of averaged parameters.
+        """Means and spreads of the schemes; None for a single scheme of averaged parameters.
 
         schemes: all of them; the last, each field its own, is not averaged and does not count.
         """
@@ -143,7 +143,7 @@ def tested(campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel],
 
 
 def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
-    """As many campaigns as the file asks for; None for none. Only their errors at check points count, no sigmas.
+    """Fly and calibrate as many campaigns as the file asks for; None for none. Only errors at check points count.
 
     Raises:
         CalibrationError: one of them cannot be solved.

@@ -108,13 +108,13 @@ def _factors(found: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
 
 
 def _variance(squares: np.ndarray) -> float:
-    """Of residuals from their squared lengths (n,), by the median."""
+    """Variance of residuals from their squared lengths (n,), by the median."""
     # median of chi-square with two degrees of freedom is 2 ln 2; the tails are what robust weights are for
     return float(np.median(squares) / (2.0 * np.log(2.0)))
 
 
 def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:
-    """With sigmas of image points times the factor of their pass and line."""
+    """The campaign with sigmas of image points times the factor of their pass and line."""
 
     def grown(one: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
         return FrozenMap(
@@ -227,7 +227,7 @@ class Meeting:
 
 
 def meeting_of(campaign: Campaign, one: FieldPass, adjustment: Adjustment) -> Meeting:
-    """Of a pass's check points, by cameras and bias of an adjustment.
+    """Intersect a pass's check points by the cameras and the bias of an adjustment.
 
     Raises:
         CalibrationError: they cannot be intersected.

@@ -155,7 +155,7 @@ class MonitorSeries:
 
     @property
     def estimator(self) -> str:
-        """By which each state is read."""
+        """Name of the estimator that reads each state."""
         return "model" if self.experiment.disturbances is None else "posterior"
 
     def measured(self, states: Sequence[State], seed: int) -> tuple[Measured, Measured]:
@@ -189,7 +189,7 @@ class MonitorSeries:
         return np.asarray(shifts - shifts[self.spec.referred])
 
     def repeated(self, state: State, count: int, seed: int, number: int) -> Measured:
-        """Of one state, ``count`` times: reference and state measured anew each time, with another detector's pattern.
+        """Measure the reference and one state ``count`` times, each time with another pattern of the detectors.
 
         ``number`` is that of the state's time.
         """
@@ -282,7 +282,7 @@ class MonitorSeries:
         return self._clean_reference, self.experiment.expected_frames(photons)
 
     def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
-        """Of mean frames (1, C, rows, columns) at the reference."""
+        """Measure the spots of mean frames (1, C, rows, columns) at the reference."""
         experiment, centroid = self.experiment, self.spec.analysis.centroid
         with self._told([self.spec.referred]), one_blas_thread():
             return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())

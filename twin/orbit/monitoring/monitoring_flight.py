@@ -203,7 +203,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
         worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
         # before the images, which take longer
-        views = look_down(spec, pair, lines, ground_seed, advance)
+        views = _look_down(spec, pair, lines, ground_seed, advance)
         monitor = MonitorSeries(experiment, spec, reference, pair)
         noisy, clean = monitor.measured(states, number)
         truth, distance = _changes(clean.truth, spec.referred)
@@ -293,7 +293,7 @@ def _turned(experiment: MonitorExperiment, state: State, camera: str) -> State:
     return compose(state, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
 
-def look_down(
+def _look_down(
     spec: OrbitMonitorSpec,
     pair: tuple[str, str],
     lines: Sequence[Mapping[str, LineCamera]],

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 def _unsigned(values: Array) -> Array:
-    """The same with plain zeros for negative ones."""
+    """Values with plain zeros in place of negative ones."""
     return np.asarray(values + 0.0)
 
 

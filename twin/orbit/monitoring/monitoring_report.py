@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 
-def sections(run: MonitorRun) -> tuple[Section, ...]:
+def _sections(run: MonitorRun) -> tuple[Section, ...]:
     """All parts."""
     smoothed = (_smoothed(run),) if run.smoothing else ()
     return (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run))
@@ -279,13 +279,13 @@ def monitor_report(run: MonitorRun) -> Report:
         lead,
         _facts(setup),
         _table(run),
-        sections(run),
+        _sections(run),
         warnings=_warnings(run),
     )
 
 
 def _times(factor: float, less: str) -> str:
-    """By what factor an error is smaller, or larger."""
+    """Factor by which an error is smaller, or larger, in words."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
