@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from analysis.units import ARCSEC
-from scenes.models.heated_bodies import HeatedBody
+from scenes.models.nodal_bodies import HeatedBody
 from twin.main_job.job_tables import table_names
 from twin.main_job.render_results import RenderRun
 from twin.run.artefact import Cell, Table

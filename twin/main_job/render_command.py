@@ -25,7 +25,7 @@ from twin.run.procedure import Session
 from twin.run.reference_frames import described
 from twin.run.second_process import SecondProcess
 from twin.targets.target_images import DIRECTIONS, PLACES
-from twin.targets.target_result import EdgeReading, TargetRun
+from twin.targets.target_measurement import EdgeReading, TargetRun
 
 DECIMALS = {"d_alpha_arcsec": 4, "d_beta_arcsec": 4, "d_gamma_arcsec": 3, "d_f_um": 2, ANGLE.key: 4}
 DECIMALS |= dict.fromkeys((p.key for p in GROUND), 3)

@@ -25,7 +25,7 @@ from twin.main_job.verdict import judge
 from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
 from twin.run.run_folder import RunFolder
-from twin.targets.target_result import PlaceTargets
+from twin.targets.target_measurement import PlaceTargets
 
 ANGLE = "angle_change_arcsec"
 """Name of the change of the angle between two cameras' lines of sight."""

@@ -11,7 +11,7 @@ from scenes.yaml.errors import InputError, Issue
 from twin.monitor.image_sampling import ImageChecks
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.procedure import Advance, silent
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.uncertainty.coverage import Coverage, run_states
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
 from twin.uncertainty.words import unseen_texts
