@@ -13,11 +13,13 @@ sec. 10.3). Derivatives stay those of the instrument at rest: they change by as 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from analysis.states import OfStates
 
 __all__ = ["BEYOND", "Curvature", "MotionModel", "Retraced", "read_again"]
 
@@ -62,7 +64,7 @@ class MotionModel:
 
 
 @dataclass(frozen=True, eq=False)
-class Curvature:
+class Curvature(OfStates):
     """What retraced states say of the linear readings of an estimator in S states.
 
     Attributes:
@@ -79,24 +81,6 @@ class Curvature:
     def holds(self) -> NDArray[np.bool_]:
         """(S,) whether the readings are right, linear or not."""
         return self.rests
-
-    def at(self, states: slice) -> Curvature:
-        """Of some states.
-
-        Args:
-            states: which.
-        """
-        return Curvature(self.off[states], self.beyond[states], self.rests[states])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Curvature]) -> Curvature:
-        """Of several series of states, one after the other.
-
-        Args:
-            parts: at least one.
-        """
-        names = ("off", "beyond", "rests")
-        return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
 
     def worst(self, state: int = 0) -> tuple[int, float]:
         """Number of the quantity whose linear reading is off by most, and by how many sigmas."""

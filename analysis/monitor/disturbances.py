@@ -41,7 +41,7 @@ class TimeLaw:
     period_s: float | None = None
 
     def correlation(self, gap: Array) -> Array:
-        """Over gaps of time, any shape, seconds; values of the same shape."""
+        """Correlation over gaps of time, seconds, of any shape."""
         away = np.abs(np.asarray(gap, np.float64))
         if self.white:
             return np.asarray(away == 0.0, np.float64)
@@ -117,7 +117,7 @@ class Disturbances:
         return np.asarray(root @ root.T)
 
     def scaled(self, factors: Sequence[float] | Array) -> Disturbances:
-        """The same with each motion's standard deviation times a factor, (M,).
+        """Disturbances whose motions have their standard deviations times factors (M,).
 
         Args:
             factors: one for each motion; 0 takes it out.
@@ -126,7 +126,7 @@ class Disturbances:
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
 
     def since(self, gap: float) -> Disturbances:
-        """The same for changes over a span of time in place of changes from what the instrument is meant to be.
+        """Disturbances over a span of time, in place of those from what the instrument is meant to be.
 
         Args:
             gap: between the two times, seconds.
@@ -143,7 +143,7 @@ class Disturbances:
         return self._best(self.parameters, noise)
 
     def best_amounts(self, noise: Array) -> Array:
-        """Likewise the motions themselves in standard deviations per pixel, C A' (A C A' + R)^-1, (..., M, D).
+        """Motions of the best prediction in standard deviations per pixel, C A' (A C A' + R)^-1, (..., M, D).
 
         Args:
             noise: R, (..., D, D) of the shifts, px^2.
@@ -215,7 +215,7 @@ class Consistency:
 
     @property
     def chance_sigma_noise(self) -> float:
-        """By how much the noise of the images moves ``chance``, one standard deviation, to first order."""
+        """Standard deviation of ``chance`` by the noise of the images, to first order."""
         return float(density(self.chi_square, self.degrees)) * self.sigma_noise
 
     @staticmethod

@@ -75,7 +75,7 @@ class Shifts:
 
 
 class Estimator(ABC):
-    """How shifts of all spots become changes of all cameras.
+    """Makes changes of all cameras of the shifts of all spots.
 
     Attributes:
         title: for readers, a word or two.
@@ -171,7 +171,7 @@ class Formula(OfEachCamera):
         return out
 
     def read(self, shifts: Shifts) -> Array:
-        """By the exact formulas where there are such."""
+        """Changes by the exact formulas where there are such."""
         if self.exact is None:
             return super().read(shifts)
         parts = []
@@ -199,7 +199,7 @@ class LeastSquares(OfEachCamera):
     note: str = "weighted least squares on all spot coordinates with the Jacobian of the traced instrument"
 
     def camera_gain(self, camera: CameraCalibration, covariance: Array) -> Array:
-        """Of the weighted fit."""
+        """Gain of the weighted fit."""
         return model_fit.gain(covariance, camera.spot_jacobian, camera.parameter_jacobian, camera.motions)
 
 

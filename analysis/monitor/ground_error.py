@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.measurement_error import UndeterminedError
+from analysis.states import OfStates
 
 __all__ = ["EARTH_RADIUS_M", "GroundError", "GroundGeometry"]
 
@@ -31,7 +32,7 @@ AXES = ("along", "across", "height")
 
 
 @dataclass(frozen=True, eq=False)
-class GroundError:
+class GroundError(OfStates):
     """Errors of points on the ground for S states.
 
     Attributes:
@@ -47,15 +48,6 @@ class GroundError:
     sigma_noise_m: Array
     plan_rms_m: Array
     height_rms_m: Array
-
-    def at(self, states: slice) -> GroundError:
-        """Those of some states, along the first axis.
-
-        Args:
-            states: which.
-        """
-        arrays = (self.error_m, self.sigma_m, self.sigma_noise_m, self.plan_rms_m, self.height_rms_m)
-        return GroundError(*(array[states] for array in arrays))
 
 
 @dataclass(frozen=True)

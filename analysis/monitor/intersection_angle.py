@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
+from analysis.states import OfStates
 
-__all__ = ["IntersectionAngleChange", "exact", "first_order"]
+__all__ = ["IntersectionAngleChange", "exact"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class IntersectionAngleChange:
+class IntersectionAngleChange(OfStates):
     """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;
     sigma_noise_rad: of that what the noise of the images does, None where that is all.
     """
@@ -39,24 +40,6 @@ class IntersectionAngleChange:
     def noise_rad(self) -> Array:
         """(...) standard deviation by the noise of the images alone, rad."""
         return self.sigma_rad if self.sigma_noise_rad is None else self.sigma_noise_rad
-
-    def at(self, states: slice) -> IntersectionAngleChange:
-        """Those of some states, along the first axis.
-
-        Args:
-            states: which.
-        """
-        noise = None if self.sigma_noise_rad is None else self.sigma_noise_rad[states]
-        return IntersectionAngleChange(self.change_rad[states], self.sigma_rad[states], noise)
-
-
-def first_order(forward: CameraParameters, backward: CameraParameters) -> IntersectionAngleChange:
-    """d_alpha_forward - d_alpha_backward. Wrong by some (d_beta_forward - d_beta_backward)^2 / 2 * cot(angle)-sized
-    terms.
-    """
-    change = np.asarray(forward.d_alpha_rad) - np.asarray(backward.d_alpha_rad)
-    variance = forward.covariance[..., 0, 0] + backward.covariance[..., 0, 0]
-    return IntersectionAngleChange(change, np.sqrt(variance))
 
 
 def exact(

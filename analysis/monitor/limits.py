@@ -211,7 +211,7 @@ def known_sigma(rows: Array, stated: Disturbances, noise: Array, groups: Sequenc
 
 
 def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturbances:
-    """With further spots that are measured at the same time.
+    """Disturbances seen by further spots that are measured at the same time.
 
     Args:
         stated: what moves.
@@ -310,7 +310,7 @@ _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """How Q quantities follow one stated number.
+    """Answer of Q quantities to one stated number.
 
     Attributes:
         number: its cause and motion: ``mirror_figure figure Z7``.
@@ -366,7 +366,7 @@ def stated_numbers(stated: Disturbances) -> dict[str, list[int]]:
 
 
 def elasticities(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> tuple[Elasticity, ...]:
-    """Of all stated numbers, the one first that makes most of the first quantity's variance.
+    """Elasticities of all stated numbers, the one first that makes most of the first quantity's variance.
 
     Args:
         rows: (Q, 4 K) of the quantities.
@@ -418,9 +418,7 @@ def unseen(rows: Array, stated: Disturbances, noise: Array, gain: Array) -> dict
     return {body: own for body, own in by_body.items() if np.max(own) > SHARE}
 
 
-def heavy_tails(
-    rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES, seed: int = 1
-) -> HeavyTail:
+def heavy_tails(rows: Array, stated: Disturbances, noise: Array, gain: Array, degrees: float = DEGREES) -> HeavyTail:
     """Errors of an estimator whose statement has Student's distribution, each number in place of its standard deviation
     with one scale for all its motions.
 
@@ -430,7 +428,6 @@ def heavy_tails(
         noise: (D, D) of the shifts, px^2.
         gain: (4 K, D) of the estimator.
         degrees: of freedom, above 2.
-        seed: of the draws of the scales.
     """
     if degrees <= 2.0:
         raise ValueError(f"heavy tails: Student's distribution has a variance above 2 degrees, found {degrees}")
@@ -441,7 +438,7 @@ def heavy_tails(
     # (Q, G, G) what numbers g and h together make of the variance
     pairs = np.einsum("qgm,mn,qhn->qgh", parts, stated.correlation, parts)
     by_noise = np.einsum("qd,de,qe->q", reading, noise, reading)
-    scales = np.random.default_rng(seed).gamma(0.5 * degrees, 2.0 / degrees, (_DRAWS, len(groups))) ** -0.5
+    scales = np.random.default_rng(1).gamma(0.5 * degrees, 2.0 / degrees, (_DRAWS, len(groups))) ** -0.5
     variance = np.stack([np.einsum("ng,gh,nh->n", scales, pair, scales) for pair in pairs], axis=1) + by_noise
     sigma = np.sqrt(np.maximum(variance, 0.0))
     normal = np.sqrt(np.maximum(pairs.sum(axis=(1, 2)) + by_noise, 0.0))

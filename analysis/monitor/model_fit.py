@@ -1,9 +1,8 @@
 """Estimator `model`: weighted least squares on all spot coordinates with the Jacobian of the traced instrument.
 
 The instrument is linear over the small motions that a monitor sees: spot shifts s = A m (px) and changes of the
-camera's parameters p = B m, for P motions m. `fit` estimates m from s (Gauss-Markov) and maps it to p with the full
-covariance. It can tell apart only the family of motions that it assumes; `observability` says, with numbers, what
-happens to all others.
+camera's parameters p = B m, for P motions m. `gain` maps s to the Gauss-Markov estimate of m and on to p. It can tell
+apart only the family of motions that it assumes; `observability` says, with numbers, what happens to all others.
 
 Order of spot coordinates: row and column of one spot after the other, [left row, left column, right row, right column]
 of a plain pair, px, after - before. Order of parameters:
@@ -19,10 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import MeasurementError, UndeterminedError
-from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC, UM_PER_M
 
-__all__ = ["MotionReport", "ObservabilityReport", "RankError", "fit", "gain", "observability"]
+__all__ = ["MotionReport", "ObservabilityReport", "RankError", "gain", "observability"]
 
 Array = NDArray[np.float64]
 _SHOWN = (
@@ -31,6 +29,8 @@ _SHOWN = (
     ("d_gamma", 1 / ARCSEC, '"'),
     ("d_f", UM_PER_M, " um"),
 )
+# Least ratio of singular values of a spot Jacobian with its columns scaled to length one.
+_RANK_TOLERANCE = 1e-8
 # Below this shift of any spot, px per unit of motion, a motion is called invisible; monitors resolve some 1e-3 px.
 _INVISIBLE_PX = 1e-5
 # Statements leave out what is smaller than this part of the largest component beside it ...
@@ -50,60 +50,29 @@ class RankError(MeasurementError, ValueError):
         self.null_vectors = null_vectors
 
 
-def fit(
-    shift: ArrayLike,
-    covariance: ArrayLike,
-    spot_jacobian: ArrayLike,
-    parameter_jacobian: ArrayLike,
-    motion_names: Sequence[str] | None = None,
-    rank_tolerance: float = 1e-8,
-) -> CameraParameters:
-    """Parameters from spot shifts.
-
-    Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
-
-    Args:
-        shift: (..., D) px, of D coordinates of spots.
-        covariance: (..., D, D) px^2, positive definite, or all zero (no noise: equal weights, zero sigma).
-        spot_jacobian: (D, P) px per unit of motion.
-        parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to D.
-        motion_names: of the P motions, for messages.
-        rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
-    """
-    data, spread = np.asarray(shift, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
-    count = len(_jacobians(spot_jacobian, parameter_jacobian)[0])
-    if data.shape[-1:] != (count,) or spread.shape[-2:] != (count, count):
-        wanted = f"shift must be (..., {count}), covariance (..., {count}, {count})"
-        raise ValueError(f"model fit: {wanted}, found {data.shape}, {spread.shape}")
-    if not (np.all(np.isfinite(data)) and np.all(np.isfinite(spread))):
-        raise ValueError("model fit: shift and covariance must be finite")
-    weights = gain(spread, spot_jacobian, parameter_jacobian, motion_names, rank_tolerance)
-    values = np.einsum("...ij,...j->...i", weights, data)
-    result = weights @ spread @ np.swapaxes(weights, -1, -2)
-    return CameraParameters.from_vector(values, result)
-
-
 def gain(
     covariance: ArrayLike,
     spot_jacobian: ArrayLike,
     parameter_jacobian: ArrayLike,
     motion_names: Sequence[str] | None = None,
-    rank_tolerance: float = 1e-8,
 ) -> Array:
-    """Parameters per pixel of shift, (..., 4, D), of `fit`.
+    """Parameters per pixel of shift, (..., 4, D).
 
-    Raises RankError and ValueError as `fit`.
+    Raises RankError naming the combination of motions that no spot sees; ValueError for bad input.
 
     Args:
         covariance: (..., D, D) px^2, positive definite, or all zero (no noise: equal weights).
         spot_jacobian: (D, P) px per unit of motion.
         parameter_jacobian: (4, P), rad and m per unit of motion. P from 1 to D.
         motion_names: of the P motions, for messages.
-        rank_tolerance: least ratio of singular values of the spot Jacobian with its columns scaled to length one.
     """
     spread = np.asarray(covariance, dtype=np.float64)
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian)
-    _check_rank(spots, motion_names, rank_tolerance)
+    if spread.shape[-2:] != (len(spots), len(spots)) or not np.all(np.isfinite(spread)):
+        raise ValueError(
+            f"model fit: covariance must be (..., {len(spots)}, {len(spots)}) and finite, found {spread.shape}"
+        )
+    _check_rank(spots, motion_names)
     noiseless = not np.any(spread)
     try:
         # whitening: solve(L, x) has unit covariance
@@ -113,7 +82,7 @@ def gain(
     white = np.linalg.solve(root, np.broadcast_to(spots, (*root.shape[:-2], *spots.shape)))
     # pinv by QR-like SVD of the column-scaled matrix: units of motion differ by many orders of magnitude
     length = np.linalg.norm(white, axis=-2, keepdims=True)
-    inverse = np.linalg.pinv(white / length, rcond=rank_tolerance * 1e-3) / np.swapaxes(length, -1, -2)
+    inverse = np.linalg.pinv(white / length, rcond=_RANK_TOLERANCE * 1e-3) / np.swapaxes(length, -1, -2)
     return np.asarray(parameters @ inverse @ np.linalg.inv(root))
 
 
@@ -121,7 +90,7 @@ def gain(
 class MotionReport:
     """What the spots and the model make of one unit (scale) of one motion.
 
-    name, scale: the motion and the size of its unit, SI. signature_px: (D,) spot shifts.
+    name: of the motion. signature_px: (D,) spot shifts.
     explained: fraction [0, 1] of the signature, weighted by its noise, that the family's motions can imitate.
     imitation: (F,) the amounts of the family's motions (in their units) that the fit puts in its place.
     reported, true: (4,) parameters that the model reports, and the true change; rad and m.
@@ -129,7 +98,6 @@ class MotionReport:
     """
 
     name: str
-    scale: float
     signature_px: Array
     explained: float
     imitation: Array
@@ -138,11 +106,6 @@ class MotionReport:
     nearest: str | None
     cosine: float
 
-    @property
-    def error(self) -> Array:
-        """(4,) reported - true, rad and m."""
-        return self.reported - self.true
-
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityReport:
@@ -150,19 +113,13 @@ class ObservabilityReport:
 
     Attributes:
         rank: of the noise-weighted, unit-scaled signatures of all motions.
-        singular_values: of the same, (min(4, M),), falling, 1.
         family: names of the P motions that the model fits.
-        family_rank: the rank of these alone.
-        family_singular_values: of these alone, (P,).
         motions: a report on each.
         statements: plain English that names what cannot be separated.
     """
 
     rank: int
-    singular_values: Array
     family: tuple[str, ...]
-    family_rank: int
-    family_singular_values: Array
     motions: tuple[MotionReport, ...]
     statements: tuple[str, ...]
 
@@ -174,7 +131,6 @@ def observability(
     scales: ArrayLike,
     covariance: ArrayLike,
     family: Sequence[int],
-    rank_tolerance: float = 1e-8,
 ) -> ObservabilityReport:
     """What can be told apart.
 
@@ -187,8 +143,6 @@ def observability(
         scales: (M,) size of one unit of each motion in SI (1e-6 for one micrometre).
         covariance: (D, D) px^2 of the shifts, positive definite.
         family: indices of the motions that the model fits.
-        rank_tolerance: least ratio of singular values of the family's spot Jacobian with its columns scaled to length
-            one.
     """
     spots, parameters = _jacobians(spot_jacobian, parameter_jacobian, limited=False)
     names, size = tuple(motion_names), np.asarray(scales, dtype=np.float64)
@@ -205,7 +159,7 @@ def observability(
         raise UndeterminedError("observability: covariance of the shifts is not positive definite") from error
     spots, parameters = spots * size, parameters * size
     own = [names[k] for k in chosen]
-    _check_rank(spots[:, chosen], own, rank_tolerance)
+    _check_rank(spots[:, chosen], own)
     white = np.linalg.solve(root, spots)
     members = white[:, chosen]
     length = np.linalg.norm(white, axis=0)
@@ -221,7 +175,6 @@ def observability(
         reports.append(
             MotionReport(
                 name=name,
-                scale=float(size[k]),
                 signature_px=spots[:, k],
                 explained=float(1 - left**2) if visible else 0.0,
                 imitation=imitation,
@@ -232,14 +185,10 @@ def observability(
             )
         )
     values = np.linalg.svd(white, compute_uv=False)
-    own_values = np.linalg.svd(members, compute_uv=False)
-    rank = int(np.sum(values > rank_tolerance * values[0]))
+    rank = int(np.sum(values > _RANK_TOLERANCE * values[0]))
     return ObservabilityReport(
         rank=rank,
-        singular_values=np.asarray(values, dtype=np.float64),
         family=tuple(own),
-        family_rank=int(np.sum(own_values > rank_tolerance * own_values[0])),
-        family_singular_values=np.asarray(own_values, dtype=np.float64),
         motions=tuple(reports),
         statements=tuple(_statements(reports, own, rank, len(spots))),
     )
@@ -305,14 +254,14 @@ def _show(values: Array, floor: float = 0.0) -> str:
     )
 
 
-def _check_rank(spots: Array, names: Sequence[str] | None, tolerance: float) -> None:
+def _check_rank(spots: Array, names: Sequence[str] | None) -> None:
     """RankError when the columns of (4, P) are dependent, naming the null vectors in units of the motions."""
     count = spots.shape[1]
     length = np.linalg.norm(spots, axis=0)
     scaled = spots / np.where(length > 0, length, 1.0)
     _, values, vt = np.linalg.svd(scaled, full_matrices=True)
     values = np.pad(values, (0, count - values.size))
-    null = vt[values <= tolerance * max(values[0], 1e-300)]
+    null = vt[values <= _RANK_TOLERANCE * max(values[0], 1e-300)]
     if not null.size:
         return
     labels = list(names) if names is not None else [f"motion {k}" for k in range(count)]

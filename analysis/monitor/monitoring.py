@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.states import OfStates
 from analysis.units import ARCSEC, UM_PER_M
 
 __all__ = [
@@ -91,7 +92,7 @@ class MonitorGeometry:
 
 
 @dataclass(frozen=True, eq=False)
-class CameraParameters:
+class CameraParameters(OfStates):
     """Changes of one camera, scalars or arrays of one shape (...).
 
     d_alpha_rad, d_beta_rad, d_gamma_rad: rotations of the camera about Y, X, Z. d_f_m: change of the principal
@@ -143,15 +144,6 @@ class CameraParameters:
     def sigma_noise(self) -> Array:
         """(..., 4): standard deviations by the noise of the images alone."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
-
-    def at(self, states: slice) -> CameraParameters:
-        """Those of some states, along the first axis.
-
-        Args:
-            states: which.
-        """
-        total = None if self.total is None else self.total[states]
-        return CameraParameters.from_vector(self.vector[states], self.covariance[states], total)
 
     def to_dict(self) -> dict[str, Any]:
         """d_alpha_arcsec, d_beta_arcsec, d_gamma_arcsec, d_f_um, <key>_sigma and <key>_sigma_noise: floats, or nested

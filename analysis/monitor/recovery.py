@@ -19,13 +19,12 @@ from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.limits import quantities
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.spot_evidence import SpotEvidence
-from analysis.spots.centroid import energy_centroid, gaussian_fit, mean_frames
+from analysis.spots.centroid import CENTROIDS, mean_frames
 from analysis.spots.fit_state import FitStates, fit_states, require_rest, widened
-from analysis.spots.likelihood import maximum_likelihood_fit
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
+from analysis.states import OfStates
 
 __all__ = [
-    "CENTROIDS",
     "Estimates",
     "MeasuredSpots",
     "Recovery",
@@ -39,7 +38,6 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-CENTROIDS = ("ml", "gaussian", "energy")
 MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
 """Spots with how good their fits are."""
 
@@ -61,7 +59,7 @@ class Estimates:
 
 
 @dataclass(frozen=True, eq=False)
-class Recovery:
+class Recovery(OfStates):
     """What the images say, for S states.
 
     before, after: (S, C, 2) spot positions (row, column), px; sigma_before, sigma_after: their standard deviations.
@@ -87,23 +85,12 @@ class Recovery:
     curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
     def at(self, states: slice) -> Recovery:
-        """Those of some states, without ``parts``.
+        """The recovery of some states, without ``parts``.
 
         Args:
             states: which.
         """
-        return Recovery(
-            self.before[states],
-            self.after[states],
-            self.sigma_before[states],
-            self.sigma_after[states],
-            self.shift_covariance[states],
-            {name: {e: p.at(states) for e, p in every.items()} for name, every in self.parameters.items()},
-            {e: a.at(states) for e, a in self.angle.items()},
-            {e: g.at(states) for e, g in self.ground.items()},
-            evidence=None if self.evidence is None else self.evidence.at(states),
-            curvature={e: c.at(states) for e, c in self.curvature.items()},
-        )
+        return OfStates.at(replace(self, parts=None), states)
 
     @property
     def shift(self) -> Array:
@@ -134,23 +121,18 @@ def measure_spots(
         mean: mean frames, (B, H, W), grey values.
         frames: number of frames of each mean.
         calibration: of the nominal instrument.
-        centroid: `ml` (the calibrated shape), `gaussian` or `energy` (the paper's).
+        centroid: name of a method of `analysis.spots.centroid.CENTROIDS`.
         threads: for the fits; results do not depend on it.
     """
-    if centroid == "ml":
-        found = maximum_likelihood_fit(mean, frames, calibration.noise, calibration.template, threads=threads)
-        return require_rest(found)
-    if centroid == "gaussian":
-        return require_rest(gaussian_fit(mean, frames, calibration.noise))
-    if centroid == "energy":
-        return require_rest(energy_centroid(mean, frames, calibration.noise))
-    raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
+    if centroid not in CENTROIDS:
+        raise ValueError(f"recovery: no centroid {centroid!r}; there are {', '.join(CENTROIDS)}")
+    return require_rest(CENTROIDS[centroid](mean, frames, calibration.noise, calibration.template, threads))
 
 
 def judged_spots(
     mean: Array, frames: int, calibration: MonitorCalibration, centroid: str = "ml", threads: int = 1
 ) -> tuple[SpotPositions, FitStates]:
-    """The same with the sigmas that their fits leave them, and how good these are, (B / C, C).
+    """Measure spots with the sigmas that their fits leave them, and judge the fits, (B / C, C).
 
     Args:
         mean: as of `measure_spots`, as all others.

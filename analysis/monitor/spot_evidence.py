@@ -56,7 +56,7 @@ class SpotEvidence:
     after: FitStates
 
     def at(self, states: slice) -> SpotEvidence:
-        """Of some states.
+        """The evidence of some states.
 
         Args:
             states: which.
@@ -66,7 +66,7 @@ class SpotEvidence:
 
     @classmethod
     def joined(cls, parts: Sequence[SpotEvidence]) -> SpotEvidence:
-        """Of series against one nominal state, one after the other.
+        """The evidence of several series against one nominal state, one after the other.
 
         Args:
             parts: at least one.

@@ -53,7 +53,7 @@ from analysis.orbit.residual_tests import (
 )
 from analysis.orbit.residual_tests import variance_components as components
 from analysis.orbit.shared_noise import SharedNoise
-from analysis.orbit.three_line_model import DRIFT, LineModel
+from analysis.orbit.three_line_model import BIAS, DRIFT, LineModel
 
 Array = NDArray[np.float64]
 
@@ -145,9 +145,8 @@ class Adjustment:
         return float(self.values[index(self.names, name)])
 
     def bias(self, field: str) -> Array:
-        """(3,) roll, pitch, yaw of a field, radians; zero where not solved for."""
-        found = [n if n in self.names else f"{field} {n}" for n in ("roll", "pitch", "yaw")]
-        return np.array([self.value(n) if n in self.names else 0.0 for n in found])
+        """(3,) roll, pitch, yaw of a field, radians."""
+        return np.array([self.value(f"{field} {n}") for n in BIAS])
 
     def cameras_of(self, field: str) -> dict[str, LineModel]:
         """Cameras in their state during one field: adjusted interior and, where solved for, drift."""
@@ -187,7 +186,7 @@ def adjust(
         fields: passes over fields of points.
         cameras: line -> mounting, distortion and start values of the interior.
         noise: of image, attitude and station.
-        unknowns: what is solved for; interior and one bias for each field.
+        unknowns: what is solved for beside the interior and one bias for each field.
         start: values by name where not the cameras' interior and zero.
         priors: pseudo-observations, for example of an on-board monitor of the cameras.
         gauge: how open combinations are closed.
@@ -231,7 +230,7 @@ def adjust(
 
 
 def _adjusted(problem: _Problem, state: _Iteration, robust: Robust | None, variance_components: bool) -> Adjustment:
-    """With weights that rest."""
+    """Solve with weights and factors that have come to rest."""
     if robust and variance_components:
         found = _settled(problem, state, _SCREENING)
         found = _settled(found.problem, found.state, _ACCEPTED)
@@ -245,7 +244,7 @@ def _adjusted(problem: _Problem, state: _Iteration, robust: Robust | None, varia
 
 @dataclass(frozen=True)
 class _Rule:
-    """How weights follow from residuals: of the image points, and factors of the groups.
+    """Rule by which weights of image points and factors of groups follow from residuals.
 
     tolerance: largest change of a weight, or relative one of a factor, that is left.
     """

@@ -3,7 +3,7 @@
 alpha is the angle between the forward and the nadir plane, beta between the nadir and the aft plane; both acute and
 positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle in the same way. The
 paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
-1e-8 rad (`arccos_rounding`), so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
+1e-8 rad, so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
 
 The sigmas come from first-order propagation. All planes pass through one station, whose error they share, and alpha
 and beta share the nadir plane, so their errors are correlated: the result is a joint covariance.
@@ -123,36 +123,10 @@ def off_axis_angle(line: PlaneFit, nadir: PlaneFit) -> PlaneAngles:
     return angles_between((line, nadir), ((0, 1),))
 
 
-def arccos_rounding(angle: ArrayLike) -> Array:
-    """Bound of the rounding error of arccos |a . b| at an angle (...), radians, for unit vectors in float64.
-
-    The product carries up to four roundings: two normals whose lengths are 1 within eps each, three products, two
-    sums. d angle = d cos / sin(angle), and no angle below sqrt(2 d cos) can be told from zero.
-    """
-    slip = 4.0 * np.finfo(np.float64).eps
-    sine = np.sin(np.asarray(angle, np.float64))
-    return np.asarray(np.minimum(slip / np.maximum(sine, 1e-300), np.sqrt(2.0 * slip)))
-
-
-def dihedral_angle(normal_a: ArrayLike, normal_b: ArrayLike) -> Array:
-    """Acute angle between planes with normals (..., 3) of any length, radians."""
-    a, b = np.asarray(normal_a, np.float64), np.asarray(normal_b, np.float64)
-    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.abs(np.sum(a * b, axis=-1))))
-
-
 def look_angle(ray_a: ArrayLike, ray_b: ArrayLike) -> Array:
     """Angle between two lines of sight (..., 3) of any length, radians, 0 to pi."""
     a, b = np.asarray(ray_a, np.float64), np.asarray(ray_b, np.float64)
     return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1)))
-
-
-def central_ray(plane: PlaneFit, tangent: ArrayLike) -> Array:
-    """Unit vector (3,) from the station along the line of sight of the CCD line's centre, within the fitted plane.
-
-    tangent: (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel number
-        and the interior orientation; either sense of counting. Raises AngleError for bad tangents.
-    """
-    return line_frame(plane, tangent).central
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +155,8 @@ def line_frame(plane: PlaneFit, tangent: ArrayLike, bend: float = 0.0) -> LineFr
 
     Args:
         plane: fitted to the line.
-        tangent: as for `central_ray`.
+        tangent: (n,) tangent of the angle of each point from the line of sight along the CCD line, from its pixel
+            number and the interior orientation; either sense of counting.
         bend: how far the ends of a line that the laboratory knows as straight may have bent out of its plane since, one
             sigma, radians. The bend is estimated with this sigma as its prior, and the central ray follows it. 0: not.
     """

@@ -94,7 +94,7 @@ class Noise:
 
     @property
     def terms(self) -> tuple[NoiseTerm, ...]:
-        """Those of attitude and station that are not zero."""
+        """Terms of attitude and station that are not zero."""
         every = (
             NoiseTerm("attitude", "attitude", self.attitude, self.attitude_interval),
             NoiseTerm("slow attitude", "attitude", self.slow_attitude, self.slow_interval),
@@ -233,39 +233,25 @@ def vertical(points: Array) -> Array:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is solved for.
+    """What is solved for beside the interior orientation (f, x and y of every line camera) and an attitude bias of each
+    field.
 
     Attributes:
-        interior: f, x and y of every line camera.
-        bias: attitude bias, one for each field, one common to all, or none.
-        offset: constant error of the orbit of each field, or none.
-        drift: change of every camera during each field against its reference state, or none. It is open against bias
+        offset: whether the orbit has a constant error in each field.
+        drift: whether every camera has changed during each field against its reference state. It is open against bias
             and interior unless priors, for example of an on-board monitor, tell it.
         rate: drift of the bias during the fields, the same in all or one in each, or none. It is weak against x and y
             of the outer lines, which see a field before and after the nadir line, unless priors tell it.
     """
 
-    interior: bool = True
-    bias: Literal["field", "common", "none"] = "field"
-    offset: Literal["field", "none"] = "none"
-    drift: Literal["field", "none"] = "none"
+    offset: bool = False
+    drift: bool = False
     rate: Literal["common", "field", "none"] = "none"
 
     def __post_init__(self) -> None:
-        """Refuse words that mean nothing: they would count as none."""
-        for name, known in _EXTENT.items():
-            if getattr(self, name) not in known:
-                raise CalibrationError(
-                    f"calibration: {name} must be {' or '.join(known)}, found {getattr(self, name)!r}"
-                )
-
-
-_EXTENT = {
-    "bias": ("field", "common", "none"),
-    "offset": ("field", "none"),
-    "drift": ("field", "none"),
-    "rate": ("common", "field", "none"),
-}
+        """Refuse a word that means nothing: it would count as none."""
+        if self.rate not in ("common", "field", "none"):
+            raise CalibrationError(f"calibration: rate must be common, field or none, found {self.rate!r}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +268,7 @@ class Prior:
     group: str = "prior"
 
 
-def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, group: str = "monitor") -> list[Prior]:
+def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike) -> list[Prior]:
     """What an on-board monitor of one camera tells of its drift during one field.
 
     Args:
@@ -290,7 +276,6 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, 
         line: of the camera.
         reading: (4,) of d_alpha, d_beta, d_gamma (radians) and d_f (metres), against the reference state.
         sigma: of each, (4,); infinite where nothing is told.
-        group: of variance that the priors belong to.
 
     Raises:
         CalibrationError: other shapes.
@@ -299,7 +284,7 @@ def monitor_priors(field: str, line: str, reading: ArrayLike, sigma: ArrayLike, 
     if values.shape != (4,) or sigmas.shape != (4,):
         raise CalibrationError(f"monitor: reading and sigma must be (4,), {', '.join(DRIFT)}")
     readings = zip(DRIFT, values.tolist(), sigmas.tolist(), strict=True)
-    return [Prior({f"{field} {line} {n}": 1.0}, v, s, group) for n, v, s in readings if s != np.inf]
+    return [Prior({f"{field} {line} {n}": 1.0}, v, s, "monitor") for n, v, s in readings if s != np.inf]
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,8 +318,8 @@ class Parameters:
         """start: by name, where not the cameras' interior and zero.
 
         Raises:
-            CalibrationError: no fields, two of one name, a line without a camera, an unknown name in start, nothing to
-                solve for, rates without the times of the rays.
+            CalibrationError: no fields, two of one name, a line without a camera, an unknown name in start, rates
+                without the times of the rays.
         """
         if not fields:
             raise CalibrationError("calibration: no fields")
@@ -342,42 +327,33 @@ class Parameters:
             raise CalibrationError("calibration: two fields have one name")
         focal = float(np.mean([c.interior[0] for c in cameras.values()]))
         entries: dict[str, tuple[float, float]] = {}
-        if unknowns.interior:
-            for line, camera in cameras.items():
-                # f moves an image by the tangent of its place in the field
-                units = (float(camera.interior[0]) / _edge(fields, line, camera), 1.0, 1.0)
-                start_values = zip(INTERIOR, camera.interior, units, strict=True)
-                entries |= {f"{line} {n}": (float(v), s) for n, v, s in start_values}
-        if unknowns.bias == "common":
-            entries |= dict.fromkeys(BIAS, (0.0, 1.0 / focal))
+        for line, camera in cameras.items():
+            # f moves an image by the tangent of its place in the field
+            units = (float(camera.interior[0]) / _edge(fields, line, camera), 1.0, 1.0)
+            start_values = zip(INTERIOR, camera.interior, units, strict=True)
+            entries |= {f"{line} {n}": (float(v), s) for n, v, s in start_values}
         for one in fields:
             reach = [np.linalg.norm(one.ground[r.point] - r.station, axis=1) for r in one.rays.values() if r.point.size]
             if not reach:
                 raise CalibrationError(f"field {one.name!r}: no image points")
-            if unknowns.bias == "field":
-                entries |= {f"{one.name} {n}": (0.0, 1.0 / focal) for n in BIAS}
-            if unknowns.offset == "field":
+            entries |= {f"{one.name} {n}": (0.0, 1.0 / focal) for n in BIAS}
+            if unknowns.offset:
                 metres = float(np.mean(np.concatenate(reach))) / focal
                 entries |= {f"{one.name} offset {n}": (0.0, metres) for n in OFFSET}
-            if unknowns.drift == "field":
+            if unknowns.drift:
                 for line, rays in one.rays.items():
                     # d_gamma swings the ends of the line
                     ends = max(float(np.abs(rays.image[:, 1]).max(initial=0.0)), _SHORTEST * focal)
                     sizes = (1.0 / focal, 1.0 / focal, 1.0 / ends, 1.0)
                     entries |= {f"{one.name} {line} {n}": (0.0, s) for n, s in zip(DRIFT, sizes, strict=True)}
-        middles = {}
-        if unknowns.rate == "common":
-            middles = {one.name: _middle(one) for one in fields}
+        middles = {} if unknowns.rate == "none" else {one.name: _middle(one) for one in fields}
+        if middles:
             spans = [np.ptp(np.concatenate([r.time for r in f.rays.values() if r.time is not None])) for f in fields]
-            entries |= dict.fromkeys(RATE, (0.0, 2.0 / (focal * max(float(np.max(spans)), _SHORTEST))))
-        if unknowns.rate == "field":
-            middles = {one.name: _middle(one) for one in fields}
-            for one in fields:
-                span = np.ptp(np.concatenate([r.time for r in one.rays.values() if r.time is not None]))
-                size = 2.0 / (focal * max(float(span), _SHORTEST))
-                entries |= {f"{one.name} {n}": (0.0, size) for n in RATE}
-        if not entries:
-            raise CalibrationError("calibration: nothing to solve for")
+            swings = [2.0 / (focal * max(float(span), _SHORTEST)) for span in spans]
+            if unknowns.rate == "common":
+                entries |= dict.fromkeys(RATE, (0.0, min(swings)))
+            else:
+                entries |= {f"{f.name} {n}": (0.0, size) for f, size in zip(fields, swings, strict=True) for n in RATE}
         names = tuple(entries)
         where = {n: i for i, n in enumerate(names)}
         values = np.array([entries[n][0] for n in names])
@@ -390,7 +366,7 @@ class Parameters:
                     raise CalibrationError(f"field {one.name!r}: no camera is called {line!r}")
                 groups = (
                     [f"{line} {n}" for n in INTERIOR],
-                    [n if unknowns.bias == "common" else f"{one.name} {n}" for n in BIAS],
+                    [f"{one.name} {n}" for n in BIAS],
                     [f"{one.name} offset {n}" for n in OFFSET],
                     [f"{one.name} {line} {n}" for n in DRIFT],
                     [n if unknowns.rate == "common" else f"{one.name} {n}" for n in RATE],
@@ -436,7 +412,7 @@ class Parameters:
 
 
 def _edge(fields: Sequence[CalibrationField], line: str, camera: LineModel) -> float:
-    """How far the ends of a line, or the outermost of its image points, lie from its middle, metres."""
+    """Distance of the ends of a line, or of the outermost of its image points, from its middle, metres."""
     places = [float(np.abs(f.rays[line].image[:, 1]).max(initial=0.0)) for f in fields if line in f.rays]
     return max(camera.half_length, *places, _SHORTEST * float(camera.interior[0]))
 

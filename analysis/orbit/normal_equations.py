@@ -60,7 +60,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Of the observations, whitened by the a-priori covariances: image (M, 2), control (m, 3), prior (K,).
+    """Residuals of the observations, whitened by the a-priori covariances: image (M, 2), control (m, 3), prior (K,).
 
     shared: group -> sum of squares of its readings' corrections.
     """
@@ -246,7 +246,7 @@ class Hidden(Protocol):
 
     @property
     def size(self) -> int:
-        """How many."""
+        """Number of terms."""
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
         """(n, 2, size) change of the misclosures with each of them.

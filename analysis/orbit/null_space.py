@@ -86,7 +86,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Gauge:
-    """How open combinations are closed.
+    """Rule that closes open combinations.
 
     Attributes:
         held: unknowns that keep their start values, for example ("nadir x",).

@@ -119,7 +119,7 @@ class PlaneFit:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Of the residuals."""
+        """Degrees of freedom of the residuals."""
         return len(self.residual) - 2
 
     @property

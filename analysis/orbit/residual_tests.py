@@ -22,7 +22,7 @@ from scipy.stats import chi2
 
 from analysis.orbit.calibration_parameters import CalibrationField, Prior
 from analysis.orbit.normal_equations import Equations, Weights
-from analysis.orbit.three_line_model import BIAS, Partials, Rays
+from analysis.orbit.three_line_model import Partials, Rays
 
 Array = NDArray[np.float64]
 Robust = Literal["huber", "igg"]
@@ -165,18 +165,13 @@ class Rates:
 
     @classmethod
     def of(cls, fields: Sequence[CalibrationField]) -> Rates:
-        """Of all fields whose rays have times."""
+        """Rates of all fields whose rays have times."""
         times = {f.name: [r.time for r in f.rays.values() if r.time is not None and r.point.size] for f in fields}
         return cls({name: float(np.mean(np.concatenate(rows))) for name, rows in times.items() if rows})
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the terms."""
-        return tuple(f"{name} {axis} rate" for name in self.middles for axis in BIAS)
-
-    @property
     def size(self) -> int:
-        """How many."""
+        """Number of terms."""
         return 3 * len(self.middles)
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
@@ -208,7 +203,7 @@ class Courses:
 
     @classmethod
     def of(cls, fields: Sequence[CalibrationField]) -> Courses:
-        """Of all lines with times and enough points."""
+        """Courses of all lines with times and enough points."""
         found: dict[tuple[str, str], tuple[float, float, int, int]] = {}
         first = 0
         for one in fields:
@@ -223,7 +218,7 @@ class Courses:
 
     @property
     def size(self) -> int:
-        """How many."""
+        """Number of terms."""
         return sum(2 * count for *_, count in self.waves.values())
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
@@ -254,13 +249,8 @@ class Steps:
     places: tuple[tuple[str, float], ...]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """Of the terms."""
-        return tuple(f"{line} {axis} at {1e3 * place:.4g} mm" for line, place in self.places for axis in "xy")
-
-    @property
     def size(self) -> int:
-        """How many."""
+        """Number of terms."""
         return 2 * len(self.places)
 
     def columns(self, field: CalibrationField, line: str, rays: Rays, by: Partials) -> Array:
@@ -300,7 +290,7 @@ class Unseen:
 
     @classmethod
     def of(cls, terms: HiddenTerms, wide: Equations, covariance: Array) -> Unseen:
-        """Of equations with the terms, at a solution.
+        """Read equations that contain the terms, at a solution.
 
         Args:
             terms: G of them.
@@ -332,12 +322,12 @@ class Unseen:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """How many combinations of the terms the residuals can show."""
+        """Number of combinations of the terms that the residuals can show."""
         return int(np.linalg.matrix_rank(self._unit, tol=1e-6, hermitian=True)) if len(self.score) else 0
 
     @property
     def chi_square(self) -> float:
-        """Of all terms together."""
+        """Chi-square of all terms together."""
         return float(self.score @ self._inverse @ self.score) if len(self.score) else 0.0
 
     @property

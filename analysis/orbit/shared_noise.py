@@ -108,18 +108,6 @@ class Series:
         """(n, 4, 3) unknowns that each ray meets."""
         return np.asarray(self.column + 3 * self._four(line)[:, :, None] + np.arange(3))
 
-    def at_readings(self) -> tuple[Array, sparse.csr_matrix]:
-        """Times (r,) of the readings whose z are all there, and (r, k) the readings by z, times sigma."""
-        middle = np.flatnonzero((np.diff(self.numbers[:-1]) == 1) & (np.diff(self.numbers[1:]) == 1)) + 1
-        rows = np.repeat(np.arange(len(middle)), 3)
-        data = np.tile(self.term.sigma * np.array([1.0, 4.0, 1.0]) / 6.0, len(middle))
-        where = (middle[:, None] + np.array([-1, 0, 1])).ravel()
-        interval = self.term.interval or 0.0
-        shape = (len(middle), len(self.numbers))
-        return np.asarray(interval * self.numbers[middle], np.float64), sparse.csr_matrix(
-            (data, (rows, where)), shape=shape
-        )
-
     def _four(self, line: str) -> NDArray[np.intp]:
         return np.asarray(self.places[line][:, None] + np.arange(_NEEDED))
 
@@ -243,8 +231,8 @@ def _series(one: CalibrationField, term: NoiseTerm, column: int) -> Series | Non
 
 
 def _walk_precision(numbers: NDArray[np.intp]) -> sparse.csr_matrix:
-    """Of a random walk at whole numbers (k,), rising, that gains a variance of 1 from one to the next; the middle one,
-    whose level the bias has, is known to as much.
+    """Precision of a random walk at whole numbers (k,), rising, that gains a variance of 1 from one to the next; the
+    middle one, whose level the bias has, is known to as much.
     """
     count = len(numbers)
     steps = sparse.diags([-1.0, 1.0], [0, 1], shape=(count - 1, count))

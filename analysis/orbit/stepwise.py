@@ -37,22 +37,18 @@ class Stepwise:
         names: of the unknowns. values: (P,) at the end.
         converged: whether the steps fell below the tolerance. steps: (rounds,) largest change of any unknown in each
             round, in conditional sigmas.
-        conditional_sigma: (P,) as each step alone reports it, the other block taken as exact: too small.
         rate: fraction of the slowest error that a round leaves by theory, open combinations apart.
-        open_count: combinations of both blocks that no round changes.
     """
 
     names: tuple[str, ...]
     values: Array
     converged: bool
     steps: Array
-    conditional_sigma: Array
     rate: float
-    open_count: int
 
     @property
     def rounds(self) -> int:
-        """How many."""
+        """Number of rounds."""
         return len(self.steps)
 
 
@@ -109,9 +105,7 @@ def stepwise(
         values=state.values,
         converged=converged,
         steps=np.array(sizes),
-        conditional_sigma=sigma,
         rate=float(np.max(shared[shared < _OPEN], initial=0.0)),
-        open_count=int(np.sum(shared >= _OPEN)),
     )
 
 

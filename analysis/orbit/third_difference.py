@@ -14,13 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["WHITE_GAIN", "WHITE_LAG", "ThirdDifference", "third_difference"]
+__all__ = ["WHITE_GAIN", "ThirdDifference", "third_difference"]
 
 Array = NDArray[np.float64]
 WHITE_GAIN = float(np.sqrt(20.0))
-WHITE_LAG = -0.75
-# Sum over all lags of the squared correlation of third differences of white noise: 1 + 2 (15^2 + 6^2 + 1) / 20^2.
-_SPREAD = 1.0 + 2.0 * (15**2 + 6**2 + 1) / 400.0
 # Steps of time that differ by more are gaps: third differences over them mean something else.
 _UNEVEN = 1e-3
 
@@ -32,33 +29,18 @@ class ThirdDifference:
     Attributes:
         rms: (k,) of the third differences of each column, as in Table 2.
         white_sigma: (k,) rms / sqrt(20), standard deviation of one sample if the noise is white.
-        white_sigma_error: (k,) its own standard deviation, if it is.
-        lag: (k,) correlation of neighbours: -0.75 for white noise, near +1 where the smooth motion is what is seen.
-        count: third differences.
     """
 
     rms: Array
     white_sigma: Array
-    white_sigma_error: Array
-    lag: Array
-    count: int
-
-    @property
-    def white(self) -> NDArray[np.bool_]:
-        """(k,) whether the correlation of neighbours lies within 4 of its standard deviations of -0.75.
-
-        False alarm 1 in 10 000 for long series. The standard deviation is Bartlett's, 0.52 / sqrt(count).
-        """
-        return np.asarray(np.abs(self.lag - WHITE_LAG) < 4.0 * _lag_error() / np.sqrt(self.count))
 
 
-def third_difference(time: ArrayLike, series: ArrayLike, *, angle: bool = False) -> ThirdDifference:
+def third_difference(time: ArrayLike, series: ArrayLike) -> ThirdDifference:
     """Third differences of an evenly sampled series.
 
     Args:
         time: (n,) seconds.
         series: (n,) or (n, k), metres or radians.
-        angle: unwrap whole turns first.
 
     Raises:
         ValueError: fewer than five samples, values that are not finite, gaps.
@@ -75,21 +57,6 @@ def third_difference(time: ArrayLike, series: ArrayLike, *, angle: bool = False)
     if typical <= 0 or len(bad):
         where = f"; the step after sample {bad[0]} is {steps[bad[0]]:.6g} s" if len(bad) else ""
         raise ValueError(f"third differences: times must rise evenly, by {typical:.6g} s{where}")
-    change = np.diff(np.unwrap(x, axis=0) if angle else x, n=3, axis=0)
-    square = np.mean(change**2, axis=0)
-    rms = np.sqrt(square)
-    with np.errstate(invalid="ignore"):
-        lag = np.mean(change[1:] * change[:-1], axis=0) / square
-    sigma = rms / WHITE_GAIN
-    return ThirdDifference(rms, sigma, sigma * np.sqrt(0.5 * _SPREAD / len(change)), lag, len(change))
-
-
-def _lag_error() -> float:
-    """Bartlett's standard deviation of the first correlation of third differences of white noise, times sqrt(count)."""
-    rho = np.array([0.0, 0.0, 0.0, -1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0, 0.0, 0.0, 0.0]) / 20.0
-    middle, first = 6, WHITE_LAG
-    total = 0.0
-    for k in range(1, middle + 1):
-        ahead = rho[middle + k + 1] if middle + k + 1 < len(rho) else 0.0
-        total += float(ahead + rho[middle + k - 1] - 2.0 * first * rho[middle + k]) ** 2
-    return float(np.sqrt(total))
+    change = np.diff(x, n=3, axis=0)
+    rms = np.sqrt(np.mean(change**2, axis=0))
+    return ThirdDifference(rms, rms / WHITE_GAIN)

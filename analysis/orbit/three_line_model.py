@@ -110,11 +110,11 @@ class LineModel:
         return cls(turn, inner, place, float(k1), float(k2), half_length=float(half_length))
 
     def with_interior(self, interior: ArrayLike) -> LineModel:
-        """The same camera with another f, x0, y0."""
+        """The camera with another f, x0, y0."""
         return replace(self, interior=np.array(interior, np.float64))
 
     def drifted(self, drift: ArrayLike) -> LineModel:
-        """The same camera in another state: (4,) d_alpha, d_beta, d_gamma, d_f against the reference state.
+        """The camera in another state: (4,) d_alpha, d_beta, d_gamma, d_f against the reference state.
 
         It replaces an earlier drift. Raises ValueError for another shape.
         """

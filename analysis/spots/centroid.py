@@ -5,8 +5,8 @@ All functions take `mean`, (B, H, W) mean grey values of `frames` frames each (s
 NoiseModel, and return SpotPositions with the covariance split into temporal and fixed-pattern parts. They work on all
 spots of a batch at once. The energy centroid is the one of paper 001 (Wang et al. 2018, Fig. 4; its equation is not
 printed: the first moment over the energy). Weights always come from the model and never from the noisy data, which
-    would bias the flux (Humphrey, Liu, Buote,
-Astrophys. J. 693, 822 (2009)). Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
+would bias the flux (Humphrey, Liu, Buote, Astrophys. J. 693, 822 (2009)). Pixel coordinates: (row, column), the centre
+of the first pixel is (0, 0).
 
 Raised by all three: SpotError, naming the spots, when a spot is saturated, is not there, or is too near the image's
 edge; ValueError for input of the wrong shape.
@@ -14,6 +14,7 @@ edge; ValueError for input of the wrong shape.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,8 +24,10 @@ from analysis.spots import spot_image
 from analysis.spots.likelihood import cramer_rao_bound, maximum_likelihood_fit
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_positions import SpotError, SpotPositions, difference_covariance
+from analysis.spots.spot_template import SpotTemplate
 
 __all__ = [
+    "CENTROIDS",
     "SpotError",
     "SpotPositions",
     "cramer_rao_bound",
@@ -54,7 +57,6 @@ def energy_centroid(
     frames: int,
     noise: NoiseModel,
     radius_px: float | None = None,
-    window: str = "circle",
     border_px: int = 4,
     keep_maps: bool = True,
 ) -> SpotPositions:
@@ -67,29 +69,27 @@ def energy_centroid(
         mean: mean frames, (B, H, W), DN.
         frames: of each mean.
         noise: of the detector.
-        radius_px: radius of the circle or half side of the square; default a quarter of the image's smaller side.
-        window: "circle" or "square". Its edge is one pixel soft, so that the result is a smooth function of the image.
+        radius_px: of the circular window; default a quarter of the image's smaller side. Its edge is one pixel soft, so
+            that the result is a smooth function of the image.
         border_px: width of the frame at the image's edge whose mean is the background.
         keep_maps: keep the influence of every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
     radius = min(height, width) / 4.0 if radius_px is None else float(radius_px)
-    if window not in ("circle", "square"):
-        raise ValueError(f"energy centroid: window must be 'circle' or 'square', found {window!r}")
     if not 1 <= radius < min(height, width) / 2 or not 1 <= border_px < min(height, width) // 2:
         raise ValueError(
             f"energy centroid: radius_px {radius} or border_px {border_px} does not fit {height} x {width} px"
         )
 
     def measure(part: slice) -> SpotPositions:
-        return _energy(image[part], frames, noise, radius, window, border_px, keep_maps)
+        return _energy(image[part], frames, noise, radius, border_px, keep_maps)
 
     return spot_image.in_pieces(measure, count)
 
 
 def _energy(
-    image: Array, frames: int, noise: NoiseModel, radius: float, window: str, border_px: int, keep_maps: bool
+    image: Array, frames: int, noise: NoiseModel, radius: float, border_px: int, keep_maps: bool
 ) -> SpotPositions:
     """The energy centroid of a few spots together."""
     count, height, width = image.shape
@@ -103,7 +103,7 @@ def _energy(
     iteration = 0
     while iteration < 100 and not np.all(converged):
         iteration += 1
-        mask, _ = spot_image.soft_window(place, height, width, radius, window)
+        mask, _ = spot_image.soft_window(place, height, width, radius)
         energy = mask * signal
         flux = energy.sum(axis=(1, 2))
         moments = [energy.sum(axis=2) @ np.arange(height), energy.sum(axis=1) @ np.arange(width)]
@@ -115,7 +115,7 @@ def _energy(
         converged = np.max(np.abs(new - place), axis=1) < 1e-7
         place = new
         spot_image.check_edge(place, height, width, radius)
-    mask, slope = spot_image.soft_window(place, height, width, radius, window)
+    mask, slope = spot_image.soft_window(place, height, width, radius)
     arm = spot_image.arms(place, height, width)
     flux = (mask * signal).sum(axis=(1, 2))[:, None, None]
     # The window follows the centre: c = C(image, c), so dc = (1 - dC/dc)^-1 dC/d(image).
@@ -124,18 +124,9 @@ def _energy(
     direct -= border * (direct.sum(axis=(2, 3), keepdims=True) / border.sum())
     direct /= flux[:, :, :, None]
     maps = np.linalg.solve(np.eye(2) - follow, direct.reshape(count, 2, -1)).reshape(direct.shape)
+    flux, nothing = flux[:, 0, 0], np.full(count, np.nan)
     return spot_image.positions(
-        place,
-        maps,
-        image,
-        frames,
-        noise,
-        keep_maps,
-        flux[:, 0, 0],
-        background,
-        converged,
-        iteration,
-        np.full(count, np.nan),
+        place, maps, image, frames, noise, keep_maps, flux, background, converged, iteration, nothing
     )
 
 
@@ -145,7 +136,6 @@ def gaussian_fit(
     noise: NoiseModel,
     radius_px: float | None = None,
     elliptical: bool = False,
-    keep_maps: bool = True,
 ) -> SpotPositions:
     """Weighted least squares of background + amplitude exp(-q/2) in a soft circular window that follows the centre.
 
@@ -160,7 +150,6 @@ def gaussian_fit(
         noise: of the detector.
         radius_px: of the window; default an eighth of the image's smaller side; about the first dark ring is best.
         elliptical: fit a, b and c.
-        keep_maps: keep the influence of every pixel, for covariances of differences.
     """
     image = spot_image.as_images(mean)
     count, height, width = image.shape
@@ -169,7 +158,7 @@ def gaussian_fit(
         raise ValueError(f"gaussian fit: radius_px {radius} does not fit {height} x {width} px")
 
     def measure(part: slice) -> SpotPositions:
-        return _gauss(image[part], frames, noise, radius, elliptical, keep_maps)
+        return _gauss(image[part], frames, noise, radius, elliptical)
 
     return spot_image.in_pieces(measure, count)
 
@@ -178,9 +167,7 @@ def _wandered(theta: Array, row: Array, column: Array) -> NDArray[np.bool_]:
     return np.maximum(np.abs(theta[:, 0] - row), np.abs(theta[:, 1] - column)) > _GAUSS_MOVE_PX
 
 
-def _gauss(
-    image: Array, frames: int, noise: NoiseModel, radius: float, elliptical: bool, keep_maps: bool
-) -> SpotPositions:
+def _gauss(image: Array, frames: int, noise: NoiseModel, radius: float, elliptical: bool) -> SpotPositions:
     """The Gaussian fit of a few spots together, on the part of each image that the window can reach."""
     count, full_height, full_width = image.shape
     row, column, background, peak, area = spot_image.coarse(image, frames, noise)
@@ -233,7 +220,7 @@ def _gauss(
     maps = np.linalg.solve(slope, weighted)[:, :2].reshape(count, 2, height, width)
     weight = weighted[:, 3]  # the background's derivative is 1, so its weighted row is the weight
     # A pixel in the window's soft edge counts as the part of it that is inside; so do the parameters fitted to it.
-    inside = spot_image.soft_window(theta[:, :2], height, width, radius, "circle")[0].reshape(count, 1, -1)
+    inside = spot_image.soft_window(theta[:, :2], height, width, radius)[0].reshape(count, 1, -1)
     across = design.transpose(0, 2, 1)
     fitted = np.linalg.solve(weighted @ across, (weighted * inside) @ across)
     freedom = inside.sum(axis=(1, 2)) - np.trace(fitted, axis1=1, axis2=2)
@@ -245,5 +232,17 @@ def _gauss(
     place = np.asarray(theta[:, :2] + corner, dtype=np.float64)
     spot_image.check_edge(place, full_height, full_width, radius)
     return spot_image.positions(
-        place, everywhere, whole, frames, noise, keep_maps, flux, theta[:, 3], converged, iteration, chi
+        place, everywhere, whole, frames, noise, True, flux, theta[:, 3], converged, iteration, chi
     )
+
+
+CENTROIDS: dict[str, Callable[[Array, int, NoiseModel, SpotTemplate, int], SpotPositions]] = {
+    "ml": lambda mean, frames, noise, template, threads: maximum_likelihood_fit(
+        mean, frames, noise, template, threads=threads
+    ),
+    "gaussian": lambda mean, frames, noise, template, threads: gaussian_fit(mean, frames, noise),
+    "energy": lambda mean, frames, noise, template, threads: energy_centroid(mean, frames, noise),
+}
+"""Name -> method, which makes centres of B spots of mean frames (B, H, W), the number of frames of each, the detector's
+noise, the calibrated shapes and a number of threads. Job files name one under ``analysis: {centroid: ...}``.
+"""

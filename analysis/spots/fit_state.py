@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.chi_square import limit_of
 from analysis.spots.spot_positions import SpotError, SpotPositions
+from analysis.states import OfStates
 
 __all__ = ["FALSE_ALARM", "UNRESTED", "FitStates", "fit_states", "require_rest", "widened"]
 
@@ -27,8 +28,8 @@ UNRESTED = "the fit does not come to rest from either of two starts; the spot ha
 
 
 @dataclass(frozen=True, eq=False)
-class FitStates:
-    """Of fits, arrays of one shape: (B,), or (S, C) as `reshaped` makes them.
+class FitStates(OfStates):
+    """Judgements of fits, arrays of one shape: (B,), or (S, C) as `reshaped` makes them.
 
     Attributes:
         whole, core: reduced chi-squares of all pixels and of the core's; NaN where no shape was fitted.
@@ -66,29 +67,7 @@ class FitStates:
         Args:
             spots: C.
         """
-        return FitStates(*(values.reshape(-1, spots) for values in self._arrays))
-
-    def at(self, states: slice) -> FitStates:
-        """Of some states, along the first axis.
-
-        Args:
-            states: which.
-        """
-        return FitStates(*(values[states] for values in self._arrays))
-
-    @property
-    def _arrays(self) -> tuple[Array, ...]:
-        limits = self.whole_limit, self.core_limit
-        return self.whole, self.core, *limits, self.whole_sigma, self.core_sigma, self.noise
-
-    @classmethod
-    def joined(cls, parts: list[FitStates]) -> FitStates:
-        """Several, one after the other along the first axis.
-
-        Args:
-            parts: at least one.
-        """
-        return cls(*(np.concatenate(same) for same in zip(*(one._arrays for one in parts), strict=True)))
+        return FitStates(*(values.reshape(-1, spots) for values in vars(self).values()))
 
 
 def fit_states(positions: SpotPositions) -> FitStates:
@@ -127,7 +106,7 @@ def widened(positions: SpotPositions, factor: Array) -> SpotPositions:
 
 
 def require_rest(positions: SpotPositions) -> SpotPositions:
-    """The same; SpotError for spots whose fit has not come to rest.
+    """Return the positions; raise SpotError for spots whose fit has not come to rest.
 
     Args:
         positions: as measured.

@@ -55,7 +55,6 @@ def maximum_likelihood_fit(
     template: SpotTemplate,
     index: NDArray[np.intp] | None = None,
     edge_px: float = EDGE_PX,
-    weights: str = "total",
     keep_maps: bool = True,
     threads: int = 1,
     max_iterations: int = _MOST_STEPS,
@@ -72,9 +71,6 @@ def maximum_likelihood_fit(
         template: T shapes.
         index: which of them each spot has, (B,); default: spot b has shape b modulo T.
         edge_px: least distance of a centre from the image's outermost pixel centres.
-        weights: "total" weighs by temporal and fixed variance (best for one image by itself); "temporal" leaves out the
-            fixed pattern (best for the difference of two images in which the spot has hardly moved). The covariance is
-            right for both.
         keep_maps: keep the influence of every pixel, for covariances of differences.
         threads: the batch is cut into small pieces that fit the cache; results do not depend on the number of threads.
         max_iterations: of the scoring; a spot that needs more is marked.
@@ -83,19 +79,16 @@ def maximum_likelihood_fit(
     count, height, width = image.shape
     if (height, width) != template.shape:
         raise ValueError(f"maximum likelihood: images are {height} x {width} px, the template is for {template.shape}")
-    if weights not in ("total", "temporal"):
-        raise ValueError(f"maximum likelihood: weights must be 'total' or 'temporal', found {weights!r}")
     if threads < 1 or max_iterations < 1:
         raise ValueError(f"maximum likelihood: threads {threads} and max_iterations {max_iterations} must be >= 1")
+    rule = _Rule(template, noise, frames)
     which = np.arange(count) % template.count if index is None else np.asarray(index, dtype=np.intp)
     if which.shape != (count,) or np.any((which < 0) | (which >= template.count)):
         raise ValueError(f"maximum likelihood: index must be ({count},) of 0 to {template.count - 1}")
 
     def measure(part: slice) -> SpotPositions:
         try:
-            return _score(
-                image[part], which[part], template, noise, frames, weights, edge_px, keep_maps, max_iterations
-            )
+            return _score(rule, image[part], which[part], edge_px, keep_maps, max_iterations)
         except TemplateRangeError as error:
             reason = "the fit left the range of the template; calibrate it with a larger margin"
             raise SpotError(dict.fromkeys(error.indices, reason)) from error
@@ -104,26 +97,18 @@ def maximum_likelihood_fit(
 
 
 def _score(
-    image: Array,
-    which: NDArray[np.intp],
-    template: SpotTemplate,
-    noise: NoiseModel,
-    frames: int,
-    weights: str,
-    edge_px: float,
-    keep_maps: bool,
-    max_iterations: int,
+    rule: _Rule, image: Array, which: NDArray[np.intp], edge_px: float, keep_maps: bool, max_iterations: int
 ) -> SpotPositions:
     """Fisher scoring of a few spots together; arguments as `maximum_likelihood_fit`."""
     count, height, width = image.shape
+    noise, frames = rule.noise, rule.frames
     row, column, background, _, _ = spot_image.coarse(image, frames, noise)
     # The first step finds flux and background exactly for a given place (the model is linear in them).
     flux = np.maximum(image.sum(axis=(1, 2)) - background * height * width, 1.0)
     theta = np.stack([row, column, flux, background], axis=1)
     spot_image.check_edge(theta[:, :2], height, width, edge_px)
-    theta = _start(image, theta, which, template, noise, frames)
+    theta = _start(rule, image, theta, which)
     work = np.empty((2, count, 4, height * width))
-    rule = _Rule(template, noise, frames, weights)
     last = rule.scored(image, theta, which, max_iterations, work)
     better = _second_start(image, last, which, rule, edge_px, max_iterations)
     if better is not None:
@@ -193,7 +178,6 @@ class _Rule:
     template: SpotTemplate
     noise: NoiseModel
     frames: int
-    weights: str
 
     def scored(
         self, image: Array, theta: Array, which: NDArray[np.intp], most: int, work: Array, damped: bool = False
@@ -208,7 +192,7 @@ class _Rule:
         design, weighted = work
         for iteration in range(1, most + 1):
             _, level = spot_image.template_model(theta, which, self.template, out=design)
-            weight = 1.0 / spot_image.variance(level, self.noise, self.frames, self.weights)
+            weight = 1.0 / spot_image.variance(level, self.noise, self.frames)
             residual = flat - level
             start = theta
             theta, length, inverse, weighted = _step(theta, design, weight, residual, weighted)
@@ -292,9 +276,7 @@ def _second_start(
     return out
 
 
-def _start(
-    image: Array, theta: Array, which: NDArray[np.intp], template: SpotTemplate, noise: NoiseModel, frames: int
-) -> Array:
+def _start(rule: _Rule, image: Array, theta: Array, which: NDArray[np.intp]) -> Array:
     """A better start from the few pixels about each spot, (B, 4): they hold most of what the image knows."""
     height, width = image.shape[1:]
     size = (min(_NEAR_PX, height), min(_NEAR_PX, width))
@@ -303,8 +285,8 @@ def _start(
     near = np.stack([one[r : r + size[0], c : c + size[1]] for one, (r, c) in zip(image, corner, strict=True)])
     flat = near.reshape(len(image), -1)
     for _ in range(_NEAR_STEPS):
-        design, level = spot_image.template_model(theta, which, template, (corner, size))
-        weight = 1.0 / spot_image.variance(level, noise, frames, "temporal")
+        design, level = spot_image.template_model(theta, which, rule.template, (corner, size))
+        weight = 1.0 / rule.noise.temporal_variance_dn2(level, rule.frames)
         theta = _step(theta, design, weight, flat - level)[0]
     return theta
 
@@ -347,7 +329,6 @@ def cramer_rao_bound(
     background: ArrayLike,
     noise: NoiseModel,
     frames: int,
-    index: NDArray[np.intp] | None = None,
 ) -> Array:
     """Least covariance (B, 2, 2) px^2 of (row, column) that any unbiased estimator can reach when all four are
     unknown.
@@ -356,24 +337,23 @@ def cramer_rao_bound(
     the variance's own derivative, which Poisson noise does not have.
 
     Args:
-        template: T shapes.
+        template: T shapes; spot b has shape b modulo T.
         row: (B,), px.
         column: (B,), px.
         flux: (B,), DN.
         background: (B,), DN with black level.
         noise: of the detector; the fixed pattern counts: the bound is for one image by itself.
         frames: of which an image is the mean.
-        index: which shape each spot has, (B,); default: spot b has shape b modulo T.
     """
     values = np.broadcast_arrays(*(np.atleast_1d(np.asarray(v, np.float64)) for v in (row, column, flux, background)))
     theta = np.stack(values, axis=1)
-    which = np.arange(theta.shape[0]) % template.count if index is None else np.asarray(index, dtype=np.intp)
+    which = np.arange(len(theta)) % template.count
     design, level = spot_image.template_model(theta, which, template)
     return _bound(design, level, noise, frames)
 
 
 def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: int) -> Array:
-    """The same bound (B, 2, 2) px^2 for spots of which there is an image without noise, and no template.
+    """Cramer-Rao bound (B, 2, 2) px^2 of spots of which there is an image without noise, and no template.
 
     Args:
         light: (B, H + 4, W + 4) DN of the spots without background; two pixels more on every side than the detector,
@@ -397,6 +377,6 @@ def image_bound(light: ArrayLike, background: float, noise: NoiseModel, frames: 
 
 def _bound(design: Array, level: Array, noise: NoiseModel, frames: int) -> Array:
     """Covariance of row and column (B, 2, 2) by the derivatives (B, 4, P) of all pixels and their level (B, P), DN."""
-    design = design / np.sqrt(spot_image.variance(level, noise, frames, "total"))[:, None]
+    design = design / np.sqrt(spot_image.variance(level, noise, frames))[:, None]
     information = design @ design.transpose(0, 2, 1)
     return np.asarray(np.linalg.inv(information)[:, :2, :2], dtype=np.float64)

@@ -36,7 +36,7 @@ class FurtherNoise(Protocol):
 
     @property
     def fixed_variance_e2(self) -> float:
-        """Of a pattern that is added to every frame, whatever the signal."""
+        """Variance of a pattern that is added to every frame, whatever the signal."""
         ...
 
     def temporal_variance_e2(self, electrons: Any) -> Any:

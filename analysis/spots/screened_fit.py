@@ -14,6 +14,8 @@ Pixel coordinates: (row, column), the centre of the first pixel is (0, 0).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -69,7 +71,6 @@ class ScreenedFit:
         others: (G, 3) row, column (px) and flux over that of the spot.
         others_sigma: (G, 3) their standard deviations.
         smear: (2, 2) px^2, second moments of the smear; zeros where none was fitted.
-        smear_sigma: (2, 2) px^2.
         level: (H, W) DN, the fitted image.
         variance: (H, W) DN^2 of the mean, also where a pixel is not used.
         used: (H, W) pixels.
@@ -86,7 +87,6 @@ class ScreenedFit:
     others: Array
     others_sigma: Array
     smear: Array
-    smear_sigma: Array
     level: Array
     variance: Array
     used: Mask
@@ -154,6 +154,18 @@ def one_shape(template: SpotTemplate, index: int, shape: tuple[int, int]) -> Spo
     return replace(template, row_factors=rows, column_factors=columns, centre=template.centre[own], shape=shape)
 
 
+@contextmanager
+def _errors_of_the_spot() -> Iterator[None]:
+    """Say of the spot why it cannot be fitted."""
+    try:
+        yield
+    except TemplateRangeError as error:
+        raise SpotError({0: "the fit left the range of the template; calibrate it with a larger margin"}) from error
+    except np.linalg.LinAlgError as error:
+        raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
+
+
+@_errors_of_the_spot()
 def fit_screened(
     mean: Array,
     counts: Array,
@@ -164,7 +176,6 @@ def fit_screened(
     near: ScreenedFit | None = None,
     jitter: Array | None = None,
     recorded: int | None = None,
-    edge_px: float = EDGE_PX,
 ) -> ScreenedFit:
     """Fit one spot.
 
@@ -178,52 +189,14 @@ def fit_screened(
         near: a fit to begin at; None to look for the brightest spot.
         jitter: (2, 2) px^2, covariance of the place over the frames; its share in the mean is added to sigma.
         recorded: frames that there are, against which the cost is counted; None for the most that a pixel has.
-        edge_px: least distance of a centre from the image's outermost pixel centres.
 
     Raises:
         SpotError: no spot, or it cannot be fitted.
     """
     terms = FitTerms() if terms is None else terms
-    try:
-        return _fit(mean, counts, good, noise, template, terms, near, jitter, recorded, edge_px)
-    except TemplateRangeError as error:
-        raise SpotError({0: "the fit left the range of the template; calibrate it with a larger margin"}) from error
-    except np.linalg.LinAlgError as error:
-        raise SpotError({0: "too few good pixels are left to fit the spot"}) from error
-
-
-def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Of the fitted image: its derivatives (K, P) by all parameters, what of it is neither the spot nor its level (P,)
-    DN, and the derivatives (K, P) of that.
-
-    Args:
-        fit: of a spot.
-        template: the spot's one shape.
-    """
-    model = _Model(template, fit.terms, *fit.level.shape)
-    design, _ = model.design(fit.theta)
-    alone = fit.theta.copy()
-    alone[2:4] = 0.0
-    beside, extra = model.design(alone)
-    beside[:4] = 0.0
-    return design, extra, beside
-
-
-def _fit(
-    mean: Array,
-    counts: Array,
-    good: Mask,
-    noise: NoiseModel,
-    template: SpotTemplate,
-    terms: FitTerms,
-    near: ScreenedFit | None,
-    jitter: Array | None,
-    recorded: int | None,
-    edge_px: float,
-) -> ScreenedFit:
     model = _Model(template, terms, mean.shape[0], mean.shape[1])
     theta = _start(mean, counts, good, noise, model) if near is None else model.begun(near)
-    spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
+    spot_image.check_edge(theta[None, :2], *template.shape, EDGE_PX)
     flat, use, many = mean.ravel(), good.ravel(), counts.ravel()
     if near is not None and terms.learnt:
         theta = model.signed(theta, flat, use, len(near.others))
@@ -241,7 +214,7 @@ def _fit(
         if rests:
             break
     design, level = model.design(theta)
-    spot_image.check_edge(theta[None, :2], *template.shape, edge_px)
+    spot_image.check_edge(theta[None, :2], *template.shape, EDGE_PX)
     weak = theta[2] < _FLUX_SIGMAS * np.sqrt(inverse[2, 2])
     spot_image.reject(np.array([weak]), f"no spot: the flux is not significant (below {_FLUX_SIGMAS:g} sigma)")
     influence = inverse[:2] @ weighted
@@ -255,7 +228,6 @@ def _fit(
     shape = mean.shape
     core = use & (design[2] > CORE_SHARE * design[2].max())
     places = [model.other(theta, inverse, k) for k in range(len(terms.others))]
-    smear, smear_sigma = model.smear_of(theta, inverse)
     positions = SpotPositions(
         row=theta[0:1],
         column=theta[1:2],
@@ -274,8 +246,7 @@ def _fit(
         terms=terms,
         others=np.array([place for place, _ in places]).reshape(-1, 3),
         others_sigma=np.array([sigma for _, sigma in places]).reshape(-1, 3),
-        smear=smear,
-        smear_sigma=smear_sigma,
+        smear=model.smear_of(theta),
         level=level.reshape(shape),
         variance=_variance(level, many, noise).reshape(shape),
         used=good,
@@ -285,6 +256,23 @@ def _fit(
         theta=theta,
         inverse=inverse,
     )
+
+
+def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
+    """Of the fitted image: its derivatives (K, P) by all parameters, what of it is neither the spot nor its level (P,)
+    DN, and the derivatives (K, P) of that.
+
+    Args:
+        fit: of a spot.
+        template: the spot's one shape.
+    """
+    model = _Model(template, fit.terms, *fit.level.shape)
+    design, _ = model.design(fit.theta)
+    alone = fit.theta.copy()
+    alone[2:4] = 0.0
+    beside, extra = model.design(alone)
+    beside[:4] = 0.0
+    return design, extra, beside
 
 
 def _variance(level: Array, counts: Array, noise: NoiseModel) -> Array:
@@ -451,9 +439,9 @@ class _Model:
         scale = np.array([1.0, 1.0, 1.0 / theta[2]])
         return theta[own] * scale, np.sqrt(np.diag(inverse)[own]) * scale
 
-    def smear_of(self, theta: Array, inverse: Array) -> tuple[Array, Array]:
-        """Moments and their standard deviations, (2, 2)."""
+    def smear_of(self, theta: Array) -> Array:
+        """Second moments, (2, 2), px^2."""
         if not self.terms.smear:
-            return np.zeros((2, 2)), np.zeros((2, 2))
-        a, b = theta[self._smear :], np.sqrt(np.diag(inverse)[self._smear :])
-        return np.array([[a[0], a[1]], [a[1], a[2]]]), np.array([[b[0], b[1]], [b[1], b[2]]])
+            return np.zeros((2, 2))
+        a = theta[self._smear :]
+        return np.array([[a[0], a[1]], [a[1], a[2]]])

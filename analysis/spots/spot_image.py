@@ -173,7 +173,7 @@ def arms(place: Array, height: int, width: int) -> Array:
     return out
 
 
-def soft_window(place: Array, height: int, width: int, radius: float, kind: str) -> tuple[Array, Array]:
+def soft_window(place: Array, height: int, width: int, radius: float) -> tuple[Array, Array]:
     """Window about each centre, falling from 1 to 0 over one pixel at `radius`: (B, H, W), and d window / d centre (B,
     2, H, W).
 
@@ -181,20 +181,13 @@ def soft_window(place: Array, height: int, width: int, radius: float, kind: str)
         place: row and column, (B, 2), px.
         height: H, px.
         width: W, px.
-        radius: of the circle or half side of the square, px.
-        kind: `circle` or `square`.
+        radius: of the circle, px.
     """
     arm = arms(place, height, width)
-    if kind == "circle":
-        distance = np.hypot(arm[:, 0], arm[:, 1])
-        mask = np.clip(radius + 0.5 - distance, 0.0, 1.0)
-        edge = (mask > 0) & (mask < 1)
-        return mask, arm * (edge / np.maximum(distance, 1e-9))[:, None]
-    if kind != "square":
-        raise ValueError(f"a window is a circle or a square, found {kind!r}")
-    side = np.clip(radius + 0.5 - np.abs(arm), 0.0, 1.0)
-    edge2 = np.where((side > 0) & (side < 1), np.sign(arm), 0.0)
-    return side[:, 0] * side[:, 1], edge2 * side[:, ::-1]
+    distance = np.hypot(arm[:, 0], arm[:, 1])
+    mask = np.clip(radius + 0.5 - distance, 0.0, 1.0)
+    edge = (mask > 0) & (mask < 1)
+    return mask, arm * (edge / np.maximum(distance, 1e-9))[:, None]
 
 
 def sane(theta: Array) -> NDArray[np.bool_]:
@@ -234,24 +227,20 @@ def gaussian(
         rest = [rest[0] + rest[2]]
     design = np.stack([light * u, light * v, bell, np.ones_like(bell), *rest], axis=1)
     model = background + light
-    mask, _ = soft_window(theta[:, :2], height, width, radius, "circle")
-    return design, design * (mask.reshape(count, -1) / variance(model, noise, frames, "total"))[:, None], model
+    mask, _ = soft_window(theta[:, :2], height, width, radius)
+    return design, design * (mask.reshape(count, -1) / variance(model, noise, frames))[:, None], model
 
 
-def variance(level: Array, noise: NoiseModel, frames: int, weights: str) -> Array:
-    """Variance of a mean of frames at grey value `level`, DN^2: "temporal" only, or "total" with the fixed pattern.
+def variance(level: Array, noise: NoiseModel, frames: int) -> Array:
+    """Variance of a mean of frames at grey value `level`, temporal and of the fixed pattern, DN^2.
 
     Args:
         level: grey values, any shape, DN.
         noise: of the detector.
         frames: of which an image is the mean.
-        weights: `temporal` or `total`.
     """
-    if weights not in ("total", "temporal"):
-        raise ValueError(f"weights must be 'total' or 'temporal', found {weights!r}")
     out: Array = noise.temporal_variance_dn2(level, frames)
-    if weights == "total":
-        out += noise.fixed_variance_dn2(level)
+    out += noise.fixed_variance_dn2(level)
     return out
 
 

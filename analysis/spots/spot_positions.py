@@ -145,7 +145,7 @@ class NoiseParts:
 
 
 def noise_parts(positions: SpotPositions, noise: NoiseModel) -> NoiseParts:
-    """Of measured positions. Raises ValueError when their maps were not kept.
+    """Noise of measured positions. Raises ValueError when their maps were not kept.
 
     Args:
         positions: measured with maps.
@@ -179,7 +179,7 @@ class SeriesNoise:
 
     @property
     def images(self) -> int:
-        """How many have been added."""
+        """Number of images that have been added."""
         return len(self._rows)
 
     def add(self, after: NoiseParts) -> None:

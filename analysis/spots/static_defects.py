@@ -184,28 +184,29 @@ def examine(
     lines, edges = np.zeros_like(good), np.zeros_like(good)
     limit = float(norm.isf(FALSE_ALARM / (2.0 * mean.size)))
     dirty = not screened.clean
-    fit = _fitted(screened, good, noise, template, terms)
+    fitted = _fit_of(screened, noise, template)
+    fit = fitted(good, terms, None)
     # what is gross first, lest it is taken for smear or for another spot
     for gross in (True, False):
         if not gross and smeared:
             terms = replace(terms, smear=True)
-            fit = _fitted(screened, good, noise, template, terms, fit)
+            fit = fitted(good, terms, fit)
         for _ in range(_ROUNDS if searched else 0):
             before = good, terms
             least = (_GROSS if smeared else 1.0) * limit if gross else CLOSER if dirty else limit
             # found anew every time: an earlier fit may have been wrong, and so may the coarse look before there was one
             start = screened.good & ~(rough & (np.abs(mean - fit.level) > least * np.sqrt(fit.variance)))
-            found = _outliers(mean, fit, start, least)
+            found = _off(mean - fit.level, fit.variance, start, least)
             place = float(fit.positions.row[0]), float(fit.positions.column[0])
             z = (mean - fit.level) / np.sqrt(fit.variance)
             lines = _lines(z, place, start & ~found, screened.good & (~start | found))
             good = start & ~found & ~lines & ~edges
             dirty = dirty or not np.array_equal(good | edges, screened.good)
             if not np.array_equal(good, before[0]):
-                fit = _fitted(screened, good, noise, template, terms, fit)
+                fit = fitted(good, terms, fit)
             if not own and not gross:
-                terms, fit = _uneven(screened, good, noise, template, terms, fit)
-                terms, fit, edge = _others(screened, good, noise, template, terms, fit)
+                terms, fit = _uneven(fitted, mean, good, terms, fit)
+                terms, fit, edge = _others(fitted, mean, template, good, terms, fit)
                 edges, good = edges | edge, good & ~edge
             dirty = dirty or terms.background > 0 or bool(terms.others) or bool(np.any(edges))
             if np.array_equal(good, before[0]) and terms == before[1]:
@@ -236,7 +237,7 @@ def lone_pixels(screened: ScreenedFrames, noise: NoiseModel) -> Mask:
 def refit(
     examined: Examined, static: Mask, noise: NoiseModel, template: SpotTemplate, told: tuple[Finding, ...] = ()
 ) -> Examined:
-    """The same with further pixels left out, that are bad in another state.
+    """The fit with further pixels left out, which are bad in another state.
 
     Args:
         examined: a spot.
@@ -250,29 +251,21 @@ def refit(
     """
     good = examined.good & ~static
     terms = replace(examined.fit.terms, others=tuple((float(r), float(c)) for r, c, _ in examined.fit.others))
-    fit = _fitted(examined.screened, good, noise, template, terms, examined.fit)
+    fit = _fit_of(examined.screened, noise, template)(good, terms, examined.fit)
     return Examined(examined.screened, good, examined.static | static, fit, (*examined.findings, *told))
 
 
-def _fitted(
-    screened: ScreenedFrames,
-    good: Mask,
-    noise: NoiseModel,
-    template: SpotTemplate,
-    terms: FitTerms,
-    near: ScreenedFit | None = None,
-) -> ScreenedFit:
-    return fit_screened(
-        screened.mean,
-        screened.counts,
-        good,
-        noise,
-        template,
-        terms,
-        near=near,
-        jitter=screened.jitter,
-        recorded=screened.recorded,
-    )
+_Fit = Callable[[Mask, FitTerms, ScreenedFit | None], ScreenedFit]
+"""Fits terms to the good pixels of one image, from an earlier fit on."""
+
+
+def _fit_of(screened: ScreenedFrames, noise: NoiseModel, template: SpotTemplate) -> _Fit:
+    def fitted(good: Mask, terms: FitTerms, near: ScreenedFit | None) -> ScreenedFit:
+        left, recorded = screened.jitter, screened.recorded
+        mean, counts = screened.mean, screened.counts
+        return fit_screened(mean, counts, good, noise, template, terms, near=near, jitter=left, recorded=recorded)
+
+    return fitted
 
 
 def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
@@ -286,11 +279,6 @@ def _rough(mean: Array, screened: ScreenedFrames, noise: NoiseModel) -> Mask:
     top = np.unravel_index(int(np.argmax(ndimage.uniform_filter(smooth, 5))), smooth.shape)
     row, column = np.indices(mean.shape)
     return np.asarray(out & screened.good & (np.hypot(row - top[0], column - top[1]) > _ROUGH_PX))
-
-
-def _outliers(mean: Array, fit: ScreenedFit, good: Mask, limit: float) -> Mask:
-    """Pixels of which the residual is not as those about them say."""
-    return _off(mean - fit.level, fit.variance, good, limit)
 
 
 def _off(residual: Array, variance: Array, good: Mask, limit: float) -> Mask:
@@ -359,21 +347,14 @@ def _medians(values: Array, used: Mask, count: NDArray[np.intp]) -> Array:
     return middle
 
 
-def _uneven(
-    screened: ScreenedFrames,
-    good: Mask,
-    noise: NoiseModel,
-    template: SpotTemplate,
-    terms: FitTerms,
-    fit: ScreenedFit,
-) -> tuple[FitTerms, ScreenedFit]:
+def _uneven(fitted: _Fit, mean: Array, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
     """Slopes and curvature of the background, where they explain more than chance does."""
     for order, more in ((1, 2), (2, 3)):
         if terms.background >= order:
             continue
         wider = replace(terms, background=order)
-        tried = _fitted(screened, good, noise, template, wider, fit)
-        gain = (fit.explains(screened.mean) - tried.explains(screened.mean)) / _spread(terms)
+        tried = fitted(good, wider, fit)
+        gain = (fit.explains(mean) - tried.explains(mean)) / _spread(terms)
         if gain <= chi2.isf(FALSE_ALARM, more):
             # a bend without a slope is tried as well
             if order == 1:
@@ -392,33 +373,28 @@ def _spread(terms: FitTerms) -> float:
 
 
 def _others(
-    screened: ScreenedFrames,
-    good: Mask,
-    noise: NoiseModel,
-    template: SpotTemplate,
-    terms: FitTerms,
-    fit: ScreenedFit,
+    fitted: _Fit, mean: Array, template: SpotTemplate, good: Mask, terms: FitTerms, fit: ScreenedFit
 ) -> tuple[FitTerms, ScreenedFit, Mask]:
     """Further spots, the brightest first, where they explain more than chance does; those at the edge are left out."""
     edges = np.zeros_like(good)
-    terms, fit = _kept(screened, good, noise, template, terms, fit)
+    terms, fit = _kept(fitted, good, terms, fit)
     while len(terms.others) < MOST_OTHERS:
-        place = _second_light(screened.mean, fit, good & ~edges, template, terms.learnt)
+        place = _second_light(mean, fit, good & ~edges, template, terms.learnt)
         if place is None:
             break
         if any(not low + 1.0 < at < high - 1.0 for at, (low, high) in zip(place, template.supported(), strict=True)):
             row, column = np.indices(good.shape)
             edges = edges | (good & (np.hypot(row - place[0], column - place[1]) <= _EDGE_LIGHT_PX))
-            fit = _fitted(screened, good & ~edges, noise, template, terms, fit)
+            fit = fitted(good & ~edges, terms, fit)
             continue
         wider = replace(terms, others=(*((float(r), float(c)) for r, c, _ in fit.others), place))
         try:
-            tried = _fitted(screened, good & ~edges, noise, template, wider, fit)
+            tried = fitted(good & ~edges, wider, fit)
         except SpotError:
             break
         row, column, share = tried.others[-1]
         away = math.hypot(row - tried.positions.row[0], column - tried.positions.column[0])
-        gain = (fit.explains(screened.mean) - tried.explains(screened.mean)) / _spread(terms)
+        gain = (fit.explains(mean) - tried.explains(mean)) / _spread(terms)
         if (share <= 0.0 and not terms.learnt) or away < NEAREST_PX or gain <= chi2.isf(FALSE_ALARM / good.size, 3):
             break
         terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in tried.others))
@@ -426,22 +402,15 @@ def _others(
     return terms, fit, edges
 
 
-def _kept(
-    screened: ScreenedFrames,
-    good: Mask,
-    noise: NoiseModel,
-    template: SpotTemplate,
-    terms: FitTerms,
-    fit: ScreenedFit,
-) -> tuple[FitTerms, ScreenedFit]:
-    """Without further spots that are no longer needed."""
+def _kept(fitted: _Fit, good: Mask, terms: FitTerms, fit: ScreenedFit) -> tuple[FitTerms, ScreenedFit]:
+    """Leave out further spots that are no longer needed."""
     share = np.abs(fit.others[:, 2]) if terms.learnt else fit.others[:, 2]
     bright = share > _LEAST_SHARE * fit.others_sigma[:, 2]
     if np.all(bright):
         return terms, fit
     terms = replace(terms, others=tuple((float(r), float(c)) for r, c, _ in fit.others[bright]))
     fit = replace(fit, others=fit.others[bright], others_sigma=fit.others_sigma[bright])
-    return terms, _fitted(screened, good, noise, template, terms, fit)
+    return terms, fitted(good, terms, fit)
 
 
 def _second_light(

@@ -232,7 +232,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:CalibrationSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_any_calibration",
         run="twin.orbit.calibration.calibration_run:run_calibration",
-        numbers="twin.orbit.calibration.calibration_numbers:calibration_numbers",
+        numbers="twin.orbit.calibration.calibration_numbers:CALIBRATION",
         report="twin.orbit.calibration.calibration_report:calibration_report",
         export="twin.orbit.calibration.calibration_export:exported",
         files=(
@@ -317,7 +317,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:MonitorSetup",
         resolve="scenes.specs.orbit.setup:resolve_monitor",
         run="twin.orbit.monitoring.monitoring_run:run_monitor",
-        numbers="twin.orbit.monitoring.monitoring_numbers:monitor_numbers",
+        numbers="twin.orbit.monitoring.monitoring_numbers:MONITOR",
         report="twin.orbit.monitoring.monitoring_report:monitor_report",
         files=(
             FileKind("orbit_monitor", "scenes.specs.orbit.monitor:OrbitMonitorSpec", "a test of monitoring in orbit"),

@@ -16,7 +16,7 @@ from tests.analysis.test_adjustment import BIAS, HOLD_X, HOLD_XY, INNER, LABORAT
 from tests.analysis.test_three_line_model import ARCSEC, PITCH, cameras, field_points, make_rays, observe
 
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)
-DRIFTS = Unknowns(drift="field")
+DRIFTS = Unknowns(drift=True)
 SIGMA = np.array([0.05 * ARCSEC, 0.05 * ARCSEC, 1.2 * ARCSEC, 0.02e-3])
 """Of the monitor: paper 001, Table 5, with its factor of two in d_gamma and d_f taken out."""
 SIZE = np.array([3 * ARCSEC, 3 * ARCSEC, 5 * ARCSEC, 30e-6])

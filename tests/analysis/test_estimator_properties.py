@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from analysis.focal_plane.plane_fit import fit_focal_plane
 from analysis.matching.least_squares import least_squares
-from analysis.monitor.intersection_angle import exact, first_order
+from analysis.monitor.intersection_angle import exact
 from analysis.monitor.monitoring import CameraParameters, MonitorGeometry, derived, paper_joint, paper_single
 from analysis.orbit.angles import angles_between
 from analysis.orbit.planes import Station, Strip, fit_plane
@@ -109,11 +109,11 @@ def test_the_intersection_angle_knows_no_common_pitch(turns, common) -> None:
     still = exact(camera(common, 0.0, turns[0, 2]), camera(common, 0.0, turns[1, 2]), 0.45, -0.09).change_rad
     assert abs(still) < 1e-15
     pair = [camera(t[0], 0.0, t[2]) for t in turns]
-    assert abs(exact(*pair, 0.45, -0.09).change_rad - first_order(*pair).change_rad) < 1e-15
+    assert abs(exact(*pair, 0.45, -0.09).change_rad - (pair[0].d_alpha_rad - pair[1].d_alpha_rad)) < 1e-15
     # with turns about X as well it changes by second order of them only, over the tangent of the angle
     pair = [camera(*t) for t in turns]
     assert (
-        abs(exact(*pair, 0.45, -0.09).change_rad - first_order(*pair).change_rad)
+        abs(exact(*pair, 0.45, -0.09).change_rad - (pair[0].d_alpha_rad - pair[1].d_alpha_rad))
         < 1e-15 + 5.0 * np.abs(turns).max() ** 2
     )
 

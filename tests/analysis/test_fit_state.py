@@ -9,7 +9,7 @@ from analysis.chi_square import limit_of
 from analysis.monitor.spot_evidence import AFTER, BEFORE, NOISE, SpotEvidence
 from analysis.spots import likelihood
 from analysis.spots.centroid import SpotError, energy_centroid, gaussian_fit, maximum_likelihood_fit
-from analysis.spots.fit_state import FitStates, fit_states, require_rest, widened
+from analysis.spots.fit_state import fit_states, require_rest, widened
 from analysis.spots.spot_template import SpotTemplate
 from tests.analysis import test_spot_centroids as spots
 from tests.analysis.test_spot_centroids import FRAMES, GAIN, OFFSET, SHAPE, airy, electrons, pattern, record
@@ -71,7 +71,7 @@ def test_another_shape_is_found_and_widened(fit, good, clean) -> None:
     for name in ("temporal_covariance", "fixed_covariance"):
         assert getattr(wider, name) == pytest.approx(getattr(found, name) * factor[:, None, None] ** 2)
     assert wider.gain_maps == pytest.approx(found.gain_maps * factor[:, None, None, None])
-    before = FitStates(*(values[:4] for values in fit_states(good)._arrays)).reshaped(4)
+    before = fit_states(good).at(slice(4)).reshaped(4)
     told = SpotEvidence(before, states.reshaped(4)).doubt(0, ["a", "b", "c", "d"])
     assert told.cause == AFTER
     assert told.spots == (0, 1, 2, 3)
@@ -93,7 +93,7 @@ def test_noise_above_the_data_sheet_is_named_as_such(fit, good) -> None:
     stated = read + 1 / 12 / FRAMES + (GAIN * spots.DSNU_E) ** 2
     # the median of 2304 squares has a sigma of 5 %
     assert states.noise == pytest.approx((stated + 3.0 * read) / stated, rel=0.25)
-    before = FitStates(*(values[:2] for values in fit_states(good)._arrays)).reshaped(2)
+    before = fit_states(good).at(slice(2)).reshaped(2)
     evidence = SpotEvidence(before, states.reshaped(2))
     told = evidence.doubt()
     assert told.cause == NOISE

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.monitor.intersection_angle import exact, first_order
+from analysis.monitor.intersection_angle import IntersectionAngleChange, exact
 from analysis.monitor.monitoring import CameraParameters
 from analysis.units import ARCSEC
 
@@ -13,6 +13,12 @@ SIGMA = np.diag([0.03, 0.04, 1.0, 1.0]) * ARCSEC
 
 def camera(d_alpha=0.0, d_beta=0.0, d_gamma=0.0):
     return CameraParameters.from_vector(np.array([d_alpha, d_beta, d_gamma, 0.0]), SIGMA @ SIGMA)
+
+
+def first_order(forward, backward):
+    """Difference of the turns about the common axis."""
+    variance = forward.covariance[..., 0, 0] + backward.covariance[..., 0, 0]
+    return IntersectionAngleChange(forward.d_alpha_rad - backward.d_alpha_rad, np.sqrt(variance))
 
 
 def test_signs():

@@ -13,11 +13,9 @@ from scipy import stats
 from analysis.orbit.angles import (
     AngleError,
     angles_between,
-    arccos_rounding,
-    central_ray,
-    dihedral_angle,
     height_error,
     intersection_angles,
+    line_frame,
     look_angle,
     off_axis_angle,
 )
@@ -378,9 +376,15 @@ def test_bias_estimate_of_a_steep_plane():
     assert np.mean(stated) == pytest.approx(mean, abs=5 * spread + 0.1 * abs(mean))
 
 
+def arccos_rounding(angle):
+    """Bound of the rounding error of arccos |a . b|: four roundings over sin(angle), or the angle that they hide."""
+    slip = 4.0 * np.finfo(np.float64).eps
+    return min(slip / np.sin(angle), np.sqrt(2.0 * slip))
+
+
 def test_arccos_loses_small_angles():
-    """Normals at a known small angle: arccos is wrong by up to its stated rounding, and mostly by a good part of it;
-    atan2 keeps all digits.
+    """Normals at a known small angle: arccos is wrong by up to its rounding, and mostly by a good part of it; atan2, as
+    angles are worked out, keeps all digits.
     """
     rng = np.random.default_rng(11)
     for angle in (1e-2, 1e-4, 1e-6, 1e-7, 1e-9):
@@ -393,7 +397,7 @@ def test_arccos_loses_small_angles():
         assert wrong < arccos_rounding(angle)
         assert wrong > 0.05 * min(arccos_rounding(angle), angle)
         # components of b are rounded to 1e-16
-        assert np.abs(dihedral_angle(a, b) - angle).max() < 4e-16
+        assert np.abs(look_angle(a, b) - angle).max() < 4e-16
     # at the angles of the cameras either form will do: 1e-9 arcsec
     assert arccos_rounding(LOOK) < 1e-9 * ARCSEC
     # an off-axis angle of one arcsecond is uncertain by 4e-5 arcsec
@@ -425,11 +429,11 @@ def test_dihedral_and_look_angle_differ_when_lines_are_not_parallel(twist):
     forward, nadir, _ = fits(scene)
     dihedral = angles_between((forward, nadir), ((0, 1),)).values[0]
     assert dihedral == pytest.approx(np.arccos(np.cos(twist) * np.cos(LOOK)), abs=1e-13)
-    rays = [central_ray(plane, scene.tangents[name]) for plane, name in ((forward, "forward"), (nadir, "nadir"))]
+    rays = [line_frame(plane, scene.tangents[name]).central for plane, name in ((forward, "forward"), (nadir, "nadir"))]
     assert look_angle(*rays) == pytest.approx(LOOK, abs=1e-12)
     assert np.abs(rays[0] - scene.body @ [np.sin(LOOK), 0, np.cos(LOOK)]).max() < 1e-12
     # counted from the other end of the line
-    assert central_ray(forward, -scene.tangents["forward"]) == pytest.approx(rays[0], abs=1e-12)
+    assert line_frame(forward, -scene.tangents["forward"]).central == pytest.approx(rays[0], abs=1e-12)
     if twist == 10 / 60 * DEG:
         assert (dihedral - LOOK) / ARCSEC == pytest.approx(1.87, abs=0.01)
 
@@ -440,7 +444,7 @@ def test_a_line_that_starts_elsewhere_along_itself_changes_the_look_angle_only()
     assert angles_between((forward, nadir), ((0, 1),)).values[0] == pytest.approx(LOOK, abs=1e-13)
     # central ray at tan(W) = 0.01 to the side: cos(look) = cos(25 deg) cos(W). Tangents from the line's own foot add
     shifted = scene.tangents["forward"] + 0.01
-    ray = central_ray(forward, shifted)
+    ray = line_frame(forward, shifted).central
     centre = scene.body @ rotation([0, LOOK, 0]) @ [0, 0.01, 1]
     assert look_angle(ray, scene.body[:, 2]) == pytest.approx(LOOK, abs=1e-12)
     side = look_angle(centre, scene.body[:, 2])
@@ -550,10 +554,10 @@ def test_bad_pairs():
     with pytest.raises(AngleError, match="coincide"):
         off_axis_angle(nadir, nadir)
     with pytest.raises(AngleError, match="finite tangents"):
-        central_ray(nadir, [0.0])
+        line_frame(nadir, [0.0])
     with pytest.raises(AngleError, match="finite tangents"):
-        central_ray(nadir, np.where(np.arange(len(SCENE.tangents["nadir"])) == 1, np.nan, SCENE.tangents["nadir"]))
+        line_frame(nadir, np.where(np.arange(len(SCENE.tangents["nadir"])) == 1, np.nan, SCENE.tangents["nadir"]))
     with pytest.raises(AngleError, match="wrong tangents"):
-        central_ray(nadir, 2 * SCENE.tangents["nadir"])
+        line_frame(nadir, 2 * SCENE.tangents["nadir"])
     with pytest.raises(AngleError, match="printed plane"):
-        central_ray(fits(SCENE, "printed")[1], SCENE.tangents["nadir"])
+        line_frame(fits(SCENE, "printed")[1], SCENE.tangents["nadir"])

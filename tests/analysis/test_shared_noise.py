@@ -107,20 +107,6 @@ def test_corrections_at_any_time_are_those_of_the_rays():
         assert np.abs(direct.station - rays.station).max() > 0.01
 
 
-def test_corrections_at_the_readings_are_those_of_the_spline_there():
-    """Each reading whose four neighbours are unknowns, at a multiple of its interval, by its three z."""
-    fields, _ = campaign(flight(8, SEVEN_NODES[:1]), np.random.default_rng(1))
-    shared = SharedNoise.of(fields, NOISE)
-    values = np.random.default_rng(2).standard_normal(shared.size)
-    for series, interval in zip(shared.series["F0"], (0.125, 1.0), strict=True):
-        moments, by_z = series.at_readings()
-        assert len(moments) > 10
-        assert np.all(np.diff(moments) > 0.99 * interval)
-        z = values[series.column : series.column + series.size].reshape(-1, 3)
-        # times are whole numbers of readings but for rounding, 1e-14 of an interval
-        assert by_z @ z == pytest.approx(series.correction_at(moments, values), abs=1e-9 * series.term.sigma)
-
-
 def test_rows_of_shared_noise_are_derivatives_of_the_misclosures():
     """Central differences through the corrected rays, for readings of attitude and of station. A z of one sigma moves
     the image by 1e-6 m at most, of which the second order is 1e-12; rounding of 1e-17 m leaves 1e-10 of it."""

@@ -11,7 +11,6 @@ import pytest
 from scipy import stats
 from scipy.special import j1
 
-from analysis.spots import spot_image
 from analysis.spots.centroid import (
     _GAUSS_MOVE_PX,
     SpotError,
@@ -89,16 +88,12 @@ def before(light, fixed):
 def measure(name, mean, template, frames=FRAMES):
     if name == "likelihood":
         return maximum_likelihood_fit(mean, frames, NOISE, template)
-    if name == "likelihood temporal":
-        return maximum_likelihood_fit(mean, frames, NOISE, template, weights="temporal")
     if name == "energy":
         return energy_centroid(mean, frames, NOISE)
-    if name == "energy square":
-        return energy_centroid(mean, frames, NOISE, window="square")
     return gaussian_fit(mean, frames, NOISE, elliptical=name == "gauss elliptical")
 
 
-ALL = ["likelihood", "likelihood temporal", "energy", "energy square", "gauss", "gauss elliptical"]
+ALL = ["likelihood", "energy", "gauss", "gauss elliptical"]
 
 
 def agrees(error, covariance):
@@ -109,9 +104,7 @@ def agrees(error, covariance):
 
 # Without noise. The likelihood fit has only the interpolation error (1e-4 px asked of the template, 2e-6 px reached).
 # The others are exact by symmetry but for the pixels that their window's edge cuts: some 1e-4 px.
-@pytest.mark.parametrize(
-    ("name", "limit"), [("likelihood", 1e-5), ("energy", 3e-4), ("energy square", 5e-4), ("gauss", 1e-4)]
-)
+@pytest.mark.parametrize(("name", "limit"), [("likelihood", 1e-5), ("energy", 3e-4), ("gauss", 1e-4)])
 def test_bias_without_noise(name, limit, template, places, light):
     clean = GAIN * light[:60] + OFFSET
     found = measure(name, clean, template)
@@ -138,7 +131,7 @@ def moved(request, places, fixed):
     return step, record(electrons(places + step), fixed, 3)
 
 
-@pytest.mark.parametrize("name", ["likelihood", "likelihood temporal", "energy", "gauss"])
+@pytest.mark.parametrize("name", ["likelihood", "energy", "gauss"])
 def test_difference_agrees_with_stated_sigma(name, moved, template, before):
     """Before and after on the same pixels: at rest the pattern cancels, moved by a spot's size it counts twice."""
     step, after = moved
@@ -309,8 +302,6 @@ def test_bad_input(template, before):
         maximum_likelihood_fit(np.full(SHAPE, np.nan), FRAMES, NOISE, template)
     with pytest.raises(ValueError, match="template is for"):
         maximum_likelihood_fit(before[:1, :90], FRAMES, NOISE, template)
-    with pytest.raises(ValueError, match="window"):
-        energy_centroid(before[:1], FRAMES, NOISE, window="hexagon")
     found = maximum_likelihood_fit(before[:1], FRAMES, NOISE, template, keep_maps=False)
     with pytest.raises(ValueError, match="keep_maps"):
         difference_covariance(found, found, NOISE)
@@ -330,10 +321,3 @@ def test_faint_and_narrow_gaussians_are_still_gaussians():
     assert sane(good).all()
     assert not sane(good * [[1, 1, -1, 1, 1]]).any()
     assert not sane(good * [[1, 1, 1, 1, -1]]).any()
-
-
-def test_windows_and_weights_that_do_not_exist_are_refused():
-    with pytest.raises(ValueError, match="a circle or a square"):
-        spot_image.soft_window(np.array([[8.0, 8.0]]), 16, 16, 4.0, "disc")
-    with pytest.raises(ValueError, match="'total' or 'temporal'"):
-        spot_image.variance(np.ones(3), None, 1, "fixed")

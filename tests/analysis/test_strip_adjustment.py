@@ -29,8 +29,8 @@ def strip(seed, count, seconds):
     return observe(points, NODE, cameras(), BIAS)
 
 
-def adjusted(rays, noise, **options):
-    return adjust_strip(rays, cameras(), noise, bias=BIAS, **options)
+def adjusted(rays, noise):
+    return adjust_strip(rays, cameras(), noise, bias=BIAS)
 
 
 def alone(rays, noise):
@@ -43,25 +43,23 @@ def test_exact_rays_are_left_alone():
     found = adjusted(make_rays(view), SLOW)
     assert np.abs(found.ground - view.points).max() < 1e-6
     assert found.chi_square < 1e-12
-    for group, sigma in (("attitude", SLOW.attitude), ("slow attitude", SLOW.slow_attitude), ("station", SLOW.station)):
-        assert np.abs(found.corrections[group].value).max() < 1e-6 * sigma
-    assert {"attitude", "slow attitude", "station"} == set(found.corrections)
+    for row in make_rays(view).values():
+        corrected = found.corrected(row)
+        assert np.abs(corrected.attitude - row.attitude).max() < 1e-6 * SLOW.attitude
+        assert np.abs(corrected.station - row.station).max() < 1e-6 * SLOW.station
 
 
 @pytest.mark.slow
 def test_sigmas_are_right():
     """40 passes: the errors of one point of each, and the residuals of all; two-sided false alarm 1e-3 each."""
-    rng, view, total, fit, readings = np.random.default_rng(2), strip(2, 40, 3.0), np.zeros(2), np.zeros(2), []
+    rng, view, total, fit = np.random.default_rng(2), strip(2, 40, 3.0), np.zeros(2), np.zeros(2)
     for k in range(40):
         found = adjusted(make_rays(view, rng, SLOW), SLOW)
         error = found.ground[k] - view.points[k]
         total += (error @ np.linalg.solve(found.covariance[k], error), 3)
         fit += (found.chi_square, found.degrees_of_freedom)
-        readings.append(found.corrections["attitude"].sigma)
     assert 5e-4 < stats.chi2.sf(*total) < 1 - 5e-4
     assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
-    # what is left of a reading is never more than the prior's sigma
-    assert np.max(readings) <= 0.5 * ARCSEC * (1 + 1e-9)
 
 
 def test_corrections_take_the_errors_out_of_other_rays():
@@ -128,21 +126,13 @@ def test_the_datum_keeps_its_prior():
     assert 5 * ARCSEC / np.sqrt(9) < before["roll"] < 5 * ARCSEC / np.sqrt(3)
 
 
-def test_wrong_matches_are_left_out():
+def test_wrong_matches_show_in_the_fit():
     rng, view = np.random.default_rng(6), strip(6, 150, 7.0)
     rays = make_rays(view, rng, WHITE)
     rays["nadir"].image[:4] += 20 * PITCH
-    found = adjusted(rays, WHITE, robust="igg")
-    assert np.all(found.weight["nadir"][:4] == 0)
-    # three rays of a point often cannot tell which one is wrong, the whole point goes then; of the other 438 image
-    # points 1 in 10 000 lies beyond the limit: more than two are a false alarm of 1e-5
-    assert sum(int(np.sum(w[4:] == 0)) for w in found.weight.values()) <= 2
-    assert np.isfinite(found.ground[4:]).mean() > 0.98
-    # 4 m in height, 1 sigma, where all three rays are left; 600 coordinates stay within 5 of that
-    assert np.nanmax(np.linalg.norm(found.ground - view.points, axis=1)) < 20
-    plain = adjusted(rays, WHITE)
-    assert plain.p_value < 1e-10
-    assert np.linalg.norm(plain.ground - view.points, axis=1)[:4].max() > 20
+    found = adjusted(rays, WHITE)
+    assert found.p_value < 1e-10
+    assert np.linalg.norm(found.ground - view.points, axis=1)[:4].max() > 20
 
 
 def test_points_of_one_line_and_bad_input():
@@ -151,21 +141,8 @@ def test_points_of_one_line_and_bad_input():
     found = adjusted(some, WHITE)
     assert np.isnan(found.ground[3]).all()
     assert np.isfinite(np.delete(found.ground, 3, axis=0)).all()
-    assert found.weight["aft"][3] == 0
-    assert np.isnan(found.residual["aft"][3]).all()
     assert found.degrees_of_freedom == 2 * 29 * 3 - 3 * 29
     with pytest.raises(CalibrationError, match="needs the times"):
         adjusted(rays, Noise(PITCH, ARCSEC))
     with pytest.raises(CalibrationError, match="needs the times"):
         adjusted({k: replace(r, time=None) for k, r in rays.items()}, WHITE)
-    with pytest.raises(CalibrationError, match="robust must be"):
-        adjusted(rays, WHITE, robust="tukey")
-
-
-def test_cameras_sit_where_they_were_calibrated_unless_it_is_said_otherwise():
-    view = strip(1, 30, 5.0)
-    rays = make_rays(view)
-    usual, zero = adjusted(rays, WHITE), adjusted(rays, WHITE, offset=(0.0, 0.0, 0.0))
-    np.testing.assert_array_equal(usual.ground, zero.ground)
-    assert usual.chi_square == zero.chi_square
-    assert usual.chi_square < 1e-12

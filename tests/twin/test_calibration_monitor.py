@@ -18,7 +18,6 @@ from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.camera_drift import (
-    PooledErrors,
     adjust_field_with_readings,
     adjust_with_readings,
     flown,
@@ -29,6 +28,7 @@ from twin.orbit.calibration.camera_drift import (
 from twin.orbit.calibration.campaign import line_model
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
+from twin.orbit.calibration.schemes import FieldErrors
 from twin.orbit.calibration.schemes import tested as at_checks
 from twin.orbit.flight.line_camera import drifted_payload
 
@@ -68,16 +68,18 @@ def test_exact_readings_return_everything() -> None:
     campaign = flown(setup_with(exact=True), 1.0, SEED)
     found = adjust_with_readings(campaign)
     for one in campaign.passes:
-        assert np.abs(one.drift["forward"]).max() > 0.1 * ARCSEC
-        assert not np.any(one.drift["nadir"])
+        assert np.abs(one.truth.drift["forward"]).max() > 0.1 * ARCSEC
+        assert not np.any(one.truth.drift["nadir"])
         cameras = found.cameras_of(one.name)
         for line in LINES:
-            np.testing.assert_allclose(cameras[line].drift[:3], one.drift[line][:3], rtol=1e-6, atol=1e-6 * ARCSEC)
-            np.testing.assert_allclose(cameras[line].drift[3], one.drift[line][3], rtol=1e-6, atol=1e-11)
+            np.testing.assert_allclose(
+                cameras[line].drift[:3], one.truth.drift[line][:3], rtol=1e-6, atol=1e-6 * ARCSEC
+            )
+            np.testing.assert_allclose(cameras[line].drift[3], one.truth.drift[line][3], rtol=1e-6, atol=1e-11)
             np.testing.assert_allclose(cameras[line].interior, campaign.truth[line].interior, rtol=0, atol=1e-11)
         errors = at_checks(campaign, one, cameras, found.bias(one.name))
         assert max(errors.plan_rms, errors.height_rms) < 1e-4  # 1e-6 of 40 arcsec of bias, over 500 km
-    assert with_monitor(campaign).schemes["1"].height < 1e-3
+    assert with_monitor(campaign).schemes["1"].height_rms < 1e-3
 
 
 @pytest.mark.second
@@ -91,7 +93,7 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     by_hand = setup.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
     assert abs(metres) == pytest.approx(by_hand, rel=0.1)
     found = simultaneous(campaign)
-    angle = np.array([(p.drift["forward"] - p.drift["aft"])[0] / ARCSEC for p in campaign.passes])
+    angle = np.array([(p.truth.drift["forward"] - p.truth.drift["aft"])[0] / ARCSEC for p in campaign.passes])
     height = [at_checks(campaign, p, found.cameras, found.bias(p.name)).error[:, 2].mean() for p in campaign.passes]
     # cameras that do not have the drift see the opposite of it
     assert np.array(height) == pytest.approx(-metres * (angle - angle.mean()), abs=0.05 * abs(metres) * np.ptp(angle))
@@ -105,12 +107,12 @@ def test_a_monitor_brings_errors_back() -> None:
     setup = setup_with()
     still, moved = (flown(setup, factor, SEED) for factor in (0.0, 4.0))
     base, blind, told = without_monitor(still), without_monitor(moved), with_monitor(moved)
-    assert told.together.height == pytest.approx(base.together.height, rel=0.02)
-    assert told.together.plan == pytest.approx(base.together.plan, rel=0.02)
-    assert blind.together.height > 1.5 * base.together.height
+    assert told.together.height_rms == pytest.approx(base.together.height_rms, rel=0.02)
+    assert told.together.plan_rms == pytest.approx(base.together.plan_rms, rel=0.02)
+    assert blind.together.height_rms > 1.5 * base.together.height_rms
     for scheme in ("1", "2"):
-        assert told.schemes[scheme].height == pytest.approx(base.schemes[scheme].height, rel=0.02)
-        assert blind.schemes[scheme].height > 1.5 * base.schemes[scheme].height
+        assert told.schemes[scheme].height_rms == pytest.approx(base.schemes[scheme].height_rms, rel=0.02)
+        assert blind.schemes[scheme].height_rms > 1.5 * base.schemes[scheme].height_rms
     assert blind.p_value < 1e-6 < told.p_value
 
 
@@ -128,12 +130,12 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     found = adjust_with_readings(all_off)
     moved = abs(found.value("forward x") - campaign.truth["forward"].interior[1])
     assert moved == pytest.approx(0.65 * ARCSEC, rel=0.01)
-    assert with_monitor(all_off).together.height < 0.02
+    assert with_monitor(all_off).together.height_rms < 0.02
     alone = adjust_field_with_readings(campaign, campaign.passes[0])
     last = off(campaign.passes[-1])
     cameras = {k: alone.cameras[k].drifted(last.readings[k]) for k in LINES}
     errors = at_checks(campaign, last, cameras, alone.bias(KEPT[0]))
-    assert PooledErrors.of([errors]).height == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
+    assert FieldErrors.pooled([errors]).height_rms == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
 
 
 @pytest.mark.second

@@ -21,7 +21,6 @@ from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import simultaneous
 from twin.orbit.calibration.field_images import FieldImages
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.influences import INNER
 from twin.orbit.calibration.screening import screened
 from twin.orbit.images.image_points import MatchedPoints, map_points, tie_points
 from twin.orbit.images.point_judgement import judged, true_ground
@@ -153,7 +152,7 @@ def two_patches() -> OrbitCalibrationSpec:
 def parameters_fit(campaign: Campaign) -> None:
     """Interior and biases against the truth, false alarm 1e-4."""
     found = simultaneous(campaign)
-    names = [*INNER, *(f"{p.name} {axis}" for p in campaign.passes for axis in BIAS)]
+    names = [*campaign.inner, *(f"{p.name} {axis}" for p in campaign.passes for axis in BIAS)]
     chosen = [k for k, n in enumerate(found.names) if n in names and found.sigma[n] > 0.0]
     error = (found.values - true_values(campaign, found.names))[chosen]
     spread = found.covariance[np.ix_(chosen, chosen)]

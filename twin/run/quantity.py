@@ -22,6 +22,7 @@ from twin.run.data_files import DataColumn, DataTable
 from twin.run.plain_data import plain_data
 
 S = TypeVar("S")
+T = TypeVar("T")
 _PER_SI: Mapping[str, float] = FrozenMap(
     {"pm": 1e12, "nm": 1e9, "um": 1e6, "mm": 1e3, "m": 1.0, "km": 1e-3, "us": 1e6, "ms": 1e3, "mK": 1e3, "mW": 1e3}
     | {"percent": 1e2, "ppm": 1e6, "urad": 1e6, "mrad": 1e3}
@@ -59,7 +60,7 @@ class Quantity(Generic[S]):
     Attributes:
         key: its name in files; the ending names the unit.
         of: source -> value in SI units, or, with a record, what that record is of: one source, a list or a mapping of
-            sources; None where there is none.
+            sources, or a mapping of such mappings; None where there is none.
         meaning: what it is, for the reference and for the columns of other programs.
         head: how tables of reports call it, without its unit; empty for the key's words.
         decimals: that reports show, None for six significant digits.
@@ -146,11 +147,25 @@ class Record(Generic[S]):
         columns = self(source)
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
+    def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:
+        """Its quantities for the record of something of which this record's source is a part."""
+
+        def through(of: Callable[[S], Any]) -> Callable[[T], Any]:
+            return lambda source: of(part(source))
+
+        return [Quantity(**vars(one) | {"of": through(one.of)}) for one in self]
+
     def _chosen(self, keys: Sequence[str]) -> list[Quantity[S]]:
         return [self[key] for key in keys] if keys else list(self.quantities)
 
     def table(
-        self, name: str, title: str, caption: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()
+        self,
+        name: str,
+        title: str,
+        caption: str,
+        rows: Sequence[Mapping[str, Any]] | Mapping[str, Mapping[str, Any]],
+        keys: Sequence[str] = (),
+        label: str = "",
     ) -> Table:
         """A table of a report.
 
@@ -158,12 +173,18 @@ class Record(Generic[S]):
             name: of its file.
             title: heading.
             caption: what it shows.
-            rows: as this record gives them.
+            rows: as this record gives them, or by name, which then is the first column.
             keys: of the columns, in their order; all if none are given.
+            label: head of the column of names.
         """
         shown = self._chosen(keys)
-        cells: list[list[Cell]] = [[row.get(one.key) for one in shown] for row in rows]
-        return Table(name, title, caption, [one.shown_head for one in shown], cells, [one.decimals for one in shown])
+        heads, decimals = [one.shown_head for one in shown], [one.decimals for one in shown]
+        if isinstance(rows, Mapping):
+            heads, decimals = [label, *heads], [None, *decimals]
+            cells: list[list[Cell]] = [[first, *(row.get(one.key) for one in shown)] for first, row in rows.items()]
+        else:
+            cells = [[row.get(one.key) for one in shown] for row in rows]
+        return Table(name, title, caption, heads, cells, decimals)
 
     def data_table(
         self, name: str, title: str, rows: Sequence[Mapping[str, Any]], keys: Sequence[str] = ()

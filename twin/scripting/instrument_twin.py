@@ -14,7 +14,8 @@ import pandas as pd
 import xarray as xr
 
 from analysis.monitor import parameters
-from analysis.monitor.recovery import CENTROIDS, recover
+from analysis.monitor.recovery import recover
+from analysis.spots.centroid import CENTROIDS
 from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings

@@ -32,7 +32,7 @@ def exported(run: CalibrationRun) -> dict[str, str]:
 
 
 def files_of(setup: AnyCalibration, campaign: Campaign) -> dict[str, str]:
-    """As `exported`, of a campaign that is not calibrated yet."""
+    """Path -> text of the files of a campaign, which need not be calibrated."""
     files = campaign_files([one.measurements for one in campaign.passes], setup.camera.plain())
     return files | {TEST_FILE: dump_yaml(_test(setup))}
 

@@ -2,465 +2,523 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET, RATE
+from analysis.orbit.forward_intersection import CheckErrors
 from analysis.orbit.null_space import Combination
+from analysis.orbit.residual_tests import FALSE_ALARM
+from analysis.orbit.strip_adjustment import Datum
 from analysis.orbit.three_line_model import BIAS
-from twin.orbit.calibration.attitude_drift import DriftNumbers
-from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult
-from twin.orbit.calibration.campaign import FieldPass, Rejected, interior_names
-from twin.orbit.calibration.chip_steps import StepNumbers
-from twin.orbit.calibration.image_numbers import ImageNumbers
-from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise
+from twin.orbit.calibration.calibration_run import CalibrationRun, FieldResult, Unknown, unit, unknowns
+from twin.orbit.calibration.camera_drift import DriftSize, Monitoring, Treatment
+from twin.orbit.calibration.campaign import Campaign, FieldPass, interior_names
+from twin.orbit.calibration.field_images import FieldImages, Screening
+from twin.orbit.calibration.influences import AttitudeDrift, ChipStep, DatumRow, LightRow, Surprise
 from twin.orbit.calibration.latitude import LatitudeFit
-from twin.orbit.calibration.measured_quality import Meeting, ground_sample, meeting_of
-from twin.orbit.calibration.repeatability import Repeatability, repeatability
-from twin.orbit.calibration.scheme_numbers import (
-    CampaignNumbers,
-    ErrorNumbers,
-    MeanNumbers,
-    MonitoringNumbers,
-    StripNumbers,
-    VerdictNumbers,
-)
-from twin.run.plain_data import plain_data
+from twin.orbit.calibration.schemes import FieldErrors, Repeatability, Repeats, SchemeMeans, meets
+from twin.orbit.calibration.screening import ground_sample, meeting_of
+from twin.orbit.calibration.strip import Strips
+from twin.orbit.images.point_judgement import LineJudgement
+from twin.run.quantity import Quantity, Record
 
 Array = NDArray[np.float64]
 
 
-def unit(name: str) -> str:
-    """SI unit of an unknown."""
-    if name.endswith(RATE):
-        return "rad/s"
-    return "rad" if name.split()[-1] in BIAS else "m"
+# --- errors at check points, by scheme -------------------------------------------------------------------
+
+ERRORS: Record[CheckErrors | FieldErrors] = Record(
+    "RMS errors at check points.",
+    Quantity("plan_rms_m", lambda e: e.plan_rms, "in plan, east and north together"),
+    Quantity("height_rms_m", lambda e: e.height_rms, "in height"),
+)
+MEANS: Record[SchemeMeans] = Record(
+    "RMS errors over the fields, of each scheme of averaged parameters.",
+    Quantity("plan_mean_m", lambda means: means.plan, "mean over the fields in plan"),
+    Quantity("plan_spread_m", lambda means: means.plan_spread, "standard deviation over the fields in plan"),
+    Quantity("height_mean_m", lambda means: means.height, "mean over the fields in height"),
+    Quantity("height_spread_m", lambda means: means.height_spread, "standard deviation over the fields in height"),
+)
+REPEATED: Record[tuple[Array, Array, float]] = Record(
+    "A scheme over the repeated campaigns.",
+    Quantity("plan_rms_m", lambda r: r[0].mean(axis=1), "mean of the fields' RMS in plan, campaign by campaign"),
+    Quantity("plan_spread_m", lambda r: r[0].std(axis=1), "standard deviation over the fields in plan"),
+    Quantity("height_rms_m", lambda r: r[1].mean(axis=1), "mean of the fields' RMS in height, campaign by campaign"),
+    Quantity("height_spread_m", lambda r: r[1].std(axis=1), "standard deviation over the fields in height"),
+    Quantity("share_within_limits", lambda r: r[2], "share of the campaigns in which every field meets the limits"),
+)
 
 
-@dataclass(frozen=True)
-class ParameterNumbers:
-    """An unknown of the adjustment of all fields; held: by the gauge. share_from_launch: of its variance, what comes
-    from the sigmas of launch and season and not from the points, 0 to 1.
+def _repeats(run: CalibrationRun) -> Repeats:
+    assert run.repeats is not None
+    return run.repeats
+
+
+def _repeated(run: CalibrationRun) -> dict[str, tuple[Array, Array, float]]:
+    repeats, limits = _repeats(run), run.setup.test.limits
+    met = repeats.met(limits.plan, limits.height).tolist()
+    return {name: (repeats.plan[:, k], repeats.height[:, k], met[k]) for k, name in enumerate(repeats.schemes)}
+
+
+CAMPAIGNS: Record[CalibrationRun] = Record(
+    "Campaigns repeated with everything drawn anew.",
+    Quantity("count", lambda run: len(_repeats(run).plan), "number of campaigns"),
+    Quantity("schemes", _repeated, record=REPEATED),
+)
+TREATMENT: Record[Treatment] = Record(
+    "Drifting cameras, adjusted with the monitor's readings or without.",
+    Quantity("all_fields", lambda one: one.together, "all fields adjusted at once", record=ERRORS),
+    Quantity("p_value", lambda one: one.p_value, "chance of a chi-square as large in that adjustment"),
+    Quantity("schemes", lambda one: one.schemes, "without ground control, by scheme", record=ERRORS),
+)
+CAMERA_DRIFT: Record[tuple[Monitoring, DriftSize]] = Record(
+    "One size of the cameras' drift from field to field.",
+    Quantity("factor", lambda d: d[1].factor, "size against that of the file"),
+    Quantity("d_alpha_sigma_rad", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
+    Quantity("without_monitor", lambda d: d[1].without, "as if no camera drifted", record=TREATMENT),
+    Quantity("with_monitor", lambda d: d[1].monitored, "with the monitor's readings", record=TREATMENT),
+)
+MONITORING: Record[Monitoring] = Record(
+    "Cameras that drift from field to field, with and without the on-board monitor.",
+    Quantity("d_alpha_sigma_rad", lambda found: found.angle, "standard deviation of Δα of an outer line in the file"),
+    Quantity("height_for_1_arcsec_m", lambda found: found.metres, "height change for 1 arcsec of Δα of the first line"),
+    Quantity("noise_counts_as", lambda found: "independent", "how the noise of orbit and attitude enters"),
+    Quantity("sizes", lambda found: [(found, size) for size in found.sizes], record=CAMERA_DRIFT),
+)
+TIES: Record[tuple[Mapping[str, CheckErrors], Mapping[str, CheckErrors]]] = Record(
+    "A scheme without tie points and with them, over the check points of all fields.",
+    Quantity("without_ties", lambda e: FieldErrors.pooled(e[0].values()), record=ERRORS),
+    Quantity("with_ties", lambda e: FieldErrors.pooled(e[1].values()), record=ERRORS),
+)
+DATUM_SIGMA: Record[Datum] = Record(
+    "How well a turn of the whole pass is known.",
+    Quantity("sigma_before", lambda d: d.before, "standard deviation from the readings alone"),
+    Quantity("sigma_after", lambda d: d.after, "standard deviation with the tie points"),
+    Quantity("unit", lambda d: "rad/s" if "rate" in d.name else "rad", "of both"),
+)
+
+
+def _strips(run: CalibrationRun) -> Strips:
+    assert run.strips is not None
+    return run.strips
+
+
+STRIPS: Record[CalibrationRun] = Record(
+    "Passes adjusted on tie points.",
+    Quantity("ties", lambda run: _strips(run).ties, "tie points that two lines or more see, by field"),
+    Quantity("p_value", lambda run: _strips(run).p_values, "chance of a chi-square as large, by field"),
+    Quantity(
+        "schemes", lambda run: {k: (run.schemes[k], tied) for k, tied in _strips(run).schemes.items()}, record=TIES
+    ),
+    Quantity("datum", lambda run: {d.name: d for d in _strips(run).datum}, record=DATUM_SIGMA),
+)
+VERDICT: Record[CalibrationRun] = Record(
+    "Which schemes meet the limits of a map in every field.",
+    Quantity("scale", lambda run: "1:50000", "of the map"),
+    Quantity("plan_limit_m", lambda run: run.setup.test.limits.plan, "largest RMS error in plan"),
+    Quantity("height_limit_m", lambda run: run.setup.test.limits.height, "largest RMS error in height"),
+    Quantity("source", lambda run: "of the file", "of the limits"),
+    Quantity("before", lambda run: meets(run.before, run.setup.test.limits), "whether the laboratory's camera does"),
+    Quantity("schemes", lambda run: {k: meets(e, run.setup.test.limits) for k, e in run.schemes.items()}),
+)
+
+# --- points measured in images ---------------------------------------------------------------------------
+
+
+_MATCHES = {
+    "found": "places that were found, before any is rejected",
+    "matched": "places that the thresholds of matching let pass",
+    "accepted": "places that consensus lets pass, too",
+    "wrong_found": "wrong places among those that were found",
+    "wrong_matched": "wrong places among those that matching let pass",
+    "wrong_accepted": "wrong places among those that consensus let pass",
+    "right_rejected_by_consensus": "right matches that consensus rejected",
+}
+_SCREENED = {
+    "entered": "image points of control and tie points that enter the adjustment",
+    "left": "image points that the adjustment keeps",
+    "wrong_entered": "wrong places among those that enter",
+    "wrong_left": "wrong places among those that are kept",
+    "check_entered": "check points before the test of their intersection",
+    "check_left": "check points after the test of their intersection",
+    "wrong_check_left": "kept check points with a wrong place in a line",
+}
+
+
+def _sums(meanings: Mapping[str, str], parts: Callable[[Any], Any] = lambda parts: parts) -> list[Quantity[Any]]:
+    """Counts that are sums over line images or fields.
+
+    Args:
+        meanings: attribute of a part, which is the key, too -> what it counts.
+        parts: of a source; the source itself if not given.
     """
 
-    value: float
-    sigma: float
-    sigma_with_gauge: float
-    share_from_launch: float
-    held: bool
-    truth: float | None
-    unit: str
-
-    @classmethod
-    def of(cls, run: CalibrationRun) -> dict[str, Self]:
-        """Name -> numbers."""
-        found = run.together
-        sigma, held = found.sigma, found.gauge.held
-        whole = found.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
-        truth = [None] * len(found.names) if run.truth is None else run.truth.tolist()
-        return {
-            name: cls(float(value), sigma[name], whole[name], float(share), name in held, true, unit(name))
-            for name, value, share, true in zip(found.names, found.values, found.from_start, truth, strict=True)
-        }
-
-
-@dataclass(frozen=True)
-class SigmaNotes:
-    """What the sigmas hold."""
-
-    sigma: str
-    sigma_with_gauge: str
-    held_start_sigma_m: float
-    fields: str
-
-    @classmethod
-    def of(cls, run: CalibrationRun) -> Self:
-        """Of a run."""
-        rates = any(name in RATE for name in run.together.names)
-        own = any(name.endswith(RATE) for name in run.together.names) and not rates
-        return cls(
-            sigma="with the gauge's held unknowns exact"
-            + (", and with the drift of the biases during the passes as the latitude fit tells it" if rates else "")
-            + (", and with a drift of the attitude in each pass as it is stated or was found" if own else ""),
-            sigma_with_gauge="with what launch leaves to expect of the held unknowns, and all that follows them",
-            held_start_sigma_m=run.campaign.spec.launch.interior,
-            fields="of each field by itself: without the drift of the biases during the pass",
-        )
-
-
-@dataclass(frozen=True)
-class CorrelationNumbers:
-    """Of the unknowns that are not held."""
-
-    names: Sequence[str]
-    matrix: Array
-
-    @classmethod
-    def of(cls, run: CalibrationRun) -> Self:
-        """Of a run."""
-        found = run.together
-        free = [k for k, name in enumerate(found.names) if found.sigma[name] > 0.0]
-        return cls([found.names[k] for k in free], np.round(found.correlation[np.ix_(free, free)], 6))
-
-
-@dataclass(frozen=True)
-class CombinationNumbers:
-    """A change of unknowns together that the measurements do not see, or hardly."""
-
-    change: Mapping[str, float]
-    strength: float
-    sigma_m: float | None
-
-    @classmethod
-    def of(cls, combinations: Iterable[Combination]) -> tuple[Self, ...]:
-        """Of all."""
-        return tuple(
-            cls({name: float(v) for name, v in zip(one.names, one.change, strict=True)}, one.strength, one.sigma)
-            for one in combinations
-        )
-
-
-@dataclass(frozen=True)
-class FitNumbers:
-    """How the adjustment of all fields fits."""
-
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float
-    iterations: int
-    attitude_drift: DriftNumbers
-
-
-@dataclass(frozen=True)
-class StepwiseNumbers:
-    """One field by turns of interior orientation and biases; rate: what a round leaves of the error."""
-
-    field: str
-    rounds: int
-    rate: float
-    converged: bool
-
-
-@dataclass(frozen=True)
-class BiasNumbers:
-    """A bias of a field by itself."""
-
-    value: float
-    sigma: float
-    truth: float | None
-    unit: str
-
-
-@dataclass(frozen=True)
-class InteriorNumbers:
-    """A parameter of the interior orientation by one field."""
-
-    value: float
-    sigma: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class FieldNumbers:
-    """A field calibrated by itself."""
-
-    latitude_rad: float
-    bias: Mapping[str, BiasNumbers]
-    interior: Mapping[str, InteriorNumbers]
-    p_value: float
-    orbit_third_difference_rms_m: Array
-    attitude_third_difference_rms_rad: Array
-
-    @classmethod
-    def of(cls, one: FieldPass, result: FieldResult) -> Self:
-        """Of one field."""
-        alone = result.adjustment
-        sigma = alone.sigma
-        interior = interior_names(tuple(alone.cameras))
-        truth = [None] * len(BIAS) if one.known_truth is None else one.bias.tolist()
-        return cls(
-            latitude_rad=one.latitude,
-            bias={
-                name: BiasNumbers(float(v), sigma[f"{one.name} {name}"], t, "rad")
-                for name, v, t in zip(BIAS, alone.bias(one.name), truth, strict=True)
-            },
-            interior={
-                name: InteriorNumbers(alone.value(name), sigma[name], "m") for name in alone.names if name in interior
-            },
-            p_value=alone.p_value,
-            orbit_third_difference_rms_m=result.orbit.rms,
-            attitude_third_difference_rms_rad=result.attitude.rms,
-        )
-
-
-@dataclass(frozen=True)
-class LatitudeNumbers:
-    """Amplitude x sin(latitude - reference) + constant, of one axis of the biases."""
-
-    amplitude_rad: float
-    amplitude_sigma_rad: float
-    constant_rad: float
-    constant_sigma_rad: float
-    reference_rad: float
-    remainder_rad: float
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float
-
-    @classmethod
-    def of(cls, fit: LatitudeFit) -> Self:
-        """Of one axis."""
-        return cls(
-            fit.amplitude,
-            fit.amplitude_sigma,
-            fit.constant,
-            fit.constant_sigma,
-            fit.reference,
-            fit.remainder,
-            fit.chi_square,
-            fit.degrees_of_freedom,
-            fit.p_value,
-        )
-
-
-@dataclass(frozen=True)
-class RepeatabilityNumbers:
-    """Scatter of a parameter from field to field."""
-
-    name: str
-    unit: str
-    scatter: float
-    sigma: float
-    p_value: float | None
-
-    @classmethod
-    def of(cls, one: Repeatability) -> Self:
-        """Of one parameter."""
-        return cls(one.name, unit(one.name), one.scatter, one.sigma, one.p_value)
-
-
-@dataclass(frozen=True)
-class QuantityNumbers:
-    """A number and its unit."""
-
-    value: float
-    unit: str
-
-
-@dataclass(frozen=True)
-class LightNumbers:
-    """What effects on the light do where they are left in."""
-
-    left_in: Sequence[str]
-    moved_rms_m: Mapping[str, Array]
-    before: ErrorNumbers
-    after: ErrorNumbers
-    parameter_change: Mapping[str, QuantityNumbers]
-    parameter_change_sigmas: Mapping[str, float]
-    p_value: float
-
-    @classmethod
-    def of(cls, row: LightRow) -> Self:
-        """Of one choice of effects."""
-        return cls(
-            left_in=row.left,
-            moved_rms_m=row.moved,
-            before=ErrorNumbers(*row.before),
-            after=ErrorNumbers(*row.after),
-            parameter_change={name: QuantityNumbers(v, unit(name)) for name, v in row.shift.items()},
-            parameter_change_sigmas={n: v / row.sigma[n] for n, v in row.shift.items() if row.sigma[n] > 0.0},
-            p_value=row.p_value,
-        )
-
-
-@dataclass(frozen=True)
-class DatumNumbers:
-    """What a datum does that is off by a shift, or a clock of the lines that is late.
-
-    Attributes:
-        shift_east_north_up_m, late_s: the shift, or by how much the clock is late.
-        bias_change_rad, interior_change_m, offset_change_m: of the parameters.
-        most: the element of the interior that moves by the most of its sigmas.
-        most_sigmas: by how many.
-        one_sigma_at: shift or time that moves it by one sigma, metres or seconds.
-        warned_from: from which on an unknown is beyond what is expected, metres or seconds; None for never.
-        chi_square_change, p_value: of the fit.
-        after: errors at check points.
-    """
-
-    shift_east_north_up_m: Sequence[float]
-    late_s: float
-    bias_change_rad: Mapping[str, float]
-    interior_change_m: Mapping[str, float]
-    offset_change_m: Mapping[str, float]
-    most: str
-    most_sigmas: float
-    one_sigma_at: float | None
-    warned_from: float | None
-    chi_square_change: float
-    p_value: float
-    after: ErrorNumbers
-
-    @classmethod
-    def of(cls, row: DatumRow) -> Self:
-        """Of one shift."""
-        return cls(
-            shift_east_north_up_m=row.shift,
-            late_s=row.late,
-            bias_change_rad=dict(zip(BIAS, row.bias.tolist(), strict=True)),
-            interior_change_m=row.interior,
-            offset_change_m=dict(zip(OFFSET, row.offset.tolist(), strict=True)),
-            most=row.most_sigmas[0],
-            most_sigmas=row.most_sigmas[1],
-            one_sigma_at=row.size / row.most_sigmas[1] if row.most_sigmas[1] else None,
-            warned_from=row.warned,
-            chi_square_change=row.fit,
-            p_value=row.p_value,
-            after=ErrorNumbers(*row.after),
-        )
-
-
-@dataclass(frozen=True)
-class SurpriseNumbers:
-    """An estimate beyond what is expected of it."""
-
-    name: str
-    change: float
-    expected_sigma: float
-    ratio: float
-    unit: str
-
-    @classmethod
-    def of(cls, one: Surprise) -> Self:
-        """Of one unknown."""
-        return cls(one.name, one.change, one.expected, one.ratio, unit(one.name))
-
-
-@dataclass(frozen=True)
-class MeasuredNumbers:
-    """A measured pass: its points, what screening left out, ground sample distance.
-
-    sigma_factor: line -> on the sigmas of its image points, by the residuals. check_chi_square: of the check points'
-    rays by the pass's own parameters, with check_degrees_of_freedom.
-    """
-
-    control_points: int
-    tie_points: int
-    check_points: int
-    image_points: Mapping[str, int]
-    gsd_m: Mapping[str, Sequence[float]]
-    rejected: Sequence[Sequence[str]]
-    rejected_check_points: Sequence[str]
-    sigma_factor: Mapping[str, float] | None
-    check_chi_square: float
-    check_degrees_of_freedom: int
-
-    @classmethod
-    def of(cls, one: FieldPass, rejected: Rejected | None, meeting: Meeting) -> Self:
-        """Of one pass."""
-        ties = len(next(iter(one.tie_images.values())).point) if one.tie_images else 0
-        return cls(
-            control_points=int(one.is_control.sum()),
-            tie_points=int((~one.is_control).sum()) + ties,
-            check_points=len(one.check_ground),
-            image_points={name: len(row.point) for name, row in one.measurements.images.items()},
-            gsd_m={name: ground_sample(one, name) for name in one.data.sensors},
-            rejected=[] if rejected is None else rejected.points,
-            rejected_check_points=[] if rejected is None else rejected.check_points,
-            sigma_factor=None if rejected is None else rejected.factors,
-            check_chi_square=meeting.chi_square,
-            check_degrees_of_freedom=meeting.degrees_of_freedom,
-        )
-
-
-@dataclass(frozen=True)
-class CalibrationNumbers:
-    """calibration.json."""
-
-    seed: int
-    parameters: Mapping[str, ParameterNumbers]
-    sigmas: SigmaNotes
-    correlations: CorrelationNumbers
-    null_vectors: Sequence[CombinationNumbers]
-    weak_vectors: Sequence[CombinationNumbers]
-    gauge: str
-    images: ImageNumbers | None
-    measured: Mapping[str, MeasuredNumbers] | None
-    fit: FitNumbers
-    chip_steps: Sequence[StepNumbers]
-    stepwise: StepwiseNumbers
-    fields: Mapping[str, FieldNumbers]
-    schemes: Mapping[str, Mapping[str, ErrorNumbers]]
-    scheme_fields: Mapping[str, Sequence[str] | str]
-    before: Mapping[str, ErrorNumbers]
-    finding: MeanNumbers | None
-    bias_latitude: Mapping[str, LatitudeNumbers]
-    repeatability: Sequence[RepeatabilityNumbers]
-    light: Sequence[LightNumbers]
-    light_corrected: bool
-    datum: Sequence[DatumNumbers]
-    surprises: Sequence[SurpriseNumbers]
-    campaigns: CampaignNumbers | None
-    monitoring: MonitoringNumbers | None
-    strips: StripNumbers | None
-    verdict: VerdictNumbers
-
-    @classmethod
-    def of(cls, run: CalibrationRun) -> Self:
-        """Of a run."""
-        found, campaign, spec, way = run.together, run.campaign, run.campaign.spec, run.stepwise
-        limits = spec.limits
-        return cls(
-            seed=run.seed,
-            parameters=ParameterNumbers.of(run),
-            sigmas=SigmaNotes.of(run),
-            correlations=CorrelationNumbers.of(run),
-            null_vectors=CombinationNumbers.of(found.open),
-            weak_vectors=CombinationNumbers.of(found.weak),
-            gauge=str(found.gauge),
-            images=None if campaign.images is None else ImageNumbers.of(campaign.images),
-            measured=None
-            if run.truth is not None
-            else {
-                p.name: MeasuredNumbers.of(
-                    p, campaign.rejected.get(p.name), meeting_of(campaign, p, run.fields[p.name].adjustment)
-                )
-                for p in campaign.passes
-            },
-            fit=FitNumbers(
-                found.chi_square,
-                found.degrees_of_freedom,
-                found.p_value,
-                found.iterations,
-                DriftNumbers.of(campaign, found),
-            ),
-            chip_steps=StepNumbers.of(campaign, found),
-            stepwise=StepwiseNumbers(spec.schemes[0][0], way.rounds, way.rate, way.converged),
-            fields={p.name: FieldNumbers.of(p, run.fields[p.name]) for p in campaign.passes},
-            schemes={scheme: ErrorNumbers.by_field(errors) for scheme, errors in run.schemes.items()},
-            scheme_fields={
-                scheme: spec.schemes[k] if k < len(spec.schemes) else "each its own"
-                for k, scheme in enumerate(run.schemes)
-            },
-            before=ErrorNumbers.by_field(run.before),
-            finding=None if run.scheme_means is None else MeanNumbers.of(run.scheme_means),
-            bias_latitude={f.axis: LatitudeNumbers.of(f) for f in run.latitude},
-            repeatability=[RepeatabilityNumbers.of(r) for r in repeatability(run)],
-            light=[LightNumbers.of(row) for row in run.light],
-            light_corrected=bool(spec.effects.corrected),
-            datum=[DatumNumbers.of(row) for row in run.datum],
-            surprises=[SurpriseNumbers.of(s) for s in run.surprises],
-            campaigns=None if run.repeats is None else CampaignNumbers.of(run.repeats, limits.plan, limits.height),
-            monitoring=None if run.monitoring is None else MonitoringNumbers.of(run.monitoring),
-            strips=None if run.strips is None else StripNumbers.of(run.strips, run.schemes),
-            verdict=VerdictNumbers.of(run),
-        )
-
-
-def calibration_numbers(run: CalibrationRun) -> dict[str, Any]:
-    """Contents of calibration.json without its frames; what is not defined is None."""
-    return dict(plain_data(CalibrationNumbers.of(run)))
+    def total(name: str) -> Callable[[Any], int]:
+        return lambda source: sum(getattr(one, name) for one in parts(source))
+
+    return [Quantity(name, total(name), said) for name, said in meanings.items()]
+
+
+def _degrees(parts: Sequence[LineJudgement]) -> Array:
+    return np.array([j.degrees_of_freedom for j in parts], float)
+
+
+def _rms(parts: Sequence[LineJudgement]) -> Array:
+    """(2,) along the track and along the line, over the places of all parts."""
+    degrees = _degrees(parts)
+    square = np.sum([np.nan_to_num(j.rms) ** 2 * n for j, n in zip(parts, degrees, strict=True)], axis=0)
+    return np.asarray(np.sqrt(square / max(degrees.sum(), 1.0)))
+
+
+MATCHING: Record[Sequence[LineJudgement]] = Record(
+    "Points of one sort in the images of one line, over the patches of a field.",
+    *_sums(_MATCHES),
+    Quantity("rms_lines_px", lambda parts: _rms(parts)[0], "RMS error along the track of places that are not wrong"),
+    Quantity("rms_pixels_px", lambda parts: _rms(parts)[1], "RMS error along the line of places that are not wrong"),
+    Quantity(
+        "chi_square_ratio",
+        lambda parts: sum(j.chi_square for j in parts) / max(_degrees(parts).sum(), 1.0),
+        "chi-square of the errors of these places over its degrees of freedom",
+    ),
+)
+
+
+def _by_line(one: FieldImages) -> dict[str, dict[str, list[LineJudgement]]]:
+    """Sort of points -> line -> judgements of the patches."""
+    parts: dict[str, dict[str, list[LineJudgement]]] = {}
+    for patch in one.patches:
+        for sort, lines in patch.judgements.items():
+            for line, judgement in lines.items():
+                parts.setdefault(sort, {}).setdefault(line, []).append(judgement)
+    return parts
+
+
+def _judgements(campaign: Campaign) -> list[LineJudgement]:
+    every = [lines for one in campaign.images or () for lines in _by_line(one).values()]
+    return [judgement for lines in every for parts in lines.values() for judgement in parts]
+
+
+def _screenings(campaign: Campaign) -> list[Screening]:
+    return [one.screening for one in campaign.images or () if one.screening is not None]
+
+
+TOTAL: Record[Campaign] = Record(
+    "Points in images, over all fields and lines; what is wrong is known from the truth.",
+    *_sums(_MATCHES, _judgements),
+    *_sums(_SCREENED, _screenings),
+    Quantity(
+        "right_rejected_by_adjustment",
+        lambda campaign: sum(s.right_lost for s in _screenings(campaign)),
+        "right places that the adjustment left out",
+    ),
+)
+IMAGES: Record[Campaign] = Record(
+    "Points measured in rendered images.",
+    Quantity("total", lambda campaign: campaign, record=TOTAL),
+    Quantity(
+        "fields",
+        lambda campaign: {one.name: _by_line(one) for one in campaign.images or ()},
+        "by sort of points and line",
+        record=MATCHING,
+    ),
+)
+
+# --- parameters and fields -------------------------------------------------------------------------------
+
+UNKNOWN: Record[Unknown] = Record(
+    "An unknown of the adjustment of all fields.",
+    Quantity("value", lambda one: one.value, "estimated"),
+    Quantity("sigma", lambda one: one.sigma, "standard deviation with the gauge's held unknowns exact"),
+    Quantity(
+        "sigma_with_gauge",
+        lambda one: one.sigma_with_gauge,
+        "standard deviation with what launch leaves to expect of the held unknowns",
+    ),
+    Quantity(
+        "share_from_launch",
+        lambda one: one.from_start,
+        "share of its variance that comes from the sigmas of launch and season and not from the points, 0 to 1",
+    ),
+    Quantity("held", lambda one: one.held, "whether the gauge holds it"),
+    Quantity("truth", lambda one: one.truth, "true value, where a simulation knows it"),
+    Quantity("unit", lambda one: one.unit, "of value, sigmas and truth"),
+)
+
+
+def _conditions(run: CalibrationRun) -> str:
+    names = run.together.names
+    rates = any(name in RATE for name in names)
+    own = any(name.endswith(RATE) for name in names) and not rates
+    return (
+        "with the gauge's held unknowns exact"
+        + ", and with the drift of the biases during the passes as the latitude fit tells it" * rates
+        + ", and with a drift of the attitude in each pass as it is stated or was found" * own
+    )
+
+
+SIGMAS: Record[CalibrationRun] = Record(
+    "What the sigmas hold.",
+    Quantity("sigma", _conditions),
+    Quantity(
+        "sigma_with_gauge",
+        lambda run: "with what launch leaves to expect of the held unknowns, and all that follows them",
+    ),
+    Quantity("held_start_sigma_m", lambda run: run.setup.test.launch.interior, "of held unknowns after a launch"),
+    Quantity("fields", lambda run: "of each field by itself: without the drift of the biases during the pass"),
+)
+
+
+def _free(found: Adjustment) -> list[int]:
+    """Numbers of the unknowns that are not held."""
+    sigma = found.sigma
+    return [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
+
+
+CORRELATIONS: Record[Adjustment] = Record(
+    "Correlations of the unknowns that are not held.",
+    Quantity("names", lambda found: [found.names[k] for k in _free(found)], "of rows and columns"),
+    Quantity("matrix", lambda found: np.round(found.correlation[np.ix_(_free(found), _free(found))], 6)),
+)
+COMBINATION: Record[Combination] = Record(
+    "A change of unknowns together that the measurements do not see, or hardly.",
+    Quantity(
+        "change",
+        lambda one: dict(zip(one.names, one.change, strict=True)),
+        "of each unknown, for an image motion of any one of them of at most 1 mm",
+    ),
+    Quantity("strength", lambda one: one.strength, "how much less well it is known than its unknowns alone would be"),
+    Quantity("sigma_m", lambda one: one.sigma, "what one sigma of the data allows it, as motion in the image"),
+)
+ATTITUDE_DRIFT: Record[AttitudeDrift] = Record(
+    "Drift of the attitude within the passes.",
+    Quantity("seconds", lambda d: d.seconds, "from when the first line sees a field to when the last one does"),
+    Quantity(
+        "sigmas_per_arcsec",
+        lambda d: d.sigmas_per_arcsec,
+        "change of each unknown in its sigmas for a drift of 1 arcsec in these seconds that is no unknown",
+        converted=False,
+    ),
+    Quantity("seen_arcsec", lambda d: d.seen, "drift about body X, Y, Z that residuals show in half of all cases"),
+    Quantity("unseen_sigmas", lambda d: d.unseen_sigmas, "sigmas by which the most sensitive unknown is then wrong"),
+    Quantity("rate_p_value", lambda d: d.rate_p_value, "chance of the residuals without rates of the attitude"),
+    Quantity("course_p_value", lambda d: d.course_p_value, "chance of the residuals without slow errors of the lines"),
+    Quantity("false_alarm", lambda d: FALSE_ALARM, "of either test"),
+    Quantity("assumed_rate_rad_s", lambda d: d.assumed and d.assumed.rate, "sigma of the rates that are assumed since"),
+    Quantity("assumed_walk_rad", lambda d: d.assumed and d.assumed.walk, "likewise of a random walk, in one second"),
+)
+FIT: Record[CalibrationRun] = Record(
+    "How the adjustment of all fields fits.",
+    Quantity("chi_square", lambda run: run.together.chi_square, "of the residuals"),
+    Quantity("degrees_of_freedom", lambda run: run.together.degrees_of_freedom, "of chi-square"),
+    Quantity("p_value", lambda run: run.together.p_value, "chance of a chi-square as large"),
+    Quantity("iterations", lambda run: run.together.iterations, "steps of the adjustment"),
+    Quantity("attitude_drift", lambda run: run.drift, record=ATTITUDE_DRIFT),
+)
+CHIP_STEP: Record[ChipStep] = Record(
+    "A step of x (along the track) or y within a line, at a joint between chips.",
+    Quantity("line", lambda step: step.line, "camera"),
+    Quantity("axis", lambda step: step.axis, "x or y"),
+    Quantity("place_m", lambda step: step.place, "y of the joint in the focal plane"),
+    Quantity("step_m", lambda step: step.step, "what the residuals say of it"),
+    Quantity("sigma_m", lambda step: step.sigma, "its standard deviation, all steps together"),
+    Quantity("seen_from_m", lambda step: step.seen_from, "step that is told in half of all cases"),
+    Quantity("found", lambda step: step.found, "whether this one is told, false alarm 1e-4 for all together"),
+)
+STEPWISE: Record[CalibrationRun] = Record(
+    "One field by turns of interior orientation and biases.",
+    Quantity("field", lambda run: run.setup.test.schemes[0][0], "its name"),
+    Quantity("rounds", lambda run: run.stepwise.rounds, "until the steps are small"),
+    Quantity("rate", lambda run: run.stepwise.rate, "what a round leaves of the slowest error"),
+    Quantity("converged", lambda run: run.stepwise.converged, "whether the steps become small"),
+)
+BIAS_OF_FIELD: Record[tuple[float, float, float | None]] = Record(
+    "A bias of a field by itself.",
+    Quantity("value", lambda bias: bias[0], "estimated"),
+    Quantity("sigma", lambda bias: bias[1], "standard deviation"),
+    Quantity("truth", lambda bias: bias[2], "true value, where a simulation knows it"),
+    Quantity("unit", lambda bias: "rad", "of all of them"),
+)
+INTERIOR_OF_FIELD: Record[tuple[float, float]] = Record(
+    "A parameter of the interior orientation by one field.",
+    Quantity("value", lambda found: found[0], "estimated"),
+    Quantity("sigma", lambda found: found[1], "standard deviation"),
+    Quantity("unit", lambda found: "m", "of both"),
+)
+
+
+def _biases(one: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float, float | None]]:
+    here, found = one[0], one[1].adjustment
+    truth = [None] * len(BIAS) if here.known_truth is None else here.bias.tolist()
+    sigma = found.sigma
+    return {
+        name: (float(value), sigma[f"{here.name} {name}"], true)
+        for name, value, true in zip(BIAS, found.bias(here.name), truth, strict=True)
+    }
+
+
+def _interior(one: tuple[FieldPass, FieldResult]) -> dict[str, tuple[float, float]]:
+    found = one[1].adjustment
+    sigma, inner = found.sigma, interior_names(tuple(found.cameras))
+    return {name: (found.value(name), sigma[name]) for name in found.names if name in inner}
+
+
+FIELD: Record[tuple[FieldPass, FieldResult]] = Record(
+    "A field calibrated by itself.",
+    Quantity("latitude_rad", lambda one: one[0].latitude, "mean of the control points"),
+    Quantity("bias", _biases, record=BIAS_OF_FIELD),
+    Quantity("interior", _interior, record=INTERIOR_OF_FIELD),
+    Quantity("p_value", lambda one: one[1].adjustment.p_value, "chance of a chi-square as large"),
+    Quantity("orbit_third_difference_rms_m", lambda one: one[1].orbit.rms, "of the measured positions, x, y, z"),
+    Quantity("attitude_third_difference_rms_rad", lambda one: one[1].attitude.rms, "roll, pitch, yaw"),
+)
+MEASURED: Record[tuple[Campaign, FieldPass, Adjustment]] = Record(
+    "A measured pass: its points, what screening left out, ground sample distance.",
+    Quantity("control_points", lambda m: int(m[1].is_control.sum()), "that calibrate"),
+    Quantity("tie_points", lambda m: m[1].tie_count, "that calibrate or tie the strip"),
+    Quantity("check_points", lambda m: len(m[1].check_ground), "that test"),
+    Quantity(
+        "image_points",
+        lambda m: {name: len(row.point) for name, row in m[1].measurements.images.items()},
+        "by line camera",
+    ),
+    Quantity(
+        "gsd_m",
+        lambda m: {name: ground_sample(m[1], name) for name in m[1].data.sensors},
+        "ground sample distance along and across the track, by line camera",
+    ),
+    Quantity("rejected", lambda m: _rejected(m, "points", []), "points with a rejected image point, and its line"),
+    Quantity("rejected_check_points", lambda m: _rejected(m, "check_points", []), "whose rays do not meet"),
+    Quantity(
+        "sigma_factor",
+        lambda m: _rejected(m, "factors"),
+        "by line, on the sigmas of its image points, by the residuals",
+    ),
+    Quantity("check_chi_square", lambda m: meeting_of(*m).chi_square, "of the rays of the check points"),
+    Quantity("check_degrees_of_freedom", lambda m: meeting_of(*m).degrees_of_freedom, "of this chi-square"),
+)
+
+
+def _rejected(measured: tuple[Campaign, FieldPass, Adjustment], what: str, none: Any = None) -> Any:
+    campaign, one, _ = measured
+    gone = campaign.rejected.get(one.name)
+    return none if gone is None else getattr(gone, what)
+
+
+LATITUDE: Record[LatitudeFit] = Record(
+    "Amplitude x sin(latitude - reference) + constant, of one axis of the biases.",
+    Quantity("amplitude_rad", lambda fit: fit.amplitude, "of the drift with latitude"),
+    Quantity("amplitude_sigma_rad", lambda fit: fit.amplitude_sigma, "its standard deviation, with what remains"),
+    Quantity("constant_rad", lambda fit: fit.constant, "bias at the reference"),
+    Quantity("constant_sigma_rad", lambda fit: fit.constant_sigma, "its standard deviation, with what remains"),
+    Quantity("reference_rad", lambda fit: fit.reference, "latitude in the middle of the fields"),
+    Quantity("remainder_rad", lambda fit: fit.remainder, "standard deviation of what remains: the season"),
+    Quantity("chi_square", lambda fit: fit.chi_square, "by the biases' own covariance"),
+    Quantity("degrees_of_freedom", lambda fit: fit.degrees_of_freedom, "of this chi-square"),
+    Quantity("p_value", lambda fit: fit.p_value, "chance of a chi-square as large if latitude is all that matters"),
+)
+REPEATABILITY: Record[Repeatability] = Record(
+    "Scatter of a parameter from field to field.",
+    Quantity("name", lambda one: one.name, "of the parameter"),
+    Quantity("unit", lambda one: unit(one.name), "of scatter and sigma"),
+    Quantity("scatter", lambda one: one.scatter, "standard deviation over the fields"),
+    Quantity("sigma", lambda one: one.sigma, "that the adjustments of single fields claim, root mean square"),
+    Quantity("p_value", lambda one: one.p_value, "chance of such a scatter if the parameter is the same in all fields"),
+)
+
+# --- errors that the fit hardly shows --------------------------------------------------------------------
+
+CHANGE: Record[tuple[str, float]] = Record(
+    "Change of a parameter.",
+    Quantity("value", lambda change: change[1], "the change"),
+    Quantity("unit", lambda change: unit(change[0]), "its unit"),
+)
+LIGHT: Record[LightRow] = Record(
+    "Effects on the light that are left in the image points, and what they do.",
+    Quantity("left_in", lambda row: row.left, "the effects"),
+    Quantity("moved_rms_m", lambda row: row.moved, "RMS of how far they move image points, x and y, by line camera"),
+    Quantity("before", lambda row: row.before, "with the laboratory's camera, mean of the fields", record=ERRORS),
+    Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
+    Quantity("parameter_change", lambda row: {n: (n, v) for n, v in row.shift.items()}, record=CHANGE),
+    Quantity(
+        "parameter_change_sigmas",
+        lambda row: {n: v / row.sigma[n] for n, v in row.shift.items() if row.sigma[n] > 0.0},
+        "changes in sigmas of the parameter",
+    ),
+    Quantity("p_value", lambda row: row.p_value, "chance of a chi-square as large"),
+)
+DATUM: Record[DatumRow] = Record(
+    "What a datum does that is off by a shift, or a clock of the lines that is late.",
+    Quantity("shift_east_north_up_m", lambda row: row.shift, "of all control points"),
+    Quantity("late_s", lambda row: row.late, "by how much the clock is late"),
+    Quantity("bias_change_rad", lambda row: dict(zip(BIAS, row.bias, strict=True)), "mean over the fields"),
+    Quantity("interior_change_m", lambda row: row.interior, "by element of the interior orientation"),
+    Quantity("offset_change_m", lambda row: dict(zip(OFFSET, row.offset, strict=True)), "mean over the fields"),
+    Quantity("most", lambda row: row.most_sigmas[0], "the element that moves by the most of its sigmas"),
+    Quantity("most_sigmas", lambda row: row.most_sigmas[1], "by how many"),
+    Quantity(
+        "one_sigma_at",
+        lambda row: row.size / row.most_sigmas[1] if row.most_sigmas[1] else None,
+        "shift or delay that moves it by one sigma, metres or seconds",
+    ),
+    Quantity("warned_from", lambda row: row.warned, "shift or delay from which on there is a warning; null for never"),
+    Quantity("chi_square_change", lambda row: row.fit, "of the adjustment"),
+    Quantity("p_value", lambda row: row.p_value, "chance of a chi-square as large"),
+    Quantity("after", lambda row: row.after, "with each field's own parameters, mean of the fields", record=ERRORS),
+)
+SURPRISE: Record[Surprise] = Record(
+    "An estimate beyond what launch and orbit leave to expect.",
+    Quantity("name", lambda one: one.name, "of the unknown"),
+    Quantity("change", lambda one: one.change, "from the value that is expected"),
+    Quantity("expected_sigma", lambda one: one.expected, "standard deviation that is expected"),
+    Quantity("ratio", lambda one: one.ratio, "of both"),
+    Quantity("unit", lambda one: unit(one.name), "of change and sigma"),
+)
+
+# --- the file --------------------------------------------------------------------------------------------
+
+
+def _measured(run: CalibrationRun) -> dict[str, tuple[Campaign, FieldPass, Adjustment]] | None:
+    if run.truth is not None:
+        return None
+    return {p.name: (run.campaign, p, run.fields[p.name].adjustment) for p in run.campaign.passes}
+
+
+def _scheme_fields(run: CalibrationRun) -> dict[str, Sequence[str] | str]:
+    return dict(zip(run.schemes, (*run.setup.test.schemes, "each its own"), strict=True))
+
+
+CALIBRATION: Record[CalibrationRun] = Record(
+    "calibration.json. Metres and radians; what is not defined is null.",
+    Quantity("seed", lambda run: run.seed, "of all random numbers"),
+    Quantity("parameters", unknowns, "of the adjustment of all fields", record=UNKNOWN),
+    Quantity("sigmas", lambda run: run, record=SIGMAS),
+    Quantity("correlations", lambda run: run.together, record=CORRELATIONS),
+    Quantity("null_vectors", lambda run: run.together.open, "what the points cannot tell", record=COMBINATION),
+    Quantity("weak_vectors", lambda run: run.together.weak, "what the points tell badly", record=COMBINATION),
+    Quantity("gauge", lambda run: str(run.together.gauge), "what is held"),
+    Quantity("images", lambda run: None if run.campaign.images is None else run.campaign, record=IMAGES),
+    Quantity("measured", _measured, "by pass, of a calibration on measurements", record=MEASURED),
+    Quantity("fit", lambda run: run, record=FIT),
+    Quantity("chip_steps", lambda run: run.chip_steps, record=CHIP_STEP),
+    Quantity("stepwise", lambda run: run, record=STEPWISE),
+    Quantity("fields", lambda run: {p.name: (p, run.fields[p.name]) for p in run.campaign.passes}, record=FIELD),
+    Quantity("schemes", lambda run: run.schemes, "by scheme and field, without ground control", record=ERRORS),
+    Quantity("scheme_fields", _scheme_fields, "whose parameters each scheme averages"),
+    Quantity("before", lambda run: run.before, "with the laboratory's camera, by field", record=ERRORS),
+    Quantity("finding", lambda run: run.scheme_means, record=MEANS),
+    Quantity("bias_latitude", lambda run: {fit.axis: fit for fit in run.latitude}, record=LATITUDE),
+    Quantity("repeatability", lambda run: run.repeatability, record=REPEATABILITY),
+    Quantity("light", lambda run: run.light, record=LIGHT),
+    Quantity("light_corrected", lambda run: bool(run.setup.test.effects.corrected), "whether effects are taken out"),
+    Quantity("datum", lambda run: run.datum, record=DATUM),
+    Quantity("surprises", lambda run: run.surprises, "the largest first", record=SURPRISE),
+    Quantity("campaigns", lambda run: None if run.repeats is None else run, record=CAMPAIGNS),
+    Quantity("monitoring", lambda run: run.monitoring, record=MONITORING),
+    Quantity("strips", lambda run: None if run.strips is None else run, record=STRIPS),
+    Quantity("verdict", lambda run: run, record=VERDICT),
+)

@@ -8,34 +8,19 @@ from matplotlib.figure import Figure
 from analysis.orbit.three_line_model import BIAS, misclosure
 from analysis.units import ARCSEC
 from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors
+from twin.orbit.calibration.camera_drift import Monitoring
 from twin.orbit.calibration.flown_campaign import true_bias
-from twin.orbit.calibration.schemes import RMS, values_of
-from twin.run.svg import (
-    BLUE,
-    GREEN,
-    GREY,
-    INK,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILION,
-    gridded,
-    look,
-    new_figure,
-    shared_legend,
-    signed_map,
-    to_svg,
-)
+from twin.orbit.calibration.schemes import RMS, FieldErrors, values_of
+from twin.run import svg
 
 
 def drift_svg(run: CalibrationRun, found: Monitoring) -> str:
     """The figure as SVG."""
-    with look("calibration-monitor-heights"):
-        return to_svg(_figure(run, found))
+    with svg.look("calibration-monitor-heights"):
+        return svg.to_svg(_figure(run, found))
 
 
-def expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
+def _expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) -> np.ndarray:
     """Height RMS (n,) for drifts of these sizes without a monitor that many campaigns would have, metres.
 
     All fields adjusted at once, each with one drift; the outer lines' d_alpha and the mean of it taken out.
@@ -43,64 +28,66 @@ def expected_height(run: CalibrationRun, found: Monitoring, factor: np.ndarray) 
     spec = run.campaign.simulated
     square = sum(one.angles[0] ** 2 for name, one in spec.drift.items() if name != "nadir")
     metres = found.metres * np.sqrt(square * (1.0 - 1.0 / len(spec.fields))) / ARCSEC
-    return np.asarray(np.hypot(found.at(0.0).without.together.height, factor * metres))
+    return np.asarray(np.hypot(found.at(0.0).without.together.height_rms, factor * metres))
 
 
 def _figure(run: CalibrationRun, found: Monitoring) -> Figure:
-    figure = new_figure(4.3)
+    figure = svg.new_figure(4.3)
     left, right = figure.subplots(1, 2)
     angle = found.angle / ARCSEC or 1.0
     size = np.array([s.factor for s in found.sizes])
     fine = np.linspace(0.0, size[-1], 101)
-    left.plot(fine * angle, expected_height(run, found, fine), "--", color=GREY, lw=1.0, label="mean of many campaigns")
-    cases = {"without monitor": (VERMILION, "o"), "with monitor": (BLUE, "s")}
+    left.plot(
+        fine * angle, _expected_height(run, found, fine), "--", color=svg.GREY, lw=1.0, label="mean of many campaigns"
+    )
+    cases = {"without monitor": (svg.VERMILION, "o"), "with monitor": (svg.BLUE, "s")}
     monitored = [s.monitored for s in found.sizes if s.monitored is not None]
     for (label, (colour, marker)), rows in zip(
         cases.items(), ([s.without for s in found.sizes], monitored), strict=True
     ):
         if rows:
-            height = [row.together.height for row in rows]
+            height = [row.together.height_rms for row in rows]
             left.plot(size * angle, height, f"{marker}-", color=colour, lw=1.4, ms=5, label=label)
     unit = "σ of Δα of an outer line [arcsec]" if found.angle else "size of the drift against the file's"
     left.set(title="All fields adjusted at once", xlabel=unit, ylabel="height RMS at check points [m]")
     names = list(found.sizes[0].without.schemes)
     here = found.at(1.0)
-    bars: list[tuple[str, str, list[PooledErrors]]] = [
-        ("no drift", GREY, list(found.at(0.0).without.schemes.values())),
-        ("without monitor", VERMILION, list(here.without.schemes.values())),
+    bars: list[tuple[str, str, list[FieldErrors]]] = [
+        ("no drift", svg.GREY, list(found.at(0.0).without.schemes.values())),
+        ("without monitor", svg.VERMILION, list(here.without.schemes.values())),
     ]
     if here.monitored is not None:
-        bars.append(("with monitor", BLUE, list(here.monitored.schemes.values())))
+        bars.append(("with monitor", svg.BLUE, list(here.monitored.schemes.values())))
     place, width = np.arange(len(names)), 0.8 / len(bars)
     for k, (label, colour, values) in enumerate(bars):
         at = place + (k - 0.5 * (len(bars) - 1)) * width
-        right.bar(at, [v.height for v in values], 0.92 * width, color=colour, label=label)
+        right.bar(at, [v.height_rms for v in values], 0.92 * width, color=colour, label=label)
     title = "Without ground control, the file's drift"
     right.set(title=title, xticks=place, xlabel="scheme", ylabel="height RMS at check points [m]")
     right.set_xticklabels([*names[:-1], f"{names[-1]}\neach its own"])
     for axes in (left, right):
         axes.set_ylim(0.0, None)
-        gridded(axes)
-        axes.tick_params(colors=INK)
+        svg.gridded(axes)
+        axes.tick_params(colors=svg.INK)
     handles, labels = left.get_legend_handles_labels()
     more, other = right.get_legend_handles_labels()
     figure.legend([*handles, more[0]], [*labels, other[0]], loc="outside lower center", ncols=4)
     return figure
 
 
-COLOURS = (BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, GREY)
+COLOURS = (svg.BLUE, svg.ORANGE, svg.GREEN, svg.VERMILION, svg.PURPLE, svg.SKY, svg.GREY)
 MARKERS = "osD^vP"
 
 
 def figure_svg(name: str, run: CalibrationRun) -> str:
     """One figure of `FIGURES` as SVG."""
-    with look(f"calibration-{name}"):
-        return to_svg(FIGURES[name](run))
+    with svg.look(f"calibration-{name}"):
+        return svg.to_svg(FIGURES[name](run))
 
 
-def schemes_figure(run: CalibrationRun) -> Figure:
+def _schemes_figure(run: CalibrationRun) -> Figure:
     """RMS of every field over the schemes, plan and height."""
-    figure = new_figure(4.3)
+    figure = svg.new_figure(4.3)
     panels = figure.subplots(1, 2)
     names, limits = list(run.schemes), run.campaign.spec.limits
     place = np.arange(len(names))
@@ -112,24 +99,24 @@ def schemes_figure(run: CalibrationRun) -> Figure:
             style = MARKERS[k // len(COLOURS) % len(MARKERS)]
             colour = COLOURS[k % len(COLOURS)]
             axes.plot(place, table[:, k], f"{style}-", color=colour, lw=0.9, ms=4, label=field)
-        axes.plot(place, table.mean(axis=1), "-", color=INK, lw=2.2, label="mean of the fields")
+        axes.plot(place, table.mean(axis=1), "-", color=svg.INK, lw=2.2, label="mean of the fields")
         before = values_of(run.before, what)
         low, high = before.min(), before.max()
         axes.set_ylim(0.0, 1.35 * table.max())
         label = f"before calibration {low:.0f} to {high:.0f} m; limit for 1:50 000 {limit:g} m"
         axes.set(title=f"RMS in {title} [m]", xticks=place, xlabel="scheme")
-        axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=GREY, fontsize=8.5)
+        axes.text(0.5, 0.97, label, transform=axes.transAxes, ha="center", va="top", color=svg.GREY, fontsize=8.5)
         if limit < 1.35 * table.max():
-            axes.axhline(limit, color=GREY, lw=0.9, ls="--")
+            axes.axhline(limit, color=svg.GREY, lw=0.9, ls="--")
         axes.set_xticklabels(labels)
-        gridded(axes)
-    shared_legend(figure, panels[0], "lower center", 4)
+        svg.gridded(axes)
+    svg.shared_legend(figure, panels[0], "lower center", 4)
     return figure
 
 
-def latitude_figure(run: CalibrationRun) -> Figure:
+def _latitude_figure(run: CalibrationRun) -> Figure:
     """Bias of every field with sigma, truth, and the fit."""
-    figure = new_figure(3.9)
+    figure = svg.new_figure(3.9)
     campaign, passes = run.campaign, run.campaign.passes
     latitude = np.array([p.latitude for p in passes])
     reach = np.linspace(latitude.min() - 0.03, latitude.max() + 0.03, 101)
@@ -138,31 +125,33 @@ def latitude_figure(run: CalibrationRun) -> Figure:
         sigma = np.array([run.together.sigma[f"{p.name} {axis}"] for p in passes]) / ARCSEC
         if campaign.known_truth is not None:
             truth = true_bias(campaign.simulated, reach)
-            axes.plot(np.degrees(reach), truth[:, k] / ARCSEC, color=GREY, lw=1.0, ls="--", label="truth, no season")
+            axes.plot(
+                np.degrees(reach), truth[:, k] / ARCSEC, color=svg.GREY, lw=1.0, ls="--", label="truth, no season"
+            )
         for fit in run.latitude[k : k + 1]:
-            axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=VERMILION, lw=1.3, label="fit")
+            axes.plot(np.degrees(reach), fit.curve(reach) / ARCSEC, color=svg.VERMILION, lw=1.3, label="fit")
         if campaign.known_truth is not None:
             true = np.array([p.bias[k] for p in passes]) / ARCSEC
-            axes.plot(np.degrees(latitude), true, "x", color=INK, ms=6, label="truth of the field", zorder=4)
+            axes.plot(np.degrees(latitude), true, "x", color=svg.INK, ms=6, label="truth of the field", zorder=4)
         axes.errorbar(
-            np.degrees(latitude), value, sigma, fmt="o", color=BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
+            np.degrees(latitude), value, sigma, fmt="o", color=svg.BLUE, ms=4, lw=1.2, capsize=2, label="estimated, 1σ"
         )
         axes.set(title=f"{axis} [arcsec]", xlabel="latitude [deg]")
-        gridded(axes)
+        svg.gridded(axes)
         handles = axes.get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=4)
     return figure
 
 
-def correlation_figure(run: CalibrationRun) -> Figure:
+def _correlation_figure(run: CalibrationRun) -> Figure:
     """Matrix of the simultaneous adjustment."""
     found = run.together
     sigma = found.sigma
     free = [k for k, name in enumerate(found.names) if sigma[name] > 0.0]
     names = [found.names[k] for k in free]
-    figure = new_figure(min(9.2, 2.6 + 0.14 * len(names)))
+    figure = svg.new_figure(min(9.2, 2.6 + 0.14 * len(names)))
     axes = figure.subplots()
-    shown = signed_map(axes, found.correlation[np.ix_(free, free)], 1.0)
+    shown = svg.signed_map(axes, found.correlation[np.ix_(free, free)], 1.0)
     size = 6.5 if len(names) > 40 else 8.0
     axes.set_xticks(np.arange(len(names)), names, rotation=90, fontsize=size)
     axes.set_yticks(np.arange(len(names)), names, fontsize=size)
@@ -170,18 +159,18 @@ def correlation_figure(run: CalibrationRun) -> Figure:
     groups = ["interior" if name in run.campaign.inner else name.split()[0] for name in names]
     for k in range(1, len(groups)):
         if groups[k] != groups[k - 1]:
-            axes.axhline(k - 0.5, color=INK, lw=0.6)
-            axes.axvline(k - 0.5, color=INK, lw=0.6)
+            axes.axhline(k - 0.5, color=svg.INK, lw=0.6)
+            axes.axvline(k - 0.5, color=svg.INK, lw=0.6)
     figure.colorbar(shown, ax=axes, shrink=0.6, label="correlation")
     return figure
 
 
-def residual_figure(run: CalibrationRun) -> Figure:
+def _residual_figure(run: CalibrationRun) -> Figure:
     """Residuals of one field's control points in the images of the lines, in pixels."""
     one = run.campaign.passes[0]
     found = run.together
     offset = [found.value(n) if n in found.names else 0.0 for n in _offsets(one.name)]
-    figure = new_figure(3.9)
+    figure = svg.new_figure(3.9)
     shown = tuple(one.control.rays)
     panels = figure.subplots(1, len(shown), sharex=True, squeeze=False)[0]
     for axes, line in zip(panels, shown, strict=True):
@@ -196,27 +185,27 @@ def residual_figure(run: CalibrationRun) -> Figure:
         left = left / pitch
         images = one.control_images[line]
         arrows = axes.quiver(
-            images.pixel, images.line / 1e3, left[:, 1], left[:, 0], color=BLUE, width=0.004, scale=14.0, zorder=3
+            images.pixel, images.line / 1e3, left[:, 1], left[:, 0], color=svg.BLUE, width=0.004, scale=14.0, zorder=3
         )
-        axes.plot(images.pixel, images.line / 1e3, ".", color=GREY, ms=2)
+        axes.plot(images.pixel, images.line / 1e3, ".", color=svg.GREY, ms=2)
         axes.quiverkey(arrows, 0.86, 1.04, 1.0, "1 px", labelpos="E", coordinates="axes")
         rms = np.sqrt(np.mean(left**2, axis=0))
         axes.set_title(f"{line}: x {rms[0]:.2f} px, y {rms[1]:.2f} px", loc="left")
         axes.set(xlabel="pixel")
         axes.margins(0.12)
-        gridded(axes)
+        svg.gridded(axes)
     panels[0].set_ylabel("image line, thousands")
     return figure
 
 
-def check_figure(run: CalibrationRun) -> Figure:
+def _check_figure(run: CalibrationRun) -> Figure:
     """Errors at one field's check points before calibration and with its own parameters; arrows plan, colour height."""
     one = run.campaign.passes[0]
     _, lat, _ = (float(v) for v in one.data.earth.geodetic(one.check_ground.mean(axis=0)))
     lon, latitude, _ = one.data.earth.geodetic(one.check_ground)
     east = (lon - lon.mean()) * 6.378e3 * np.cos(lat)
     north = (latitude - latitude.mean()) * 6.357e3
-    figure = new_figure(5.2)
+    figure = svg.new_figure(5.2)
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     cases = (
         ("laboratory's camera", run.before[one.name]),
@@ -244,17 +233,17 @@ def check_figure(run: CalibrationRun) -> Figure:
         axes.set_aspect("equal")
         axes.margins(0.14)
         figure.colorbar(arrows, ax=axes, shrink=0.75, label="height error [m]", location="bottom")
-        gridded(axes)
+        svg.gridded(axes)
     panels[0].set_ylabel("north [km]")
     return figure
 
 
 FIGURES = {
-    "schemes-of-fields": schemes_figure,
-    "bias-latitude": latitude_figure,
-    "correlation-matrix": correlation_figure,
-    "residuals": residual_figure,
-    "check-points": check_figure,
+    "schemes-of-fields": _schemes_figure,
+    "bias-latitude": _latitude_figure,
+    "correlation-matrix": _correlation_figure,
+    "residuals": _residual_figure,
+    "check-points": _check_figure,
 }
 
 

@@ -7,23 +7,12 @@ from typing import TYPE_CHECKING
 from analysis.units import ARCSEC
 from scenes.specs.measured.orbit_data_setup import MeasuredCalibrationSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.attitude_drift import DriftNumbers, drift_warnings
-from twin.orbit.calibration.calibration_numbers import unit
-from twin.orbit.calibration.calibration_run import CalibrationRun
-from twin.orbit.calibration.calibration_sections import (
-    monitor_gain,
-    rests_on_launch,
-    scheme_names,
-    scheme_summary,
-    sections,
-    strip_gain,
-)
-from twin.orbit.calibration.chip_steps import StepNumbers, step_warnings
-from twin.orbit.calibration.influences import SURPRISE
-from twin.orbit.calibration.measured_sections import measured_facts, measured_warnings
+from twin.orbit.calibration import calibration_sections
+from twin.orbit.calibration.calibration_run import CalibrationRun, unit
+from twin.orbit.calibration.influences import SURPRISE, drift_warnings, step_warnings
 from twin.orbit.calibration.observations import any_effect, light_effects
-from twin.orbit.calibration.scheme_numbers import meets, schemes_within
-from twin.orbit.calibration.schemes import values_of
+from twin.orbit.calibration.schemes import meets, values_of
+from twin.orbit.calibration.screening import meeting_of
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, one_sentence
 
@@ -31,12 +20,21 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
 
 
+_FEW = 30
+"""Image points of which a chance is hardly worth a warning."""
+_LEAST_CHANCE = 1e-3
+_WIDE = 2.0
+"""Factor on the sigmas of a line beyond which there is a warning."""
+_MANY = 0.1
+"""Share of image points that may be left out without a warning."""
+
+
 def calibration_report(run: CalibrationRun) -> Report:
     """Report of a calibration."""
     setup = run.setup
     plan, height = (values_of(run.before, what).mean() for what in ("plan_rms", "height_rms"))
     limits = setup.test.limits
-    good = schemes_within(run)
+    good = run.within_limits
     # of averaged parameters the scheme with most fields; the last one lets each field use its own
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
@@ -47,17 +45,17 @@ def calibration_report(run: CalibrationRun) -> Report:
         f"{'schemes ' + ', '.join(good) if good else 'no scheme'}: see the schemes",
     )
     lead = (
-        scheme_summary(run.scheme_means),
-        *(() if run.monitoring is None else (monitor_gain(run.monitoring),)),
-        *(() if run.strips is None else (strip_gain(run.schemes, run.strips),)),
+        calibration_sections.scheme_summary(run.scheme_means),
+        *(() if run.monitoring is None else (calibration_sections.monitor_gain(run.monitoring),)),
+        *(() if run.strips is None else (calibration_sections.strip_gain(run.schemes, run.strips),)),
     )
     return Report(
         "Calibration in orbit over test fields",
         verdict,
         lead,
-        measured_facts(setup, run) if isinstance(setup, MeasuredCalibrationSetup) else _facts(setup),
+        _measured_facts(setup, run) if isinstance(setup, MeasuredCalibrationSetup) else _facts(setup),
         _summary(run),
-        sections(run),
+        calibration_sections.sections(run),
         warnings=_warnings(run),
     )
 
@@ -65,10 +63,12 @@ def calibration_report(run: CalibrationRun) -> Report:
 def _summary(run: CalibrationRun) -> Table:
     limits = run.campaign.spec.limits
     rows: list[tuple[Cell, ...]] = []
-    for name, errors in zip(["laboratory", *scheme_names(run)], (run.before, *run.schemes.values()), strict=True):
+    for name, errors in zip(
+        ["laboratory", *calibration_sections.scheme_names(run)], (run.before, *run.schemes.values()), strict=True
+    ):
         plan, height = (values_of(errors, what) for what in ("plan_rms", "height_rms"))
         numbers = (plan.mean(), plan.std(), plan.max(), height.mean(), height.std(), height.max())
-        meets_limits = "yes" if meets(errors, limits.plan, limits.height) else "no"
+        meets_limits = "yes" if meets(errors, limits) else "no"
         rows.append((name, *(float(v) for v in numbers), meets_limits))
     return Table(
         "schemes",
@@ -142,9 +142,9 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             f"expected (launch, errors.gps.drift){more}: check the datum of the control points, the camera file and "
             "the times, for the fit need not show such an error"
         )
-    assumptions += drift_warnings(run.campaign, DriftNumbers.of(run.campaign, found))
-    assumptions += step_warnings(StepNumbers.of(run.campaign, found))
-    if resting := rests_on_launch(found):
+    assumptions += drift_warnings(run.campaign, run.drift)
+    assumptions += step_warnings(run.chip_steps)
+    if resting := calibration_sections.rests_on_launch(found):
         assumptions.append(
             f"{', '.join(resting)}: known from launch.bias and launch.interior, not from the points; these sigmas are "
             "as good as that statement. More points, or a longer and wider field, would tell them"
@@ -154,5 +154,69 @@ def _warnings(run: CalibrationRun) -> tuple[str, ...]:
             "light time, aberration and refraction are left in the image points and go into the parameters"
         )
     if run.truth is None:
-        assumptions += measured_warnings(run)
+        assumptions += _measured_warnings(run)
     return tuple(assumptions)
+
+
+def _measured_facts(setup: MeasuredCalibrationSetup, run: CalibrationRun) -> tuple[tuple[str, str], ...]:
+    """What was given."""
+    test, said = setup.test, setup.data.conventions
+    errors, gps = test.errors.star_tracker, test.errors.gps
+    angles = ", ".join(format_quantity(v, ANGLE) for v in errors.noise)
+    lengths = ", ".join(format_quantity(v, LENGTH) for v in gps.noise)
+    quaternion = "as the files of the platform say"
+    if said.quaternion is not None and said.body_axes is not None:
+        turns = said.quaternion.turns.replace("_", " ")
+        quaternion = f"scalar {said.quaternion.scalar}, {turns}, body {', '.join(said.body_axes)}"
+    paths = {one.measured.interpolation for one in run.campaign.passes}
+    joined = {"spline": "cubic spline", "lagrange": "Lagrange's polynomial of ten readings"}
+    light = "none" if not any_effect(run.campaign.effects) else "taken out" if test.effects.corrected else "left in"
+    held = " and ".join(run.together.gauge.held)
+    return (
+        ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
+        ("Passes", f"{len(run.campaign.passes)}, measured, over {', '.join(p.name for p in run.campaign.passes)}"),
+        ("Line cameras", ", ".join(run.campaign.lines)),
+        (
+            "Frame and time",
+            f"{said.frame}; epochs in {said.time_scale.upper()}; a line's time is the {said.line_moment}",
+        ),
+        ("Quaternions", quaternion),
+        (
+            "Pixels",
+            f"middle of pixel n at {'n' if said.centre == 'integer' else 'n + 0.5'}, the first is {said.first_pixel}",
+        ),
+        ("First pixel sees", f"the {said.first_pixel_sees} side of the track"),
+        ("Noise of the attitude, 1σ", f"[{angles}], slow {max(errors.slow.noise) / ARCSEC:.3g} arcsec"),
+        ("Noise of the orbit, 1σ", f"[{lengths}], joined by {' and '.join(joined[p] for p in sorted(paths))}"),
+        ("Effects on the light", light),
+        ("Held", held),
+        ("Not estimated", "distortion, mounting, what the camera's file says of single CCDs"),
+        ("Description", test.description),
+    )
+
+
+def _measured_warnings(run: CalibrationRun) -> list[str]:
+    """What speaks against the result."""
+    found = []
+    for name, gone in run.campaign.rejected.items():
+        lost = gone.entered - gone.left
+        if lost > _MANY * gone.entered:
+            found.append(
+                f"{name}: {lost} of {gone.entered} image points were left out, more than {100.0 * _MANY:.0f}%: are the "
+                "conventions right, and the points matched well?"
+            )
+        wide = {line: factor for line, factor in gone.factors.items() if factor > _WIDE}
+        if wide:
+            listed = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
+            found.append(
+                f"{name}: image points scatter more than their sigmas say, by factors of {listed}; their sigmas have "
+                "been made larger by these"
+            )
+    for one in run.campaign.passes:
+        meeting = meeting_of(run.campaign, one, run.fields[one.name].adjustment)
+        if meeting.degrees_of_freedom >= _FEW and meeting.p_value < _LEAST_CHANCE:
+            found.append(
+                f"{one.name}: rays of the check points do not meet within their sigmas (chance {meeting.p_value:.1g}): "
+                "sigmas of image points or of the attitude are too small, or it has slow errors"
+            )
+    return found

@@ -25,9 +25,27 @@ from twin.orbit.calibration.camera_drift import Monitoring, monitored
 from twin.orbit.calibration.campaign import Campaign, FieldPass, campaign_of
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, drift_looked_for, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields
-from twin.orbit.calibration.influences import DatumRow, LightRow, Surprise, datum_rows, light_rows, surprises
+from twin.orbit.calibration.influences import (
+    AttitudeDrift,
+    ChipStep,
+    DatumRow,
+    LightRow,
+    Surprise,
+    datum_rows,
+    light_rows,
+    surprises,
+)
 from twin.orbit.calibration.latitude import LatitudeFit, latitude_fits, rate_priors
-from twin.orbit.calibration.schemes import Repeats, SchemeMeans, repeated, schemes_tested, tested_before
+from twin.orbit.calibration.schemes import (
+    Repeatability,
+    Repeats,
+    SchemeMeans,
+    meets,
+    repeatability,
+    repeated,
+    schemes_tested,
+    tested_before,
+)
 from twin.orbit.calibration.screening import screened
 from twin.orbit.calibration.strip import Strips, strips_adjusted
 from twin.orbit.measured.measurement_tables import read_measurements
@@ -75,9 +93,12 @@ class CalibrationRun:
         schemes: scheme, "1" on -> field -> errors; the last lets each field use its own parameters.
         scheme_means: over the fields; None for a single scheme of averaged parameters.
         latitude: the biases against latitude, roll, pitch, yaw; empty for too few fields.
+        repeatability: of the parameters from field to field; empty for one field.
         light: what effects on the light do where they are left in.
         datum: what a wrong datum does.
         surprises: estimates beyond what is expected of them.
+        drift: of the attitude within the passes, by the residuals.
+        chip_steps: within the lines, by the residuals.
         repeats: campaigns repeated with everything drawn anew; None for none.
         monitoring: what a monitor of drifting cameras buys; None for cameras that keep.
         strips: passes adjusted on tie points; None for none.
@@ -94,12 +115,69 @@ class CalibrationRun:
     schemes: Mapping[str, Mapping[str, CheckErrors]]
     scheme_means: SchemeMeans | None
     latitude: tuple[LatitudeFit, ...]
+    repeatability: tuple[Repeatability, ...]
     light: tuple[LightRow, ...]
     datum: tuple[DatumRow, ...]
     surprises: tuple[Surprise, ...]
+    drift: AttitudeDrift
+    chip_steps: tuple[ChipStep, ...]
     repeats: Repeats | None
     monitoring: Monitoring | None
     strips: Strips | None
+
+    @property
+    def within_limits(self) -> list[str]:
+        """Schemes with which every field meets the limits of the test's file."""
+        return [name for name, errors in self.schemes.items() if meets(errors, self.setup.test.limits)]
+
+
+def unit(name: str) -> str:
+    """SI unit of an unknown."""
+    if name.endswith(RATE):
+        return "rad/s"
+    return "rad" if name.split()[-1] in BIAS else "m"
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """An unknown of the adjustment of all fields, in SI units.
+
+    Attributes:
+        name: of the unknown.
+        value: estimated.
+        sigma: with the gauge's held unknowns exact; 0 where held.
+        sigma_with_gauge: with what launch leaves to expect of the held unknowns.
+        from_start: share of its variance that comes from the sigmas of launch and season, not from the points, 0 to 1.
+        held: by the gauge.
+        truth: None where nobody knows it.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    sigma_with_gauge: float
+    from_start: float
+    held: bool
+    truth: float | None
+
+    @property
+    def unit(self) -> str:
+        """SI unit."""
+        return unit(self.name)
+
+
+def unknowns(run: CalibrationRun) -> dict[str, Unknown]:
+    """Name -> unknown of the adjustment of all fields."""
+    found = run.together
+    sigma, held = found.sigma, found.gauge.held
+    whole = found.sigma_with(dict.fromkeys(held, run.campaign.spec.launch.interior))
+    truth = [None] * len(found.names) if run.truth is None else run.truth.tolist()
+    return {
+        name: Unknown(name, value, sigma[name], whole[name], share, name in held, true)
+        for name, value, share, true in zip(
+            found.names, found.values.tolist(), found.from_start.tolist(), truth, strict=True
+        )
+    }
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
@@ -184,9 +262,12 @@ def _run(setup: AnyCalibration, seed: int, advance: Advance) -> CalibrationRun:
         schemes,
         SchemeMeans.of(schemes),
         latitude,
+        repeatability(campaign, alone),
         light,
         datum,
         surprises(campaign, together),
+        AttitudeDrift.of(campaign, together),
+        ChipStep.of(campaign, together),
         None if isinstance(setup, MeasuredCalibrationSetup) else repeated(setup, others, advance),
         None if isinstance(setup, MeasuredCalibrationSetup) else monitored(setup, shown, advance),
         strips_adjusted(campaign, advance),
@@ -225,7 +306,7 @@ def true_values(campaign: Campaign, names: tuple[str, ...]) -> np.ndarray:
     }
     for one in campaign.passes:
         known |= {f"{one.name} {name}": v for name, v in zip(BIAS, one.bias, strict=True)}
-        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.offset, strict=True)}
+        known |= {f"{one.name} offset {name}": v for name, v in zip(OFFSET, one.truth.offset, strict=True)}
     rates = [(one.truth.bias_at(1.0) - one.truth.bias_at(-1.0)) / 2.0 for one in campaign.passes]
     known |= dict(zip(RATE, np.mean(rates, axis=0), strict=True))
     for one, own in zip(campaign.passes, rates, strict=True):

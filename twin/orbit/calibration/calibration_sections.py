@@ -11,22 +11,12 @@ from analysis.orbit.calibration_parameters import OFFSET, RATE
 from analysis.orbit.forward_intersection import CheckErrors
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.calibration.attitude_drift import DriftNumbers
-from twin.orbit.calibration.calibration_numbers import unit
+from twin.orbit.calibration import field_sections
 from twin.orbit.calibration.calibration_plots import drift_svg, figure_svg
-from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun
-from twin.orbit.calibration.camera_drift import Monitoring, PooledErrors, Treatment
-from twin.orbit.calibration.chip_steps import StepNumbers, steps_table
-from twin.orbit.calibration.field_sections import (
-    biases_section,
-    datum_section,
-    fields_section,
-    images_section,
-    light_section,
-)
-from twin.orbit.calibration.measured_sections import measured_section
-from twin.orbit.calibration.scheme_numbers import meets, schemes_within
-from twin.orbit.calibration.schemes import RMS, Repeats, SchemeMeans, values_of
+from twin.orbit.calibration.calibration_run import STEPWISE_TOLERANCE, CalibrationRun, unit
+from twin.orbit.calibration.camera_drift import Monitoring, Treatment
+from twin.orbit.calibration.influences import steps_table
+from twin.orbit.calibration.schemes import RMS, FieldErrors, Repeats, SchemeMeans, meets, values_of
 from twin.orbit.calibration.strip import Strips
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.run.report import Section
@@ -36,17 +26,17 @@ def monitor_gain(found: Monitoring) -> str:
     """What the monitor buys, in one sentence, from the scheme with most averaged parameters."""
     none, here = found.at(0.0), found.at(1.0)
     scheme = list(none.without.schemes)[-2]
-    still, blind = none.without.schemes[scheme].height, here.without.schemes[scheme].height
+    still, blind = none.without.schemes[scheme].height_rms, here.without.schemes[scheme].height_rms
     text = (
         f"With cameras that drift by {found.angle / ARCSEC:.2g} arcsec (Δα, 1σ) from field to field, heights "
         f"without ground control (scheme {scheme}) are wrong by {blind:.2f} m RMS, {still:.2f} m without drift"
     )
     if here.monitored is None:
         return f"{text}."
-    return f"{text}; with the on-board monitor's readings, {here.monitored.schemes[scheme].height:.2f} m."
+    return f"{text}; with the on-board monitor's readings, {here.monitored.schemes[scheme].height_rms:.2f} m."
 
 
-def monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
+def _monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     """Errors by size of the drift and by scheme."""
     spec = run.campaign.simulated
     drifts = "; ".join(
@@ -102,41 +92,24 @@ def _by_size(found: Monitoring) -> Table:
 
 def _by_scheme(found: Monitoring) -> Table:
     none, here = found.at(0.0).without, found.at(1.0)
-    rows: list[tuple[Cell, ...]] = []
-    for scheme, still in none.schemes.items():
-        blind = here.without.schemes[scheme]
-        monitored = None if here.monitored is None else here.monitored.schemes[scheme]
-        rows.append(
-            (
-                scheme,
-                still.plan,
-                blind.plan,
-                None if monitored is None else monitored.plan,
-                still.height,
-                blind.height,
-                None if monitored is None else monitored.height,
-            )
-        )
+    cases = {"no drift": none.schemes, "no monitor": here.without.schemes}
+    cases["monitor"] = {} if here.monitored is None else here.monitored.schemes
+    rows: list[tuple[Cell, ...]] = [
+        (scheme, *(getattr(case.get(scheme), what, None) for what in RMS for case in cases.values()))
+        for scheme in none.schemes
+    ]
     return Table(
         "monitor-schemes",
         "Schemes without ground control, with the file's drift",
         "RMS at check points of all fields, metres; the last scheme lets each field use its own parameters.",
-        (
-            "scheme",
-            "plan, no drift",
-            "plan, no monitor",
-            "plan, monitor",
-            "height, no drift",
-            "height, no monitor",
-            "height, monitor",
-        ),
+        ("scheme", *(f"{what}, {case}" for what in ("plan", "height") for case in cases)),
         rows,
         (None, 2, 2, 2, 2, 2, 2),
     )
 
 
 def _cells(one: Treatment | None) -> tuple[Cell, ...]:
-    return (None, None, None) if one is None else (one.together.plan, one.together.height, one.p_value)
+    return (None, None, None) if one is None else (one.together.plan_rms, one.together.height_rms, one.p_value)
 
 
 def _angles(values: tuple[float, float, float]) -> str:
@@ -146,20 +119,20 @@ def _angles(values: tuple[float, float, float]) -> str:
 def strip_gain(before: Mapping[str, Mapping[str, CheckErrors]], found: Strips) -> str:
     """What the adjustment gains, in one sentence, from the scheme with most averaged parameters."""
     scheme = list(found.schemes)[-2]
-    old, new = (PooledErrors.of(e[scheme].values()) for e in (before, found.schemes))
+    old, new = (FieldErrors.pooled(e[scheme].values()) for e in (before, found.schemes))
     return (
         f"Calibrating with {min(found.ties.values())} tie points of each pass or more, and adjusting each pass on "
-        f"them, takes the height RMS of scheme {scheme} from {old.height:.2f} m to {new.height:.2f} m and the plan RMS "
-        f"from {old.plan:.2f} m to {new.plan:.2f} m."
+        f"them, takes the height RMS of scheme {scheme} from {old.height_rms:.2f} m to {new.height_rms:.2f} m and the "
+        f"plan RMS from {old.plan_rms:.2f} m to {new.plan_rms:.2f} m."
     )
 
 
-def strips_section(run: CalibrationRun, found: Strips) -> Section:
+def _strips_section(run: CalibrationRun, found: Strips) -> Section:
     """Errors before and after, and what tie points cannot tell."""
     rows: list[tuple[Cell, ...]] = []
     for scheme, fields in found.schemes.items():
-        old, new = (PooledErrors.of(e.values()) for e in (run.schemes[scheme], fields))
-        rows.append((scheme, old.plan, new.plan, old.height, new.height))
+        old, new = (FieldErrors.pooled(e.values()) for e in (run.schemes[scheme], fields))
+        rows.append((scheme, old.plan_rms, new.plan_rms, old.height_rms, new.height_rms))
     table = Table(
         "strips",
         "Check points with and without tie points",
@@ -215,14 +188,20 @@ def sections(run: CalibrationRun) -> tuple[Section, ...]:
     if run.repeats is not None:
         found.append(_repeats(run, run.repeats))
     if run.truth is None:
-        found.append(measured_section(run))
+        found.append(field_sections.measured_section(run))
     if run.campaign.images is not None:
-        found.append(images_section(run.campaign))
+        found.append(field_sections.images_section(run.campaign))
     if run.monitoring is not None:
-        found.append(monitoring_section(run, run.monitoring))
+        found.append(_monitoring_section(run, run.monitoring))
     if run.strips is not None:
-        found.append(strips_section(run, run.strips))
-    found += [_parameters(run), fields_section(run), biases_section(run), light_section(run), datum_section(run)]
+        found.append(_strips_section(run, run.strips))
+    found += [
+        _parameters(run),
+        field_sections.fields_section(run),
+        field_sections.biases_section(run),
+        field_sections.light_section(run),
+        field_sections.datum_section(run),
+    ]
     return (*found, _rank(run), _data(run))
 
 
@@ -264,7 +243,7 @@ def _schemes(run: CalibrationRun) -> Section:
         "rest.",
         f"Maps at 1:50 000: {limits.plan:g} m in plan and {limits.height:g} m in height, assumed in the file. Every "
         f"field meets them by {_good(run)}; the laboratory's camera "
-        f"{'meets them, too' if meets(run.before, limits.plan, limits.height) else 'does not meet them'}.",
+        f"{'meets them, too' if meets(run.before, limits) else 'does not meet them'}.",
     )
     figures = (
         SvgFigure("schemes-of-fields", "Schemes", "Each line is a field.", figure_svg("schemes-of-fields", run)),
@@ -280,7 +259,7 @@ def _schemes(run: CalibrationRun) -> Section:
 
 
 def _good(run: CalibrationRun) -> str:
-    good = schemes_within(run)
+    good = run.within_limits
     return f"scheme{'s' * (len(good) > 1)} {', '.join(good)}" if good else "no scheme"
 
 
@@ -315,12 +294,7 @@ def _repeats(run: CalibrationRun, repeats: Repeats) -> Section:
         "from campaign to campaign; spread over the fields; in how many campaigns every field meets 1:50 000.",
         (
             "parameters",
-            "plan [m]",
-            "± campaign",
-            "spread of fields",
-            "height [m]",
-            "± campaign",
-            "spread of fields",
+            *(h for w in ("plan", "height") for h in (f"{w} [m]", "± campaign", "spread of fields")),
             "1:50 000",
         ),
         rows,
@@ -340,8 +314,7 @@ def _parameters(run: CalibrationRun) -> Section:
     inner = run.campaign.inner
     start = dict(zip(inner, np.ravel([laboratory[line].interior for line in run.campaign.lines]), strict=True))
     truth = None if run.truth is None else dict(zip(found.names, run.truth.tolist(), strict=True))
-    numbers = DriftNumbers.of(run.campaign, found)
-    drift = numbers.sigmas_per_arcsec or {}
+    drift = run.drift.sigmas_per_arcsec or {}
     rows: list[tuple[Cell, ...]] = []
     for name in inner:
         held = sigma[name] == 0.0
@@ -385,7 +358,7 @@ def _parameters(run: CalibrationRun) -> Section:
             "interior",
             "Interior orientation",
             "Micrometres, changes from the laboratory. Without sigma: held (gauge). Drift: by how many of its sigmas "
-            f"an element moves where the attitude drifts by 1 arcsec in {numbers.seconds:.0f} s and the adjustment "
+            f"an element moves where the attitude drifts by 1 arcsec in {run.drift.seconds:.0f} s and the adjustment "
             "does not know of it; empty where rates are unknowns.",
             ("element", "change", "σ", "σ per arcsec of drift", *("true change", "z")[:known]),
             rows,
@@ -407,7 +380,7 @@ def _parameters(run: CalibrationRun) -> Section:
         "RMS of x and y in each line's title. What is left is noise of the image and of the attitude.",
         figure_svg("residuals", run),
     )
-    steps = steps_table(StepNumbers.of(run.campaign, found))
+    steps = steps_table(run.chip_steps)
     return Section("Parameters", tuple(text), (*tables, steps, figure))
 
 

@@ -7,7 +7,7 @@ independent: both take most of the time and change the errors at check points ha
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
 from twin.orbit.calibration.observations import EFFECTS
-from twin.orbit.calibration.schemes import averaged, schemes_tested, tested
+from twin.orbit.calibration.schemes import FieldErrors, averaged, schemes_tested, tested
 from twin.run.procedure import Advance
 from twin.run.random_streams import stream
 
@@ -32,25 +32,6 @@ if TYPE_CHECKING:
 
 FACTORS = (0.0, 0.5, 1.0, 2.0, 4.0)
 """Sizes of the drift against the file's."""
-
-
-@dataclass(frozen=True)
-class PooledErrors:
-    """RMS over the check points of all fields, plan (both axes) and height, metres."""
-
-    plan: float
-    height: float
-
-    @classmethod
-    def of(cls, errors: Iterable[CheckErrors]) -> PooledErrors:
-        """Of fields, by the number of their points."""
-        rows = list(errors)
-        count = [e.count for e in rows]
-        plan, height = (
-            float(np.sqrt(np.average(np.square(v), weights=count)))
-            for v in ([e.plan_rms for e in rows], [e.height_rms for e in rows])
-        )
-        return cls(plan, height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +44,9 @@ class Treatment:
         schemes: scheme -> all fields without ground control; the last lets each field use its own parameters.
     """
 
-    together: PooledErrors
+    together: FieldErrors
     p_value: float
-    schemes: Mapping[str, PooledErrors]
+    schemes: Mapping[str, FieldErrors]
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,25 +129,27 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
 
 
 def without_monitor(campaign: Campaign) -> Treatment:
-    """As if nothing drifted."""
+    """Adjust a campaign as if no camera drifted."""
     found = simultaneous(campaign)
     errors = [tested(campaign, p, found.cameras, found.bias(p.name)) for p in campaign.passes]
     schemes = schemes_tested(campaign, {p.name: calibrated_alone(campaign, p) for p in campaign.passes})
-    pooled = FrozenMap({name: PooledErrors.of(fields.values()) for name, fields in schemes.items()})
-    return Treatment(PooledErrors.of(errors), found.p_value, pooled)
+    pooled = FrozenMap({name: FieldErrors.pooled(fields.values()) for name, fields in schemes.items()})
+    return Treatment(FieldErrors.pooled(errors), found.p_value, pooled)
 
 
 def with_monitor(campaign: Campaign) -> Treatment:
-    """With the monitor's readings: as observations where a field is calibrated, and as they are where it is tested."""
+    """Adjust a campaign with the monitor's readings, which are observations where a field is calibrated and correct the
+    cameras where it is tested.
+    """
     found = adjust_with_readings(campaign)
     errors = [tested(campaign, p, found.cameras_of(p.name), found.bias(p.name)) for p in campaign.passes]
     alone = {p.name: adjust_field_with_readings(campaign, p) for p in campaign.passes}
     schemes = {}
     for k, names in enumerate(campaign.spec.schemes):
-        schemes[str(k + 1)] = PooledErrors.of(_scheme(campaign, alone, names, p) for p in campaign.passes)
+        schemes[str(k + 1)] = FieldErrors.pooled(_scheme(campaign, alone, names, p) for p in campaign.passes)
     own = (_scheme(campaign, alone, (p.name,), p) for p in campaign.passes)
-    schemes[str(len(campaign.spec.schemes) + 1)] = PooledErrors.of(own)
-    return Treatment(PooledErrors.of(errors), found.p_value, FrozenMap(schemes))
+    schemes[str(len(campaign.spec.schemes) + 1)] = FieldErrors.pooled(own)
+    return Treatment(FieldErrors.pooled(errors), found.p_value, FrozenMap(schemes))
 
 
 def adjust_with_readings(campaign: Campaign) -> Adjustment:
@@ -182,7 +165,7 @@ def adjust_field_with_readings(campaign: Campaign, one: FieldPass) -> Adjustment
         [one.control],
         campaign.laboratory,
         campaign.noise,
-        unknowns=Unknowns(drift="field"),
+        unknowns=Unknowns(drift=True),
         priors=_reading_priors(campaign, one),
         gauge=gauge_of(campaign),
     )

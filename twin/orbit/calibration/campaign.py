@@ -108,7 +108,7 @@ class FieldPass:
 
     @property
     def name(self) -> str:
-        """Of the field."""
+        """Name of the field."""
         return self.measurements.name
 
     @property
@@ -118,7 +118,7 @@ class FieldPass:
 
     @property
     def truth(self) -> PassTruth:
-        """Of a simulated pass. AssertionError for a measured one."""
+        """What a simulation knows of the pass. AssertionError for a measured one."""
         assert self.known_truth is not None, "nobody knows the truth of a measured pass"
         return self.known_truth
 
@@ -128,19 +128,15 @@ class FieldPass:
         return self.truth.bias
 
     @property
-    def offset(self) -> np.ndarray:
-        """True offset; see `PassTruth`."""
-        return self.truth.offset
-
-    @property
     def trajectory(self) -> Trajectory:
         """The true one."""
         return self.truth.trajectory
 
     @property
-    def drift(self) -> Mapping[str, np.ndarray]:
-        """True drift; see `PassTruth`."""
-        return self.truth.drift
+    def tie_count(self) -> int:
+        """Number of tie points: those that calibrate, and those that are kept apart for the strip."""
+        apart = {int(number) for row in self.tie_images.values() for number in row.point}
+        return int((~self.is_control).sum()) + len(apart)
 
     @property
     def middle(self) -> float:
@@ -158,18 +154,18 @@ class FieldPass:
 
     @property
     def altitude(self) -> float:
-        """Of the satellite above the ellipsoid in the middle of the pass, metres."""
+        """Height of the satellite above the ellipsoid in the middle of the pass, metres."""
         path = self.measured
         return float(self.data.earth.geodetic(path.position(self.middle))[2])
 
     def shifted(self, datum: tuple[float, float, float]) -> FieldPass:
-        """With control points given farther east, north and up, metres; rays stay as they are."""
+        """The pass with control points given farther east, north and up, metres; rays stay as they are."""
         lon, lat, _ = self.data.earth.geodetic(self.control_ground.mean(axis=0))
         ground = self.control_ground + np.array(datum) @ east_north_up(lon, lat)
         return replace(self, control_ground=ground, control=replace(self.control, ground=ground))
 
     def later(self, seconds: float) -> FieldPass:
-        """With rays of the station and attitude so many seconds later; image points stay as they are."""
+        """The pass with rays of the station and attitude so many seconds later; image points stay as they are."""
 
         def moved(rays: Mapping[str, Rays]) -> FrozenMap[str, Rays]:
             found = {}
@@ -246,7 +242,7 @@ class Campaign:
 
     @property
     def independent(self) -> Campaign:
-        """The same measurements, but the analysis counts the noise of attitude and orbit as each exposure's own.
+        """The campaign in which each exposure has noise of attitude and orbit of its own.
 
         Estimates are hardly worse and ten times faster; their sigmas are too small where points are exposed within a
         few readings.
@@ -255,7 +251,7 @@ class Campaign:
         return replace(self, noise=own)
 
     def without_effects(self, removed: LightEffects) -> Campaign:
-        """The same image points with these effects on the light taken out of them.
+        """The campaign with these effects on the light taken out of its image points.
 
         Raises:
             CalibrationError: control coordinates that cannot be used, or check points that cannot be intersected.
@@ -354,13 +350,13 @@ def campaign_of(
     laboratory = FrozenMap({name: line_model(payload, name) for name in payload.lines if name in seen})
     passes = [_field_pass(one, payload, laboratory, ties_apart) for one in measured]
     unit = image_sigma(passes[0].control_images, passes[0].data)
-    noise = noise_of(spec.errors, unit, [one.measured for one in passes])
+    noise = _noise_of(spec.errors, unit, [one.measured for one in passes])
     weighed = tuple(replace(p, data=replace(p.data, unit=unit)) for p in passes)
     campaign = Campaign(spec, laboratory, noise, tuple(_with_ties(p, noise) for p in weighed))
     return campaign.without_effects(campaign.effects if spec.effects.corrected else NO_EFFECTS)
 
 
-def noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
+def _noise_of(errors: ErrorsSpec | ReadingErrorsSpec, image: float, paths: Sequence[TabulatedTrajectory] = ()) -> Noise:
     """Sigmas of readings as given, root mean square over axes, and their intervals.
 
     Args:

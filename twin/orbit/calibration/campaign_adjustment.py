@@ -38,7 +38,7 @@ def gauge_of(campaign: Campaign) -> Gauge:
     return Gauge(held=(f"{campaign.reference} x", f"{campaign.reference} y"), start=FrozenMap(start))
 
 
-def rates_of(campaign: Campaign) -> np.ndarray:
+def _rates_of(campaign: Campaign) -> np.ndarray:
     """(3,) standard deviations of the attitude's rate in each pass, stated or found in residuals, rad/s."""
     stated = campaign.spec.errors.star_tracker.drift if campaign.spec.errors.switched_on else None
     found = (0.0, 0.0, 0.0) if campaign.drifts is None else campaign.drifts.rate
@@ -46,14 +46,14 @@ def rates_of(campaign: Campaign) -> np.ndarray:
 
 
 def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequence[Prior] = ()) -> tuple[Prior, ...]:
-    """Of the rate of each pass; empty where none drifts by itself.
+    """Priors on the rate of each pass; empty where none drifts by itself.
 
     Args:
         campaign: for what is stated.
         passes: that are adjusted.
         common: what is known of a rate that all of them have; its error then counts as one of each.
     """
-    sigma = rates_of(campaign)
+    sigma = _rates_of(campaign)
     if not np.any(sigma):
         return tuple(common)
     known = {next(iter(p.weights)): (p.value, p.sigma) for p in common}
@@ -65,13 +65,12 @@ def _rate_priors(campaign: Campaign, passes: Sequence[FieldPass], common: Sequen
     return tuple(found)
 
 
-def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior] = ()) -> Adjustment:
+def calibrated_alone(campaign: Campaign, one: FieldPass) -> Adjustment:
     """A field by itself, with paper 003's twelve unknowns less the gauge, and its rate where the attitude drifts.
 
     Args:
         campaign: for the laboratory's camera and the noise.
         one: the field.
-        priors: what else is known of its unknowns, for example by an on-board monitor.
 
     Raises:
         CalibrationError: it cannot be solved.
@@ -82,7 +81,7 @@ def calibrated_alone(campaign: Campaign, one: FieldPass, priors: Sequence[Prior]
         campaign.laboratory,
         campaign.noise,
         unknowns=Unknowns(rate="field" if rates else "none"),
-        priors=(*priors, *rates),
+        priors=rates,
         gauge=gauge_of(campaign),
     )
 
@@ -138,7 +137,7 @@ def simultaneous(
         CalibrationError: it cannot be solved.
     """
     errors = campaign.spec.errors
-    offsets = errors.switched_on and any(errors.gps.drift)
+    offsets = bool(errors.switched_on and any(errors.gps.drift))
     drifts = tuple(
         Prior({f"{p.name} offset {axis}": 1.0}, 0.0, max(sigma, _LEAST_OFFSET), "orbit")
         for p in campaign.passes
@@ -147,16 +146,12 @@ def simultaneous(
     rated = _rate_priors(campaign, campaign.passes, rates)
     kind: Literal["common", "field", "none"] = "none"
     if rated:
-        kind = "field" if np.any(rates_of(campaign)) else "common"
+        kind = "field" if np.any(_rates_of(campaign)) else "common"
     return adjust(
         [p.control for p in campaign.passes],
         campaign.laboratory,
         campaign.noise,
-        unknowns=Unknowns(
-            offset="field" if offsets else "none",
-            drift="field" if drift else "none",
-            rate=kind,
-        ),
+        unknowns=Unknowns(offsets, drift, kind),
         priors=(*(drifts if offsets else ()), *rated, *monitor),
         gauge=gauge_of(campaign),
         robust=robust,

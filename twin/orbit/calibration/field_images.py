@@ -273,7 +273,7 @@ def _joined(parts: list[_Chosen], data: PassData) -> _Chosen:
 
 
 def _lost(records: list[PatchRecord]) -> str:
-    """How many were sought, matched and agreed with by their neighbours, in words."""
+    """Numbers of points that were sought, matched and agreed with by their neighbours, in words."""
     words = []
     for name in records[0].judgements["control"]:
         lines = [r.points.control.lines[name] for r in records if r.points.control is not None]

@@ -1,6 +1,12 @@
-"""What a report says of single fields, of points measured in images, and of errors that the fit does not show."""
+"""What a report says of single fields, of measured passes, of points in images, and of errors that the fit does
+not show.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import astuple
+from typing import Any
 
 import numpy as np
 
@@ -8,17 +14,18 @@ from analysis.orbit.calibration_parameters import OFFSET
 from analysis.orbit.three_line_model import BIAS
 from analysis.units import ARCSEC
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from twin.orbit.calibration.calibration_numbers import IMAGES
 from twin.orbit.calibration.calibration_plots import figure_svg
 from twin.orbit.calibration.calibration_run import CalibrationRun
 from twin.orbit.calibration.campaign import Campaign
-from twin.orbit.calibration.field_images import FieldImages
-from twin.orbit.calibration.image_numbers import ImageTotals, MatchingNumbers
+from twin.orbit.calibration.field_images import Screening
 from twin.orbit.calibration.influences import SURPRISE, DatumRow, LightRow
-from twin.orbit.calibration.repeatability import repeatability
+from twin.orbit.calibration.screening import ground_sample, meeting_of
 from twin.orbit.images.imaged_ground import BEYOND
 from twin.orbit.images.point_judgement import WRONG
 from twin.orbit.images.point_report import points_png
 from twin.run.artefact import Cell, PngFigure, SvgFigure, Table
+from twin.run.quantity import Quantity, Record
 from twin.run.report import Section
 
 
@@ -40,7 +47,7 @@ def fields_section(run: CalibrationRun) -> Section:
         rows,
         (None, 1, *(3,) * (len(BIAS) + len(truth) + 1)),
     )
-    found = repeatability(run)
+    found = run.repeatability
     if not found:
         return Section("Fields", ("One field alone does not repeat.",), (table,))
     scatter: list[tuple[Cell, ...]] = []
@@ -163,60 +170,164 @@ def biases_section(run: CalibrationRun) -> Section:
     return Section("Biases against latitude", text, (figure, table))
 
 
+_LISTED = 12
+"""Names that a text lists at most."""
+
+
+def measured_section(run: CalibrationRun) -> Section:
+    """Points and residuals of every pass, errors of check points in pixels of the ground, what no sigma contains."""
+    campaign = run.campaign
+    rows: list[tuple[Cell, ...]] = []
+    sizes: list[tuple[Cell, ...]] = []
+    own = list(run.schemes.values())[-1]
+    for one in campaign.passes:
+        gone = campaign.rejected.get(one.name)
+        meeting = meeting_of(campaign, one, run.fields[one.name].adjustment)
+        lost = (
+            (None, None, None) if gone is None else (len(gone.points), len(gone.check_points), _factors(gone.factors))
+        )
+        alone = run.fields[one.name].adjustment
+        rows.append(
+            (
+                one.name,
+                int(one.is_control.sum()),
+                one.tie_count,
+                len(one.check_ground),
+                *lost,
+                alone.chi_square / max(alone.degrees_of_freedom, 1),
+                alone.p_value,
+                meeting.chi_square / max(meeting.degrees_of_freedom, 1),
+            )
+        )
+        for line in one.data.sensors:
+            along, across = ground_sample(one, line)
+            pixel = float(np.sqrt(along * across))
+            errors = own[one.name]
+            sizes.append(
+                (one.name, line, along, across, errors.plan_rms / pixel, errors.height_rms / pixel, errors.count)
+            )
+    points = Table(
+        "measured-points",
+        "Points of every pass",
+        "Left out: image points that robust weights gave up, check points whose rays do not meet. Factor: on the given "
+        "sigmas of image points of the lines, by the residuals of those that remain. Chi-square over its degrees of "
+        "freedom, of the pass calibrated by itself and of the rays of its check points with these parameters.",
+        (
+            "pass",
+            "control",
+            "ties",
+            "check",
+            "image points left out",
+            "check left out",
+            "factor",
+            "χ²/dof",
+            "chance",
+            "check χ²/dof",
+        ),
+        rows,
+        (None, None, None, None, None, None, None, 2, 3, 2),
+    )
+    pixels = Table(
+        "measured-pixels",
+        "Pixels on the ground, and errors of check points in them",
+        "Ground sample distance of the middle of each line, metres; RMS errors of the check points by the pass's own "
+        "parameters, in ground pixels (root of along times across).",
+        ("pass", "line", "along the track [m]", "across [m]", "plan [px]", "height [px]", "check points"),
+        sizes,
+        (None, None, 3, 3, 2, 2, None),
+    )
+    return Section("Measurements", (*_screening(run), *_limits(run)), (points, pixels))
+
+
+def _factors(found: Mapping[str, float]) -> str:
+    """Factors of the lines in words: one where all lines have the same."""
+    texts = {line: f"{v:.2f}" for line, v in found.items()}
+    if len(set(texts.values())) == 1:
+        return next(iter(texts.values()))
+    return ", ".join(f"{line} {v}" for line, v in texts.items())
+
+
+def _screening(run: CalibrationRun) -> tuple[str, ...]:
+    """What was left out, by name."""
+    if not run.campaign.rejected:
+        return ("No image point was left out: the file says `screening: none`.",)
+    found = []
+    for name, gone in run.campaign.rejected.items():
+        listed = ", ".join(f"{point} in {line}" for point, line in gone.points[:_LISTED])
+        more = f" and {len(gone.points) - _LISTED} more" if len(gone.points) > _LISTED else ""
+        checks = ", ".join(gone.check_points[:_LISTED])
+        text = f"{name}: {gone.left} of {gone.entered} image points are used"
+        text += f"; left out {listed}{more}" if listed else "; none is left out"
+        text += f"; check points whose rays do not meet: {checks}." if checks else "."
+        found.append(text)
+    return tuple(found)
+
+
+def _limits(run: CalibrationRun) -> tuple[str, ...]:
+    """What makes the sigmas, and what they do not contain."""
+    noise, campaign = run.campaign.noise, run.campaign
+    one = campaign.passes[0]
+    focal = float(np.mean([m.interior[0] for m in campaign.laboratory.values()]))
+    ground = one.altitude / focal
+    # white noise of the readings by their spline, in metres on the ground, beside that of the image
+    parts = {
+        "image points": noise.image * ground,
+        "readings of the attitude": noise.attitude * one.altitude,
+        "slow errors of the attitude": noise.slow_attitude * one.altitude,
+        "readings of the orbit": noise.station,
+        "control points": float(
+            np.sqrt(np.mean(np.trace(one.control_covariance[one.is_control], axis1=1, axis2=2) / 3.0))
+        ),
+    }
+    listed = ", ".join(f"{name} {value:.2g} m" for name, value in sorted(parts.items(), key=lambda v: -v[1]) if value)
+    return (
+        f"One standard deviation on the ground at nadir, of a single ray to a single point of {one.name}: {listed}. "
+        "The first of these limits the result; more points make it smaller but for slow errors of the attitude.",
+        "The sigmas contain these, as the tables and the file state them. They do not contain what all points of a "
+        "pass share and no point shows: a wrong datum of the control points, a wrong time, an atmosphere unlike the "
+        "standard one, and biases that drift during the pass where nothing tells them. Errors at check points are "
+        "against their given coordinates and contain the errors of these; n points tell an RMS to 1/√(2n) of itself.",
+    )
+
+
+SCREENED: Record[Screening] = Record(
+    "Image points of a field in the adjustment.",
+    Quantity("entered", lambda s: s.entered, "image points of control and tie points"),
+    Quantity("wrong", lambda s: s.wrong_entered, "wrong places among them"),
+    Quantity("rejected", lambda s: s.entered - s.left, "image points that the adjustment leaves out"),
+    Quantity("right_rejected", lambda s: s.right_lost, "right places among those that it leaves out"),
+    Quantity("wrong_left", lambda s: s.wrong_left, "wrong places that it keeps"),
+    Quantity("check_points", lambda s: s.check_entered, "check points before the test of their intersection"),
+    Quantity("check_left", lambda s: s.check_left, "check points after it"),
+    Quantity("wrong_check_left", lambda s: s.wrong_check_left, "kept ones with a wrong place in a line", "wrong left"),
+)
 _SORTS = {"control": "orthophoto", "tie": "tie"}
 
 
 def images_section(campaign: Campaign) -> Section:
-    """How many points were matched, lost and wrong, by field, sort and line."""
+    """Numbers of points that were matched, lost and wrong, by field, sort and line."""
     assert campaign.images is not None
     spec = campaign.simulated.images
     assert spec is not None
-    total = ImageTotals.of(campaign.images)
-    matching = _matching(campaign.images)
-    rows: list[tuple[Cell, ...]] = []
-    for one in campaign.images:
-        s = one.screening
-        assert s is not None
-        rows.append(
-            (
-                one.name,
-                s.entered,
-                s.wrong_entered,
-                s.entered - s.left,
-                s.right_lost,
-                s.wrong_left,
-                s.check_entered,
-                s.check_left,
-                s.wrong_check_left,
-            )
-        )
-    screened = Table(
+    data = IMAGES(campaign)
+    total = data["total"]
+    screened = SCREENED.table(
         "image-points",
         "Image points in the adjustment",
         "Of points that every line has. Rejected: robust weight zero (IGG), for check points rays that do not meet.",
-        (
-            "field",
-            "entered",
-            "wrong",
-            "rejected",
-            "right rejected",
-            "wrong left",
-            "check points",
-            "check left",
-            "wrong left",
-        ),
-        rows,
+        {one.name: SCREENED(one.screening) for one in campaign.images if one.screening is not None},
+        label="field",
     )
     counts = [len(p.control_ground[p.control.control]) for p in campaign.passes]
     text = (
         f"In each field {len(spec.patches)} patches of {spec.lines} x {spec.pixels} pixels are rendered by every line. "
-        f"Of {total.found} places that matching found, {total.wrong_found} are wrong "
-        f"({100.0 * total.wrong_found / total.found:.1f}%), mostly on fields that look different in the "
-        f"orthophoto; thresholds of the matching leave {total.wrong_matched} of {total.matched}, the "
-        f"neighbours' agreement {total.wrong_accepted} of {total.accepted}, the adjustment "
-        f"{total.wrong_left} of {total.left} image points ({total.check_left} check points: "
-        f"{total.wrong_check_left}). The neighbours' test costs {total.right_rejected_by_consensus} right ones, "
-        f"the adjustment {total.right_rejected_by_adjustment}.",
+        f"Of {total['found']} places that matching found, {total['wrong_found']} are wrong "
+        f"({100.0 * total['wrong_found'] / total['found']:.1f}%), mostly on fields that look different in the "
+        f"orthophoto; thresholds of the matching leave {total['wrong_matched']} of {total['matched']}, the "
+        f"neighbours' agreement {total['wrong_accepted']} of {total['accepted']}, the adjustment "
+        f"{total['wrong_left']} of {total['left']} image points ({total['check_left']} check points: "
+        f"{total['wrong_check_left']}). The neighbours' test costs {total['right_rejected_by_consensus']} right ones, "
+        f"the adjustment {total['right_rejected_by_adjustment']}.",
         f"{' and '.join(str(c) for c in counts)} control points are left. Their image points weigh by the covariances "
         f"of the matching and {BEYOND:g} px beyond them, for what no fit shows. Matches of the three "
         "lines with one piece of the orthophoto err alike, by its noise and its "
@@ -236,16 +347,17 @@ def images_section(campaign: Campaign) -> Section:
         )
         for sort, points in first.patches[0].points.sorts.items()
     ]
-    return Section("Points in images", text, (matching, screened, *figures))
+    return Section("Points in images", text, (_matching(data["fields"]), screened, *figures))
 
 
-def _matching(images: tuple[FieldImages, ...]) -> Table:
+def _matching(fields: Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]) -> Table:
+    keys = ("right_rejected_by_consensus", "rms_lines_px", "rms_pixels_px", "chi_square_ratio")
     rows: list[tuple[Cell, ...]] = []
-    for one in images:
-        for sort, lines in MatchingNumbers.by_line(one).items():
+    for field, sorts in fields.items():
+        for sort, lines in sorts.items():
             for line, n in lines.items():
-                cells = (n.right_rejected_by_consensus, n.rms_lines_px, n.rms_pixels_px, n.chi_square_ratio)
-                rows.append((one.name, _SORTS[sort], line, *n.wrong_shares, *cells))
+                wrong = [f"{n[f'wrong_{passed}']} of {n[passed]}" for passed in ("found", "matched", "accepted")]
+                rows.append((field, _SORTS[sort], line, *wrong, *(n[key] for key in keys)))
     return Table(
         "image-matching",
         "Matching",
@@ -283,7 +395,9 @@ def light_section(run: CalibrationRun) -> Section:
             sizes.append((name, *moved))
         inner, turned = row.most(run.campaign.inner), row.most(tuple(n for n in row.shift if n.split()[-1] in BIAS))
         shifts = [f"{who} {by:+.1f} σ" if row.left else "" for who, by in (inner, turned)]
-        rows.append((f"{name} left in" if row.left else name, *row.before, *row.after, *shifts, row.p_value))
+        rows.append(
+            (f"{name} left in" if row.left else name, *astuple(row.before), *astuple(row.after), *shifts, row.p_value)
+        )
     pixels = Table(
         "light-pixels",
         "How far image points move",
@@ -321,8 +435,9 @@ def light_section(run: CalibrationRun) -> Section:
         "thousandths of a pixel, most of it because the heights of check points, which refraction depends on, are "
         "first known to 100 m.",
         "Left in, they do hardly any harm where a camera is used as it was calibrated: biases and principal points "
-        f"take them up, the mean error in plan goes from {run.light[0].after[0]:.3f} m to {left.after[0]:.3f} m. But "
-        f"parameters are then wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the "
+        f"take them up, the mean error in plan goes from {run.light[0].after.plan_rms:.3f} m to "
+        f"{left.after.plan_rms:.3f} m. But parameters are then "
+        f"wrong ({most} by {1e6 * left.shift[most]:+.1f} µm, {abs(ratio):.1f} sigmas), which the "
         "fit need not show, and they are no longer those of the camera: seen from another height, or by a satellite "
         "that tilts, the light does something else.",
         "The corrections use the same models of the atmosphere and of the light as the simulation: they show that the "
@@ -350,7 +465,7 @@ def datum_section(run: CalibrationRun) -> Section:
                 *map(float, row.offset),
                 row.fit,
                 row.p_value,
-                *row.after,
+                *astuple(row.after),
             )
         )
     table = Table(

@@ -44,7 +44,7 @@ _DRIFT, _READING = 6, 7
 """Streams of a field's seed. What else is drawn of a field does not change with them."""
 
 
-def sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
+def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
 
     The draws of a line are the same whatever their sigmas are.
@@ -60,7 +60,7 @@ def sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> Fr
     return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
-def sample_readings(
+def _sample_readings(
     spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
@@ -148,8 +148,8 @@ def _pass(
     imager: Imager | None,
 ) -> _Flown:
     """Fly and measure."""
-    pictures, drift = stream(seed, _PICTURES), sample_drift(spec, seed)
-    readings = sample_readings(spec, drift, seed)
+    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
+    readings = _sample_readings(spec, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth)
@@ -201,11 +201,11 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
+    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
     return _Flown(told, readings, images, truth)
 
 
-def measurements_of(
+def _measurements_of(
     name: str,
     platform: PlatformTable,
     times: Mapping[str, LineTimes],

@@ -1,29 +1,43 @@
-"""What is not seen in the fit: effects on the light that are left in the image points, ground coordinates in a wrong
-datum. Both are carried by the parameters; how far, is found by calibrating again from the same measurements. These
-comparisons count the noise of attitude and orbit as independent, which takes a tenth of the time.
+"""Errors that a calibration hardly sees in its own fit, and what they do to the parameters.
+
+Effects on the light that are left in the image points and ground coordinates in a wrong datum are carried by the
+parameters; how far, is found by calibrating again from the same measurements. These comparisons count the noise of
+attitude and orbit as independent, which takes a tenth of the time. A drift of the attitude within the passes and steps
+between the chips of a line are judged by the residuals: by how much they would have to differ from zero to be seen, and
+whether they do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Self
 
 import numpy as np
+from scipy.stats import chi2, norm
 
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.calibration_parameters import OFFSET
-from analysis.orbit.forward_intersection import CheckErrors
+from analysis.orbit.residual_tests import FALSE_ALARM, Rates, Steps
 from analysis.orbit.three_line_model import BIAS
-from scenes.specs.orbit.angle import LINES
-from twin.orbit.calibration.campaign import Campaign, interior_names
+from analysis.units import ARCSEC
+from scenes.specs.measured.orbit_data import MeasuredCalibrationSpec
+from twin.orbit.calibration.campaign import Campaign, FoundDrift
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, simultaneous
 from twin.orbit.calibration.observations import EFFECTS
-from twin.orbit.calibration.schemes import RMS, schemes_tested, tested_before, values_of
+from twin.orbit.calibration.schemes import FieldErrors, schemes_tested, tested_before
 from twin.orbit.flight.light_effects import NO_EFFECTS
+from twin.run.artefact import Table
+from twin.run.quantity import in_unit
 
-INNER = interior_names(LINES)
 SURPRISE = 4.0
 """Sigmas of what is expected of an unknown; one of seventy lies beyond by chance in 1 of 200 campaigns."""
+UNSEEN = 3.0
+"""Sigmas of an unknown, by a drift that residuals show only in half of all cases, from which on a file has to say
+whether there is one."""
+_STEP_ALARM = 1e-4
+"""False alarm of all steps of a run together."""
 _TRIAL_TIME = 0.01
 """Seconds; by which the lines are late, 70 m on the ground."""
 _TRIAL_SHIFT = 100.0
@@ -37,7 +51,7 @@ class LightRow:
     Attributes:
         left: effects that are not taken out, of `EFFECTS`.
         moved: line -> (2,) RMS of what they move the check points' image points by, x and y, metres.
-        before: mean of the fields' RMS with the laboratory's camera, plan and height, metres.
+        before: mean of the fields' RMS with the laboratory's camera.
         after: likewise, each field with its own parameters.
         shift: name -> change of a parameter of the simultaneous adjustment from the case that nothing is left in.
         sigma: name -> its sigma.
@@ -46,8 +60,8 @@ class LightRow:
 
     left: tuple[str, ...]
     moved: Mapping[str, np.ndarray]
-    before: tuple[float, float]
-    after: tuple[float, float]
+    before: FieldErrors
+    after: FieldErrors
     shift: Mapping[str, float]
     sigma: Mapping[str, float]
     p_value: float
@@ -82,14 +96,14 @@ class DatumRow:
     offset: np.ndarray
     fit: float
     p_value: float
-    after: tuple[float, float]
+    after: FieldErrors
     late: float
     sigma: Mapping[str, float]
     warned: float | None
 
     @property
     def size(self) -> float:
-        """Of the shift, metres, or of the time, seconds."""
+        """Size of the shift, metres, or of the delay, seconds."""
         return abs(self.late) or float(np.linalg.norm(self.shift))
 
     @property
@@ -116,7 +130,7 @@ class Surprise:
 
     @property
     def ratio(self) -> float:
-        """In sigmas of what is expected."""
+        """Size of the change in sigmas of what is expected."""
         return abs(self.change) / self.expected
 
 
@@ -157,7 +171,9 @@ def light_rows(campaign: Campaign, sigma: Mapping[str, float]) -> tuple[LightRow
             for line in campaign.lines
         }
         shift = dict(zip(found.names, (found.values - base.values).tolist(), strict=True))
-        rows.append(LightRow(left, moved, _means(tested_before(case)), _after(case), shift, sigma, found.p_value))
+        rows.append(
+            LightRow(left, moved, FieldErrors.mean(tested_before(case)), _after(case), shift, sigma, found.p_value)
+        )
     return tuple(rows)
 
 
@@ -199,7 +215,7 @@ def datum_rows(campaign: Campaign) -> tuple[DatumRow, ...]:
 
 
 def _warned(campaign: Campaign, change: Mapping[str, float], size: float) -> float | None:
-    """How large a cause of this size (metres or seconds) and these changes must be for `surprises` to tell it."""
+    """Size from which on `surprises` tells a cause that makes these changes at one size (metres or seconds)."""
     known = _expected(campaign)
     ratio = max((abs(change.get(name, 0.0)) / sigma for name, (_, sigma) in known.items()), default=0.0)
     return SURPRISE * size / ratio if ratio > 0.0 else None
@@ -228,13 +244,161 @@ def _expected(campaign: Campaign) -> dict[str, tuple[float, float]]:
     return known
 
 
-def _after(campaign: Campaign) -> tuple[float, float]:
-    """Mean RMS in plan and height, each field with its own parameters."""
+def _after(campaign: Campaign) -> FieldErrors:
+    """Means of the fields' RMS errors, each field with its own parameters."""
     alone = {p.name: calibrated_alone(campaign, p) for p in campaign.passes}
-    return _means(list(schemes_tested(campaign, alone).values())[-1])
+    return FieldErrors.mean(list(schemes_tested(campaign, alone).values())[-1])
 
 
-def _means(errors: Mapping[str, CheckErrors]) -> tuple[float, float]:
-    """Of the fields' RMS in plan and height, metres."""
-    plan, height = (float(values_of(errors, what).mean()) for what in RMS)
-    return plan, height
+@dataclass(frozen=True)
+class AttitudeDrift:
+    """Drift of the attitude during the passes.
+
+    Attributes:
+        seconds: from when the first line sees a field to when the last one does, mean of the passes.
+        sigmas_per_arcsec: name of an unknown -> its change, in its sigmas, for a drift of 1 arcsec in these seconds
+            (one standard deviation about each axis in each pass) that is no unknown; None where rates are unknowns.
+        seen: (3,) drift about body X, Y, Z in these seconds that residuals show in half of all cases, radians; None
+            likewise.
+        unseen_sigmas: by how many of its sigmas the most sensitive unknown is then wrong; None likewise.
+        rate_p_value, course_p_value: chance of the residuals without rates, and without errors that change slowly along
+            the lines; below `FALSE_ALARM` they count as found.
+        assumed: what was taken into the noise since; None where nothing was found.
+    """
+
+    seconds: float
+    sigmas_per_arcsec: Mapping[str, float] | None
+    seen: np.ndarray | None
+    unseen_sigmas: float | None
+    rate_p_value: float | None
+    course_p_value: float
+    assumed: FoundDrift | None
+
+    @classmethod
+    def of(cls, campaign: Campaign, found: Adjustment) -> Self:
+        """What the adjustment of all fields shows of a drift."""
+        seconds = float(np.mean([p.seconds_apart for p in campaign.passes]))
+        effect = seen = unseen = None
+        chance = None
+        if found.rates is not None and seconds > 0.0:
+            assert isinstance(found.rates.terms, Rates)
+            sigma = np.array([found.sigma[n] for n in found.names])
+            change = np.linalg.norm(found.rates.moved, axis=1) * ARCSEC / seconds
+            effect = {n: float(c / s) for n, c, s in zip(found.names, change, sigma, strict=True) if s > 0.0}
+            # of a test of all rates together, each alone
+            power = np.sqrt(chi2.isf(FALSE_ALARM, max(found.rates.degrees_of_freedom, 1)))
+            alone = found.rates.sigma_alone.reshape(-1, 3)
+            seen = power * np.sqrt(1.0 / np.mean(alone**-2.0, axis=0) / len(alone)) * seconds
+            limit = np.where(np.isfinite(alone), alone, 0.0).ravel() * power
+            wrong = np.abs(found.rates.moved) * limit
+            unseen = float(np.max(wrong[sigma > 0.0] / sigma[sigma > 0.0][:, None], initial=0.0))
+            chance = found.rates.p_value
+        course, drifts = found.courses.p_value, campaign.drifts
+        if drifts is not None:
+            chance, course = drifts.rate_p_value, drifts.course_p_value
+        return cls(seconds, effect, seen, unseen, chance, course, drifts)
+
+    @property
+    def most(self) -> tuple[str, float]:
+        """The unknown that drift moves by the most of its sigmas, and by how many; ("", 0) where rates are unknowns."""
+        if not self.sigmas_per_arcsec:
+            return "", 0.0
+        return max(self.sigmas_per_arcsec.items(), key=lambda item: item[1])
+
+
+def drift_warnings(campaign: Campaign, drift: AttitudeDrift) -> list[str]:
+    """That residuals show a drift, or that a file does not say whether there is one that would matter."""
+    if drift.assumed is not None:
+        rate = max(drift.assumed.rate) * drift.seconds / ARCSEC
+        chance = min(drift.course_p_value, 1.0 if drift.rate_p_value is None else drift.rate_p_value)
+        return [
+            "the attitude drifts during the passes, or image points err alike along the lines: residuals of"
+            f" neighbouring exposures are alike (chance {chance:.1g}). A random walk of"
+            f" {drift.assumed.walk / ARCSEC:.2g} arcsec in a second and rates of {rate:.2g} arcsec in"
+            f" {drift.seconds:.0f} s have been taken into the sigmas, which are as good as this guess: state"
+            " errors.star_tracker.drift and walk"
+        ]
+    name, ratio = drift.most
+    spec, unseen = campaign.spec, drift.unseen_sigmas or 0.0
+    if isinstance(spec, MeasuredCalibrationSpec) and spec.errors.star_tracker.drift is None and unseen > UNSEEN:
+        seen = float(np.min(drift.seen)) / ARCSEC if drift.seen is not None else np.inf
+        return [
+            f"nothing is said of a drift of the attitude within a pass: 1 arcsec in {drift.seconds:.0f} s moves"
+            f" {name} by {ratio:.2g} of its sigmas, and the residuals of these points show it from {seen:.2g} arcsec:"
+            " state errors.star_tracker.drift, [0 arcsec, 0 arcsec, 0 arcsec] where there is none"
+        ]
+    return []
+
+
+@dataclass(frozen=True)
+class ChipStep:
+    """A step of x (along the track) or y within a line.
+
+    Attributes:
+        line: camera.
+        axis: x or y.
+        place: y of the joint in the focal plane, metres.
+        step: what the residuals say of it, of everything beyond the joint, metres.
+        sigma: of that, all steps together.
+        seen_from: step that is told in half of all cases; None where the points tell none.
+        found: whether this one is told, false alarm 1e-4 for all together.
+    """
+
+    line: str
+    axis: str
+    place: float
+    step: float
+    sigma: float | None
+    seen_from: float | None
+    found: bool
+
+    @classmethod
+    def of(cls, campaign: Campaign, together: Adjustment) -> tuple[Self, ...]:
+        """Steps of all lines of a campaign, by the adjustment of all fields."""
+        steps = Steps(_joints(campaign))
+        unseen = together.unseen(steps)
+        limit = float(norm.isf(0.5 * _STEP_ALARM / max(steps.size, 1)))
+        found = []
+        for k, (value, sigma) in enumerate(zip(unseen.estimate.tolist(), unseen.sigma.tolist(), strict=True)):
+            line, place = steps.places[k // 2]
+            said = (value, sigma, limit * sigma, abs(value) > limit * sigma)
+            found.append(cls(line, "xy"[k % 2], place, *(said if np.isfinite(sigma) else (0.0, None, None, False))))
+        return tuple(found)
+
+
+def _joints(campaign: Campaign) -> tuple[tuple[str, float], ...]:
+    """(line, y) of the joints between chips; the middle of a line of one chip."""
+    data = campaign.passes[0].data
+    found = []
+    for name in campaign.lines:
+        ccds = () if data.lines is None else data.lines[name].ccds or ()
+        pixels = [0.5 * (a.last + b.first) for a, b in pairwise(ccds)]
+        pixels = pixels or [0.5 * (data.sensors[name].camera.pixels - 1)]
+        found += [(name, float(y)) for y in data.places(name, np.array(pixels))[:, 1]]
+    return tuple(found)
+
+
+def steps_table(numbers: tuple[ChipStep, ...]) -> Table:
+    """What the points say, joint by joint, in micrometres."""
+    rows = [(n.line, n.axis, in_unit(n.place, "mm"), *in_unit((n.step, n.sigma, n.seen_from), "um")) for n in numbers]
+    return Table(
+        "chip-steps",
+        "Steps between chips that these points would show",
+        "Steps are no unknowns: what the residuals say of one at each joint of the camera's file, at the middle of a "
+        "line of one chip, micrometres. Seen from: told in half of all cases, one false alarm in 10 000 runs.",
+        ("line", "axis", "at y [mm]", "step", "σ", "seen from"),
+        rows,
+        (None, None, 2, 2, 2, 2),
+    )
+
+
+def step_warnings(numbers: tuple[ChipStep, ...]) -> list[str]:
+    """Steps that the residuals show."""
+    found = [n for n in numbers if n.found]
+    if not found:
+        return []
+    listed = ", ".join(
+        f"{n.line} {n.axis} {1e6 * n.step:+.1f} ± {1e6 * (n.sigma or 0.0):.1f} µm at {1e3 * n.place:.1f} mm"
+        for n in found
+    )
+    return [f"residuals show a step within a line: {listed}; its chips lie otherwise than the camera's file says"]

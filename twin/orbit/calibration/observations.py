@@ -39,7 +39,7 @@ _DISTORTION_STEPS = 8
 
 
 def light_effects(spec: EffectsSpec) -> LightEffects:
-    """Those that a file says."""
+    """Effects on the light that a file switches on."""
     return LightEffects(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
 
 
@@ -126,7 +126,7 @@ class PassData:
 
     @property
     def phase(self) -> float:
-        """Of the attitude's readings: time of one of them from the next whole multiple of their interval, seconds.
+        """Time of a reading of the attitude from the next whole multiple of their interval, seconds.
 
         Readings of the orbit are as far from their multiples at most, half of their interval, which shared noise does
         not know: its variance then is that of another place between two readings.

@@ -1,18 +1,20 @@
 """Schemes of averaged parameters (paper 003, section 4.4), tested on all fields by forward intersection without ground
-control: on one campaign, and on campaigns repeated with everything drawn anew.
+control: on one campaign, and on campaigns repeated with everything drawn anew. What averaging can gain depends on how
+well the parameters repeat from field to field, which stands here, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import chi2
 
 from analysis.orbit.adjustment import Adjustment
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
-from analysis.orbit.three_line_model import LineModel
+from analysis.orbit.three_line_model import BIAS, LineModel
 from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
@@ -21,7 +23,37 @@ from twin.orbit.calibration.observations import EFFECTS
 from twin.run.procedure import Advance
 
 if TYPE_CHECKING:
+    from scenes.specs.orbit.calibration import MapLimitsSpec
     from scenes.specs.orbit.setup import CalibrationSetup
+
+RMS = ("plan_rms", "height_rms")
+"""Attributes of `CheckErrors` and of `FieldErrors`."""
+
+
+@dataclass(frozen=True)
+class FieldErrors:
+    """RMS errors at the check points of several fields, metres: in plan (both axes) and in height."""
+
+    plan_rms: float
+    height_rms: float
+
+    @classmethod
+    def pooled(cls, errors: Iterable[CheckErrors]) -> FieldErrors:
+        """RMS errors over all check points, so that a field weighs by the number of its points."""
+        rows = list(errors)
+        count = [e.count for e in rows]
+        plan, height = (np.average(np.square([getattr(e, what) for e in rows]), weights=count) for what in RMS)
+        return cls(float(np.sqrt(plan)), float(np.sqrt(height)))
+
+    @classmethod
+    def mean(cls, errors: Mapping[str, CheckErrors]) -> FieldErrors:
+        """Means of the fields' RMS errors."""
+        return cls(*(float(values_of(errors, what).mean()) for what in RMS))
+
+
+def meets(errors: Mapping[str, CheckErrors], limits: MapLimitsSpec) -> bool:
+    """Whether the RMS errors of every field lie within the limits of a map."""
+    return all(e.plan_rms <= limits.plan and e.height_rms <= limits.height for e in errors.values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +73,7 @@ class SchemeMeans:
 
     @classmethod
     def of(cls, schemes: Mapping[str, Mapping[str, CheckErrors]]) -> SchemeMeans | None:
-        """None for a single scheme of averaged parameters.
+        """Means and spreads of the schemes; None for a single scheme of averaged parameters.
 
         schemes: all of them; the last, each field its own, is not averaged and does not count.
         """
@@ -58,8 +90,6 @@ class SchemeMeans:
 
 _LEAST_SCHEMES = 3
 """Two of averaged parameters, and each field its own."""
-RMS = ("plan_rms", "height_rms")
-"""Attributes of `CheckErrors`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +143,7 @@ def tested(campaign: Campaign, one: FieldPass, cameras: Mapping[str, LineModel],
 
 
 def repeated(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Advance) -> Repeats | None:
-    """As many campaigns as the file asks for; None for none. Only their errors at check points count, no sigmas.
+    """Fly and calibrate as many campaigns as the file asks for; None for none. Only errors at check points count.
 
     Raises:
         CalibrationError: one of them cannot be solved.
@@ -145,3 +175,44 @@ def averaged(
         for line, camera in campaign.laboratory.items()
     }
     return cameras, np.mean([r.bias(name) for name, r in zip(names, results, strict=True)], axis=0)
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """One parameter over the fields, each calibrated by itself, metres or radians.
+
+    Attributes:
+        name: of the parameter, without a field.
+        scatter: standard deviation over the fields.
+        sigma: that the adjustments claim, root mean square; 0 where held.
+        p_value: chance of such a scatter or a larger one if the parameter is the same in all fields; None where held.
+    """
+
+    name: str
+    scatter: float
+    sigma: float
+    p_value: float | None
+
+
+def repeatability(campaign: Campaign, alone: Mapping[str, Adjustment]) -> tuple[Repeatability, ...]:
+    """Interior orientation, then biases; empty for fewer than two fields.
+
+    Args:
+        campaign: the fields.
+        alone: field -> it calibrated by itself.
+    """
+    if len(alone) < 2:
+        return ()
+    found = []
+    for name in (*campaign.inner, *BIAS):
+        names = {field: f"{field} {name}" if name in BIAS else name for field in alone}
+        value = np.array([one.value(names[field]) for field, one in alone.items()])
+        sigma = np.array([one.sigma[names[field]] for field, one in alone.items()])
+        scatter, claimed = float(value.std(ddof=1)), float(np.sqrt(np.mean(sigma**2)))
+        chance = None
+        if claimed > 0.0:
+            weight = sigma**-2.0
+            mean = float(np.sum(weight * value) / np.sum(weight))
+            chance = float(chi2.sf(np.sum(weight * (value - mean) ** 2), len(value) - 1))
+        found.append(Repeatability(name, scatter, claimed, chance))
+    return tuple(found)

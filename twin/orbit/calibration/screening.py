@@ -1,13 +1,14 @@
-"""Last test of measured points: robust weights of the adjustment, and of check points the intersection of their rays.
+"""What measured points say of themselves: robust weights of the adjustment, whether the rays of check points meet, how
+large a pixel is on the ground.
 
 What the adjustment leaves out is taken from the measurements for good, and the sigmas of matching grow where the
-residuals of the rest ask for it. Nothing of it uses the truth but the counts.
+residuals of the rest ask for it. Nothing here uses the truth but the counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -107,13 +108,13 @@ def _factors(found: Adjustment, kept: _Kept) -> dict[tuple[str, str], float]:
 
 
 def _variance(squares: np.ndarray) -> float:
-    """Of residuals from their squared lengths (n,), by the median."""
+    """Variance of residuals from their squared lengths (n,), by the median."""
     # median of chi-square with two degrees of freedom is 2 ln 2; the tails are what robust weights are for
     return float(np.median(squares) / (2.0 * np.log(2.0)))
 
 
 def _rescaled(campaign: Campaign, factors: Mapping[tuple[str, str], float]) -> Campaign:
-    """With sigmas of image points times the factor of their pass and line."""
+    """The campaign with sigmas of image points times the factor of their pass and line."""
 
     def grown(one: FieldPass, images: Mapping[str, ImagePoints]) -> FrozenMap[str, ImagePoints]:
         return FrozenMap(
@@ -203,3 +204,47 @@ def _counted(one: FieldPass, shown: FieldImages, kept: dict[str, np.ndarray], ch
         int(check.sum()),
         int((bad & check).sum()),
     )
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """How well the rays of check points meet, by the sigmas of image points and readings.
+
+    Attributes:
+        chi_square: of all of them.
+        degrees_of_freedom: two for each ray less three for each point.
+    """
+
+    chi_square: float
+    degrees_of_freedom: int
+
+    @property
+    def p_value(self) -> float:
+        """Chance of such a chi-square or a larger one. Points exposed within a few readings err alike, and the
+        calibration's own errors are in it.
+        """
+        return float(chi2.sf(self.chi_square, self.degrees_of_freedom))
+
+
+def meeting_of(campaign: Campaign, one: FieldPass, adjustment: Adjustment) -> Meeting:
+    """Intersect a pass's check points by the cameras and the bias of an adjustment.
+
+    Raises:
+        CalibrationError: they cannot be intersected.
+    """
+    found = intersect(one.check, adjustment.cameras_of(one.name), campaign.noise, bias=adjustment.bias(one.name))
+    seen = found.rays > 1
+    return Meeting(float(np.sum(found.chi_square[seen])), int(np.sum(2 * found.rays[seen] - 3)))
+
+
+def ground_sample(one: FieldPass, line: str) -> tuple[float, float]:
+    """Ground sample distance of the middle of a line's image along and across the track, metres."""
+    sensor = one.data.sensors[line]
+    row = one.control_images.get(line)
+    middle = 0.5 * (sensor.lines - 1) if row is None or not len(row.line) else float(np.mean(row.line))
+    pixel = 0.5 * (sensor.camera.pixels - 1)
+    step = 0.5 if 0.0 <= middle - 0.5 and middle + 0.5 <= sensor.lines - 1 else 0.25
+    places = np.array([[middle - step, pixel], [middle + step, pixel], [middle, pixel - step], [middle, pixel + step]])
+    ground = sensor.ground(places[:, 0], places[:, 1], one.data.height)
+    along, across = (float(np.linalg.norm(ground[k + 1] - ground[k])) / (2.0 * step) for k in (0, 2))
+    return along, across

@@ -101,7 +101,7 @@ def with_points(field: CalibrationField, rays: Mapping[str, Rays], ground: np.nd
     )
 
 
-def tie_rays(one: FieldPass) -> Mapping[str, Rays]:
+def _tie_rays(one: FieldPass) -> Mapping[str, Rays]:
     """The strip's tie points; where points are measured in images, all those that the calibration uses."""
     return one.ties or one.control.rays
 
@@ -114,7 +114,7 @@ def adjusted_strip(
     Raises:
         CalibrationError: it cannot be adjusted.
     """
-    return adjust_strip(tie_rays(one), cameras, campaign.noise, bias=bias)
+    return adjust_strip(_tie_rays(one), cameras, campaign.noise, bias=bias)
 
 
 def tested_in_strip(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,23 +12,18 @@ import numpy as np
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
 from analysis.monitor.monitoring import CameraParameters
-from analysis.monitor.recovery import joint, judged_spots
+from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots
 from analysis.monitor.series_smoother import smooth, window_of
 from analysis.monitor.spot_evidence import SpotEvidence
 from analysis.spots.centroid import mean_frames
-from analysis.spots.fit_state import FitStates
-from analysis.spots.spot_positions import (
-    SeriesNoise,
-    SpotError,
-    SpotPositions,
-    difference_covariance,
-    noise_parts,
-)
+from analysis.spots.spot_positions import SeriesNoise, SpotError
 from optics.geometry.tree import State
 from optics.numerics.threads import cores, one_blas_thread
 from scenes.specs.course import moment
 from scenes.specs.instrument import CENTRAL_PRISM
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.observation import Observing, Record, light_of, read
+from twin.monitor.truth import Truth
 from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
@@ -36,10 +32,6 @@ if TYPE_CHECKING:
 CHUNK = 25
 """States rendered at once, to bound memory."""
 TOO_FAR = "temperatures and motions that keep the beams on the mirrors and the spots on their CCDs"
-
-
-Judged = tuple[SpotPositions, FitStates]
-"""Spots with the sigmas that their fits leave them, and how good these are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,12 +88,22 @@ class Measured:
         covariance: (S, 2 C, 2 C) px^2 of each state's shifts.
         noise: of the shifts of all states together; None where they are not of one series.
         evidence: what the fits of the spots say of their sigmas.
+        truth: of the states.
     """
 
     positions: np.ndarray
     covariance: np.ndarray
     noise: SeriesNoise | None
     evidence: SpotEvidence
+    truth: tuple[Truth, ...]
+
+    @classmethod
+    def of(cls, found: Sequence[Recovery], noise: SeriesNoise | None, truth: Sequence[Truth]) -> Measured:
+        """From what was recovered piece by piece."""
+        positions = [np.stack([one.before, one.after]) for one in found]
+        evidence = SpotEvidence.joined([one.evidence for one in found if one.evidence is not None])
+        spread = np.concatenate([one.shift_covariance for one in found])
+        return cls(np.concatenate(positions, axis=1), spread, noise, evidence, tuple(truth))
 
     def doubts(self, times: Sequence[float], spots: Sequence[str]) -> tuple[str, ...]:
         """A warning where sigma does not hold: at the worst of the states.
@@ -130,36 +132,6 @@ class _Some:
         return self.noise.covariance(self.at[images])
 
 
-class _Collected:
-    """Differences to one set of reference images, piece by piece: influence maps of all positions would be large."""
-
-    def __init__(self, experiment: MonitorExperiment, start: Judged, series: bool) -> None:
-        before, self.fits = start
-        self.detector, self.before = experiment.calibration.noise, before
-        self.more: list[FitStates] = []
-        self.spots = experiment.calibration.spots
-        self.end: list[np.ndarray] = []
-        self.spread: list[np.ndarray] = []
-        self.noise: SeriesNoise | None = None
-        if series and experiment.disturbances is not None:
-            self.noise = SeriesNoise(noise_parts(before, self.detector), window_of(2 * self.spots))
-
-    def add(self, found: Judged) -> None:
-        after, fits = found
-        self.more.append(fits)
-        spread = difference_covariance(self.before, after, self.detector)
-        self.spread.append(joint(spread.reshape(-1, self.spots, 2, 2)))
-        self.end.append(after.position.reshape(-1, self.spots, 2))
-        if self.noise is not None:
-            self.noise.add(noise_parts(after, self.detector))
-
-    def measured(self) -> Measured:
-        end = np.concatenate(self.end)
-        start = np.broadcast_to(self.before.position.reshape(1, self.spots, 2), end.shape)
-        evidence = SpotEvidence(self.fits, FitStates.joined(self.more))
-        return Measured(np.stack([start, end]), np.concatenate(self.spread), self.noise, evidence)
-
-
 class MonitorSeries:
     """A monitor with its reference images. Where disturbances are stated each state is read by `posterior`, with what
     they are expected to change since the reference; else by `model`.
@@ -177,13 +149,13 @@ class MonitorSeries:
         self.experiment, self.spec, self.pair = experiment, spec, pair
         self.frames: int = spec.frames or experiment.instrument.spec.monitor.frames
         self.reference = experiment.path.expected_photons([reference])
-        self._clean_reference = self._spots(experiment.expected_frames(self.reference), None)
+        self._clean_reference = self._reference_spots(experiment.expected_frames(self.reference))
         names = list(experiment.instrument.cameras)
         self._own = np.concatenate([np.arange(4) + 4 * names.index(name) for name in pair])
 
     @property
     def estimator(self) -> str:
-        """By which each state is read."""
+        """Name of the estimator that reads each state."""
         return "model" if self.experiment.disturbances is None else "posterior"
 
     def measured(self, states: Sequence[State], seed: int) -> tuple[Measured, Measured]:
@@ -193,23 +165,18 @@ class MonitorSeries:
             BenchError: a spot cannot be measured.
             AimError, BeamMissedError: light is lost.
         """
-        experiment = self.experiment
         # a stream of its own: states are numbered from 0
-        first = mean_frames(experiment.frames_after(self.reference, self.frames, seed, len(states))[0])
-        exposed = _Collected(experiment, self._spots(first, None), True)
-        expected = _Collected(experiment, self._clean_reference, True)
-        for piece, photons in experiment.path.iterate_photons(states, chunk=CHUNK):
-            after = mean_frames(experiment.frames_after(photons, self.frames, seed, piece.start))
-            exposed.add(self._spots(after, piece.start))
-            expected.add(self._spots(experiment.expected_frames(photons), piece.start))
-        return exposed.measured(), expected.measured()
+        first = self._reference_spots(self._exposed(self.reference, seed, len(states)))
+        exposed, expected = self._observed(
+            states,
+            (lambda photons, numbers: (first, self._exposed(photons, seed, numbers)), self._expected),
+            series=True,
+        )
+        return Measured.of(*exposed), Measured.of(*expected)
 
-    def clean(self, states: Sequence[State]) -> np.ndarray:
-        """(S, 2 C) shifts from expected images without noise, px. Raises as `measured`."""
-        found = _Collected(self.experiment, self._clean_reference, False)
-        for piece, photons in self.experiment.path.iterate_photons(states, chunk=CHUNK):
-            found.add(self._spots(self.experiment.expected_frames(photons), piece.start))
-        return found.measured().shifts
+    def clean(self, states: Sequence[State]) -> Measured:
+        """From expected images without noise. Raises as `measured`."""
+        return Measured.of(*self._observed(states, (self._expected,))[0])
 
     def of_prisms(self) -> np.ndarray:
         """(T, 2 C) shifts without noise by temperatures that the file gives to the monitor's prisms themselves."""
@@ -218,30 +185,23 @@ class MonitorSeries:
         for k in range(len(self.spec.course.times)):
             own = {p: f for p, f in job.fields(k).items() if "/monitor/" in p or p.startswith(CENTRAL_PRISM)}
             states.append(self.experiment.thermal.state(own, {}))
-        shifts = self.clean(states)
+        shifts = self.clean(states).shifts
         return np.asarray(shifts - shifts[self.spec.referred])
 
     def repeated(self, state: State, count: int, seed: int, number: int) -> Measured:
-        """Of one state, ``count`` times: reference and state measured anew each time, with another detector's pattern.
+        """Measure the reference and one state ``count`` times, each time with another pattern of the detectors.
 
         ``number`` is that of the state's time.
         """
-        experiment = self.experiment
-        photons = experiment.path.expected_photons([state])
-        pieces = []
-        for k in range(count):
-            before, after = (
-                mean_frames(experiment.frames_after(what, self.frames, seed + k, which)[0])
-                for what, which in ((self.reference, 1), (photons, 0))
+
+        def record(k: int) -> Record:
+            return lambda photons, numbers: (
+                self._exposed(self.reference, seed + k, 1)[0],
+                self._exposed(photons, seed + k, 0),
             )
-            found = _Collected(experiment, self._spots(before, number), False)
-            found.add(self._spots(after, number))
-            pieces.append(found.measured())
-        positions = np.concatenate([one.positions for one in pieces], axis=1)
-        every = [one.evidence for one in pieces]
-        first, last = (FitStates.joined([getattr(one, name) for one in every]) for name in ("before", "after"))
-        covariance = np.concatenate([one.covariance for one in pieces])
-        return Measured(positions, covariance, None, SpotEvidence(first, last))
+
+        every = self._observed([state], [record(k) for k in range(count)], [number])
+        return Measured.of([one for found, _, _ in every for one in found], None, every[0][2])
 
     def gains(self, measured: Measured, numbers: Sequence[int]) -> np.ndarray:
         """(S, 8, 2 C) of the estimator, parameters of the pair per pixel.
@@ -314,19 +274,65 @@ class MonitorSeries:
         values = np.einsum("...pd,...d->...p", gains, shifts)
         return {name: values[:, 4 * k : 4 * k + 4] for k, name in enumerate(self.pair)}
 
-    def _spots(self, frames: np.ndarray, first: int | None) -> Judged:
-        calibration = self.experiment.calibration
-        flat = frames.reshape(-1, *frames.shape[-2:])
-        try:
-            with one_blas_thread():
-                return judged_spots(flat, self.frames, calibration, self.spec.analysis.centroid, cores())
-        except SpotError as error:
-            raise self._lost(error, self.spec.referred if first is None else first) from error
+    def _exposed(self, photons: np.ndarray, seed: int, numbers: int | np.ndarray) -> np.ndarray:
+        return mean_frames(self.experiment.frames_after(photons, self.frames, seed, numbers))
 
-    def _lost(self, error: SpotError, first: int) -> BenchError:
-        state, spot = divmod(error.indices[0], self.experiment.calibration.spots)
-        number = min(first + state, len(self.spec.course.times) - 1)
-        channel = self.experiment.path.channels[spot].key
-        reason = error.reasons[error.indices[0]]
-        time = moment(self.spec.course.times[number])
-        return BenchError(f"the spot {channel} cannot be measured at {time} ({reason})", ("course",), TOO_FAR)
+    def _expected(self, photons: np.ndarray, numbers: np.ndarray) -> tuple[MeasuredSpots, np.ndarray]:
+        """A `Record` of expected images."""
+        return self._clean_reference, self.experiment.expected_frames(photons)
+
+    def _reference_spots(self, images: np.ndarray) -> MeasuredSpots:
+        """Measure the spots of mean frames (1, C, rows, columns) at the reference."""
+        experiment, centroid = self.experiment, self.spec.analysis.centroid
+        with self._told([self.spec.referred]), one_blas_thread():
+            return judged_spots(images[0], self.frames, experiment.calibration, centroid, cores())
+
+    def _observed(
+        self, states: Sequence[State], records: Sequence[Record], numbers: Sequence[int] = (), series: bool = False
+    ) -> list[tuple[list[Recovery], SeriesNoise | None, list[Truth]]]:
+        """What each of some ways to record images says of the same states, piece by piece, as `Measured.of` takes it.
+
+        Args:
+            states: to be observed.
+            records: ways to record.
+            numbers: of the states' times; those of the course if not given.
+            series: whether the states are those of the course, whose noise is wanted together.
+        """
+        experiment, spots = self.experiment, self.experiment.calibration.spots
+        series = series and experiment.disturbances is not None
+        times = numbers or range(len(states))
+        noise: list[SeriesNoise | None] = [None] * len(records)
+        found: list[list[Recovery]] = [[] for _ in records]
+        truths = []
+        for first in range(0, len(states), CHUNK):
+            piece = slice(first, first + CHUNK)
+            some = states[piece]
+            photons = experiment.path.expected_photons(some, chunk=CHUNK)
+            light = light_of(experiment, some, np.arange(first, first + len(some)), photons=photons)
+            truths.append(light.truth)
+            for k, record in enumerate(records):
+                how = Observing(
+                    record, self.spec.analysis.centroid, stated=False, keep_parts=series, frames=self.frames
+                )
+                with self._told(times[piece]):
+                    one = read(experiment, light, how)
+                assert one is not None
+                if one.recovery.parts is not None:
+                    before, after = one.recovery.parts
+                    together = noise[k] = noise[k] or SeriesNoise(before, window_of(2 * spots))
+                    together.add(after)
+                # influence maps of all positions would be large
+                found[k].append(replace(one.recovery, parts=None))
+        return [(every, own, truths) for every, own in zip(found, noise, strict=True)]
+
+    @contextmanager
+    def _told(self, numbers: Sequence[int]) -> Iterator[None]:
+        """Spots that cannot be measured as an error of the file, with the number of each state's time."""
+        try:
+            yield
+        except SpotError as error:
+            state, spot = divmod(error.indices[0], self.experiment.calibration.spots)
+            channel, reason = self.experiment.path.channels[spot].key, error.reasons[error.indices[0]]
+            time = moment(self.spec.course.times[min(numbers[state], len(self.spec.course.times) - 1)])
+            text = f"the spot {channel} cannot be measured at {time} ({reason})"
+            raise BenchError(text, ("course",), TOO_FAR) from error

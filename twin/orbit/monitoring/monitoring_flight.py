@@ -25,6 +25,7 @@ from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import moment
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import Truth
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
@@ -196,16 +197,16 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
     advance("monitor", 1, parts)
     instrument, reference = experiment.instrument, states[spec.referred]
     try:
-        truth, distance = _changes(experiment, states, spec.referred)
         lines = tuple(_lines(experiment, state, pair) for state in states)
         turned = {name: _lines(experiment, _turned(experiment, reference, name), pair)[name] for name in pair}
         advance("monitor", 2, parts)
         angle = np.array([look_angle(line[pair[0]], line[pair[1]]) for line in lines])
         worst = int(np.argmax(np.abs(angle - angle[spec.referred])))
         # before the images, which take longer
-        views = look_down(spec, pair, lines, ground_seed, advance)
+        views = _look_down(spec, pair, lines, ground_seed, advance)
         monitor = MonitorSeries(experiment, spec, reference, pair)
         noisy, clean = monitor.measured(states, number)
+        truth, distance = _changes(clean.truth, spec.referred)
         used = noisy if spec.errors.switched_on and spec.errors.monitor else clean
         gains = monitor.gains(used, range(len(states)))
         advance("monitor", 3, parts)
@@ -247,19 +248,18 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
     )
 
 
-def _changes(
-    experiment: MonitorExperiment, states: Sequence[State], reference: int
-) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Camera -> (T, 4) true changes since the reference, and camera -> principal distance there.
 
     The trace refers changes to the nominal camera; their differences are those between two states but for products of
     two arcseconds, 1e-11 rad.
     """
     out, distance = {}, {}
-    for name, change in experiment.sight.truth(states).cameras.items():
-        values = np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
+    for name in truths[0].cameras:
+        every = [one.cameras[name] for one in truths]
+        values = np.concatenate([np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) for c in every])
         out[name] = values - values[reference]
-        distance[name] = float(change.principal_distance[reference])
+        distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
     return out, distance
 
 
@@ -271,12 +271,13 @@ def _causes(
     """
     named = [("temperature", path) for path in spec.course.temperature] + [("motion", path) for path in spec.motion]
     states = [s for what, path in named for s in states_of(experiment, spec, (spec.referred, worst), (what, path))]
-    truth, _ = _changes(experiment, states, 0)
-    estimates = monitor.by_camera(gain, monitor.clean(states))
+    found = monitor.clean(states)
+    truth, _ = _changes(found.truth, 0)
+    estimates = monitor.by_camera(gain, found.shifts)
     out = []
     for k, (what, path) in enumerate(named):
-        true = {n: truth[n][2 * k + 1] - truth[n][2 * k] for n in monitor.pair}
-        error = {n: estimates[n][2 * k + 1] - estimates[n][2 * k] - true[n] for n in monitor.pair}
+        true, read = ({n: v[n][2 * k + 1] - v[n][2 * k] for n in monitor.pair} for v in (truth, estimates))
+        error = {n: read[n] - true[n] for n in monitor.pair}
         out.append(Cause(what, path, FrozenMap(true), FrozenMap(error)))
     return tuple(out)
 
@@ -292,7 +293,7 @@ def _turned(experiment: MonitorExperiment, state: State, camera: str) -> State:
     return compose(state, {f"{BASE}/{camera}": Motion((0.0, ARCSEC, 0.0))}, bodies)
 
 
-def look_down(
+def _look_down(
     spec: OrbitMonitorSpec,
     pair: tuple[str, str],
     lines: Sequence[Mapping[str, LineCamera]],

@@ -4,374 +4,200 @@ errors in metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor.monitoring import PER_SI
-from analysis.units import ARCSEC
-from scenes.specs.orbit.monitor import PARAMETERS
 from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight
-from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, rms
-from twin.run.plain_data import plain_data
+from twin.orbit.monitoring.monitoring_run import CaseErrors, MonitorRun, Smoothing, rms
+from twin.run.quantity import Quantity, Record
 
 Array = NDArray[np.float64]
 
 
-def cause_heights(run: MonitorRun, cause: Cause) -> tuple[float, float]:
-    """Metres of height that a cause alone makes at its time: without monitoring, and what the monitor is wrong by."""
-    flight = run.flight
-    slopes = {n: run.slopes[n][flight.worst] for n in flight.pair}
-    without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
-    applied = np.array([float(name in flight.spec.apply) for name in PARAMETERS])
-    left = sum(float(slopes[n] @ (applied * cause.error[n])) for n in flight.pair)
-    return without, left
-
-
-@dataclass(frozen=True)
-class ChangeNumbers:
-    """Changes of a camera: numbers, or (T,) over the times."""
-
-    d_alpha_arcsec: Array
-    d_beta_arcsec: Array
-    d_gamma_arcsec: Array
-    d_f_um: Array
-
-    @classmethod
-    def of(cls, values: Array) -> Self:
-        """Of (..., 4), radians and metres."""
-        return cls(*np.moveaxis(values * PER_SI, -1, 0))
-
-
-@dataclass(frozen=True)
-class CameraNumbers:
-    """Changes of one camera since the reference; those monitored with their sigmas."""
-
-    true: ChangeNumbers
-    monitored: Mapping[str, Any]
-    without_noise: ChangeNumbers
-    prisms_alone: ChangeNumbers
-
-    @classmethod
-    def of(cls, flight: MonitorFlight, name: str) -> Self:
-        """Of one camera by name."""
-        true, clean, prisms = (
-            ChangeNumbers.of(unsigned(values[name])) for values in (flight.truth, flight.clean, flight.prisms)
-        )
-        return cls(true, flight.monitored[name].to_dict(), clean, prisms)
-
-
-def unsigned(values: Array) -> Array:
-    """The same with plain zeros for negative ones."""
+def _unsigned(values: Array) -> Array:
+    """Values with plain zeros in place of negative ones."""
     return np.asarray(values + 0.0)
 
 
-@dataclass(frozen=True)
-class AngleNumbers:
-    """The intersection angle at the reference, and its changes over the times."""
-
-    reference_deg: float
-    true_change_arcsec: Array
-    monitored_change_arcsec: Array
-    monitored_change_sigma_arcsec: Array
-    monitored_change_sigma_noise_arcsec: Array
-    true_change_span_arcsec: float
-
-    @classmethod
-    def of(cls, run: MonitorRun) -> Self:
-        """Of a run."""
-        change = run.angle_change / ARCSEC
-        return cls(
-            reference_deg=float(np.degrees(run.flight.angle[run.flight.spec.referred])),
-            true_change_arcsec=unsigned(change),
-            monitored_change_arcsec=unsigned(run.angle / ARCSEC),
-            monitored_change_sigma_arcsec=unsigned(run.angle_sigma / ARCSEC),
-            monitored_change_sigma_noise_arcsec=unsigned(run.angle_noise / ARCSEC),
-            true_change_span_arcsec=float(np.ptp(change)),
-        )
-
-
-@dataclass(frozen=True)
-class SummaryNumbers:
-    """Errors at the check points over all times; worst: the RMS of the worst time; camera: what the cameras do."""
-
-    height_rms_m: float
-    height_worst_m: float
-    height_bias_rms_m: float
-    height_camera_rms_m: float
-    plan_rms_m: float
-    plan_camera_rms_m: float
-
-    @classmethod
-    def of(cls, case: CaseErrors) -> SummaryNumbers:
-        """Of one case."""
-        return cls(**_summary(case))
-
-
-def _summary(case: CaseErrors) -> dict[str, Any]:
-    """Fields of `SummaryNumbers`."""
-    return {
-        "height_rms_m": case.height_rms,
-        "height_worst_m": case.worst,
-        "height_bias_rms_m": rms(case.bias),
-        "height_camera_rms_m": case.camera_height_rms,
-        "plan_rms_m": case.plan_rms,
-        "plan_camera_rms_m": rms(case.camera_plan),
-    }
-
-
-@dataclass(frozen=True)
-class SeriesNumbers:
-    """The same at each time, (T,)."""
-
-    height_rms_m: Array
-    height_bias_m: Array
-    height_camera_m: Array
-    plan_rms_m: Array
-
-
-@dataclass(frozen=True)
-class CaseNumbers(SummaryNumbers):
-    """One case with its series."""
-
-    series: SeriesNumbers
-
-    @classmethod
-    def of(cls, case: CaseErrors) -> CaseNumbers:
-        """Of one case."""
-        series = SeriesNumbers(*map(unsigned, (case.height, case.bias, case.camera, case.plan)))
-        return cls(**_summary(case), series=series)
-
-
-@dataclass(frozen=True)
-class ConversionNumbers:
-    """Metres of height for an arcsecond; of the angle, of both cameras alike, of each camera."""
-
-    by_angle_m_per_arcsec: float
-    by_common_turn_m_per_arcsec: float
-    by_camera_m_per_arcsec: Mapping[str, float]
-    theory_by_camera_m_per_arcsec: Mapping[str, float]
-    base_to_height: float
-
-
-@dataclass(frozen=True)
-class SlopeNumbers:
-    """Change of the mean height with what the analysis is told of one camera, at the reference."""
-
-    d_alpha_m_per_arcsec: float
-    d_beta_m_per_arcsec: float
-    d_gamma_m_per_arcsec: float
-    d_f_m_per_um: float
-
-    @classmethod
-    def of(cls, run: MonitorRun, name: str) -> Self:
-        """Of one camera by name."""
-        return cls(*(float(v) for v in run.slopes[name][run.flight.spec.referred] / PER_SI))
-
-
-@dataclass(frozen=True)
-class PropagationNumbers:
-    """Sigma of the mean height over the times, by the monitor's noise and of its whole error (none where nothing is
-    stated to move), and that of the noise against repeats at one time.
-    """
-
-    height_sigma_m: Array
-    height_total_sigma_m: Array | None
-    time_s: float
-    repeats: int
-    sigma_m: float
-    spread_m: float
-    ratio: float
-    lower_limit: float
-    upper_limit: float
-    agrees: bool
-
-    @classmethod
-    def of(cls, run: MonitorRun) -> Self:
-        """Of a run."""
-        scatter, (low, high) = run.scatter, run.scatter.limits
-        return cls(
-            height_sigma_m=unsigned(run.sigma),
-            height_total_sigma_m=None if run.sigma_total is None else unsigned(run.sigma_total),
-            time_s=float(run.flight.times[run.flight.worst]),
-            repeats=len(scatter.heights),
-            sigma_m=scatter.sigma,
-            spread_m=scatter.spread,
-            ratio=scatter.spread / scatter.sigma,
-            lower_limit=low,
-            upper_limit=high,
-            agrees=scatter.agrees,
-        )
+CHANGES: Record[Array] = Record(
+    "Changes of a camera.",
+    Quantity("d_alpha_arcsec", lambda values: _unsigned(values[..., 0]), "Δα"),
+    Quantity("d_beta_arcsec", lambda values: _unsigned(values[..., 1]), "Δβ"),
+    Quantity("d_gamma_arcsec", lambda values: _unsigned(values[..., 2]), "Δγ"),
+    Quantity("d_f_um", lambda values: _unsigned(values[..., 3]), "change of the principal distance"),
+)
+CAMERA: Record[tuple[MonitorFlight, str]] = Record(
+    "Changes of one camera since the reference, over the times.",
+    Quantity("true", lambda one: one[0].truth[one[1]], record=CHANGES),
+    Quantity("monitored", lambda one: one[0].monitored[one[1]].to_dict(), "by the monitor, with sigmas"),
+    Quantity("without_noise", lambda one: one[0].clean[one[1]], "by images without noise", record=CHANGES),
+    Quantity("prisms_alone", lambda one: one[0].prisms[one[1]], "by temperatures of the prisms", record=CHANGES),
+)
+ANGLE: Record[MonitorRun] = Record(
+    "The angle between the lines of sight at the reference, and its changes over the times.",
+    Quantity("reference_deg", lambda run: run.flight.angle[run.flight.spec.referred], "true, at the reference"),
+    Quantity("true_change_arcsec", lambda run: _unsigned(run.angle_change), "true change since the reference"),
+    Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle), "change by the monitor"),
+    Quantity(
+        "monitored_change_sigma_arcsec", lambda run: _unsigned(run.angle_sigma), "standard deviation of its error"
+    ),
+    Quantity("monitored_change_sigma_noise_arcsec", lambda run: _unsigned(run.angle_noise), "of that the noise's part"),
+    Quantity("true_change_span_arcsec", lambda run: np.ptp(run.angle_change), "largest less smallest true change"),
+)
+SUMMARY: Record[CaseErrors] = Record(
+    "RMS errors at the check points over all times.",
+    Quantity("height_rms_m", lambda case: case.height_rms, "in height", "height", 3),
+    Quantity("height_worst_m", lambda case: case.worst, "in height at the worst time", "worst", 3),
+    Quantity("height_bias_rms_m", lambda case: rms(case.bias), "of the points' mean height error"),
+    Quantity(
+        "height_camera_rms_m",
+        lambda case: case.camera_height_rms,
+        "in height by the cameras",
+        "height by the cameras",
+        4,
+    ),
+    Quantity("plan_rms_m", lambda case: case.plan_rms, "in plan", "plan", 3),
+    Quantity(
+        "plan_camera_rms_m", lambda case: rms(case.camera_plan), "in plan by the cameras", "plan by the cameras", 4
+    ),
+)
+SERIES: Record[CaseErrors] = Record(
+    "Errors at the check points of each time.",
+    Quantity("height_rms_m", lambda case: _unsigned(case.height), "RMS in height"),
+    Quantity("height_bias_m", lambda case: _unsigned(case.bias), "mean height error"),
+    Quantity("height_camera_m", lambda case: _unsigned(case.camera), "mean height error by the cameras"),
+    Quantity("plan_rms_m", lambda case: _unsigned(case.plan), "RMS in plan"),
+)
+CASE: Record[CaseErrors] = Record(
+    "Errors with the cameras of one case.", *SUMMARY, Quantity("series", lambda case: case, record=SERIES)
+)
+INTERVAL: Record[tuple[float, CaseErrors]] = Record(
+    "Errors where values are interpolated over an interval.",
+    Quantity("interval_s", lambda one: one[0], "between measurements"),
+    *SUMMARY.of_part(lambda one: one[1]),
+)
+CONVERSION: Record[MonitorRun] = Record(
+    "Metres of height for an arcsecond, at the reference.",
+    Quantity("by_angle_m_per_arcsec", lambda run: run.conversion.of_angle, "of the angle", converted=False),
+    Quantity(
+        "by_common_turn_m_per_arcsec", lambda run: run.conversion.of_common, "by which both turn alike", converted=False
+    ),
+    Quantity("by_camera_m_per_arcsec", lambda run: run.conversion.traced, "of one camera's Y, traced", converted=False),
+    Quantity(
+        "theory_by_camera_m_per_arcsec",
+        lambda run: run.conversion.theory,
+        "of one camera's Y, by base to height",
+        converted=False,
+    ),
+    Quantity("base_to_height", lambda run: run.conversion.base_to_height, "base over height of the pair"),
+)
+SLOPES: Record[Array] = Record(
+    "Change of the mean height with what the analysis is told of one camera, at the reference.",
+    Quantity("d_alpha_m_per_arcsec", lambda slope: slope[0], "with Δα", converted=False),
+    Quantity("d_beta_m_per_arcsec", lambda slope: slope[1], "with Δβ", converted=False),
+    Quantity("d_gamma_m_per_arcsec", lambda slope: slope[2], "with Δγ", converted=False),
+    Quantity("d_f_m_per_um", lambda slope: slope[3], "with the principal distance", converted=False),
+)
+PROPAGATION: Record[MonitorRun] = Record(
+    "Standard deviation of the mean height, and that of the noise against repeats at one time.",
+    Quantity("height_sigma_m", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
+    Quantity(
+        "height_total_sigma_m",
+        lambda run: None if run.sigma_total is None else _unsigned(run.sigma_total),
+        "over the times, of the whole error; null without a prior on disturbances",
+    ),
+    Quantity("time_s", lambda run: run.flight.times[run.flight.worst], "of the repeats"),
+    Quantity("repeats", lambda run: len(run.scatter.heights), "how often the monitor measures"),
+    Quantity("sigma_m", lambda run: run.scatter.sigma, "propagated"),
+    Quantity("spread_m", lambda run: run.scatter.spread, "standard deviation over the repeats"),
+    Quantity("ratio", lambda run: run.scatter.spread / run.scatter.sigma, "spread over sigma"),
+    Quantity("lower_limit", lambda run: run.scatter.limits[0], "of the ratio"),
+    Quantity("upper_limit", lambda run: run.scatter.limits[1], "of the ratio"),
+    Quantity("agrees", lambda run: run.scatter.agrees, "whether the ratio lies within the limits"),
+)
+SMOOTHED: Record[tuple[MonitorRun, float, Smoothing]] = Record(
+    "Heights by values smoothed from the measurements at one interval.",
+    Quantity("interval_s", lambda one: one[1], "between measurements"),
+    Quantity("measurements", lambda one: len(one[0].flight.spec.measured(one[1])), "how many there are"),
+    Quantity("height_rms_m", lambda one: one[2].case.height_rms, "RMS error in height over all times"),
+    Quantity("height_camera_rms_m", lambda one: one[2].case.camera_height_rms, "the same by the cameras"),
+    Quantity("height_sigma_rms_m", lambda one: rms(one[2].sigma), "RMS of the sigma that the smoother states"),
+    Quantity("better_than_interpolation", lambda one: one[2].factor, "by which factor the cameras' error is smaller"),
+    Quantity("largest_ratio", lambda one: one[2].furthest, "largest error over its sigma"),
+    Quantity("ratio_limit", lambda one: one[2].limit, "of this ratio"),
+    Quantity("agrees", lambda one: one[2].agrees, "whether the ratio lies within its limit"),
+    Quantity("chi_square", lambda one: one[2].consistency.chi_square, "of the measured shifts under the prior"),
+    Quantity("degrees_of_freedom", lambda one: one[2].consistency.degrees, "of chi-square"),
+    Quantity("chi_square_limit", lambda one: one[2].consistency.limit, "of chi-square"),
+    Quantity("shifts_agree", lambda one: one[2].consistency.agrees, "whether chi-square lies within its limit"),
+)
 
 
-@dataclass(frozen=True)
-class SmoothedNumbers:
-    """Heights by values smoothed from the measurements at one interval: RMS errors of all and of the cameras alone, how
-    many times smaller than with interpolation, and the sigma that the smoother states, RMS over the times. Then the
-    largest error over its sigma with its limit, and the chi-square of the measured shifts with its own.
-    """
-
-    interval_s: float
-    measurements: int
-    height_rms_m: float
-    height_camera_rms_m: float
-    height_sigma_rms_m: float
-    better_than_interpolation: float
-    largest_ratio: float
-    ratio_limit: float
-    agrees: bool
-    chi_square: float
-    degrees_of_freedom: int
-    chi_square_limit: float
-    shifts_agree: bool
-
-    @classmethod
-    def of(cls, run: MonitorRun, interval: float) -> Self:
-        """Of one interval."""
-        one = run.smoothing[interval]
-        return cls(
-            interval_s=interval,
-            measurements=len(run.flight.spec.measured(interval)),
-            height_rms_m=one.case.height_rms,
-            height_camera_rms_m=one.case.camera_height_rms,
-            height_sigma_rms_m=rms(one.sigma),
-            better_than_interpolation=one.factor,
-            largest_ratio=one.furthest,
-            ratio_limit=one.limit,
-            agrees=one.agrees,
-            chi_square=one.consistency.chi_square,
-            degrees_of_freedom=one.consistency.degrees,
-            chi_square_limit=one.consistency.limit,
-            shifts_agree=one.consistency.agrees,
-        )
+def _readings(run: MonitorRun) -> dict[str, Any]:
+    readings = run.flight.smoothed[run.flight.spec.interval].readings
+    return {name: readings[name].to_dict() for name in run.flight.pair}
 
 
-@dataclass(frozen=True)
-class SmoothingNumbers:
-    """What all measurements say together: changes at the file's interval with their sigmas, errors of the height over
-    the times with the sigma that is stated, and the comparison over the intervals.
-    """
-
-    disturbances: str
-    cameras: Mapping[str, Any]
-    height_error_m: Array
-    height_sigma_m: Array
-    intervals: Sequence[SmoothedNumbers]
-
-    @classmethod
-    def of(cls, run: MonitorRun) -> Self | None:
-        """Of a run; None where nothing is stated to move."""
-        flight, stated = run.flight, run.setup.disturbances
-        if stated is None:
-            return None
-        chosen, readings = run.smoothing[flight.spec.interval], flight.smoothed[flight.spec.interval].readings
-        return cls(
-            disturbances=stated.name,
-            cameras={name: readings[name].to_dict() for name in flight.pair},
-            height_error_m=unsigned(chosen.error),
-            height_sigma_m=unsigned(chosen.sigma),
-            intervals=[SmoothedNumbers.of(run, interval) for interval in run.smoothing],
-        )
+SMOOTHING: Record[MonitorRun] = Record(
+    "What all measurements say together under the prior on disturbances.",
+    Quantity("disturbances", lambda run: run.setup.disturbances and run.setup.disturbances.name, "name of the prior"),
+    Quantity("cameras", _readings, "changes at the file's interval, with sigmas"),
+    Quantity("height_error_m", lambda run: _unsigned(run.smoothed.error), "mean height error over the times"),
+    Quantity("height_sigma_m", lambda run: _unsigned(run.smoothed.sigma), "its standard deviation by the smoother"),
+    Quantity("intervals", lambda run: [(run, *item) for item in run.smoothing.items()], record=SMOOTHED),
+)
+PART: Record[Array] = Record(
+    "A part of the mean height error of the monitored cameras.",
+    Quantity("height_rms_m", rms, "over the times"),
+    Quantity("height_m", _unsigned, "signed, over the times"),
+)
+CAUSE: Record[tuple[MonitorRun, Cause]] = Record(
+    "One temperature or motion of the file alone, at one time.",
+    Quantity("what", lambda one: one[1].what, "temperature or motion"),
+    Quantity("node", lambda one: one[1].path, "of the instrument's tree"),
+    Quantity("true", lambda one: one[1].truth, "true changes, by camera", record=CHANGES),
+    Quantity("monitor_error", lambda one: one[1].error, "reading without noise minus truth, by camera", record=CHANGES),
+    Quantity("height_without_monitoring_m", lambda one: one[0].cause_heights(one[1])[0], "height error that it makes"),
+    Quantity(
+        "height_left_by_monitor_m", lambda one: one[0].cause_heights(one[1])[1], "height error that a misreading makes"
+    ),
+)
 
 
-@dataclass(frozen=True)
-class PartNumbers:
-    """A part of the monitored cameras' height error, signed over the times."""
-
-    height_rms_m: float
-    height_m: Array
+def _sensitivity(run: MonitorRun) -> dict[str, Array]:
+    return {name: run.slopes[name][run.flight.spec.referred] / PER_SI for name in run.flight.pair}
 
 
-@dataclass(frozen=True)
-class CauseNumbers:
-    """One cause alone, at one time; by camera."""
-
-    what: str
-    node: str
-    true: Mapping[str, ChangeNumbers]
-    monitor_error: Mapping[str, ChangeNumbers]
-    height_without_monitoring_m: float
-    height_left_by_monitor_m: float
-
-    @classmethod
-    def of(cls, run: MonitorRun, cause: Cause) -> Self:
-        """Of one cause."""
-        true, error = (
-            {name: ChangeNumbers.of(values) for name, values in by_camera.items()}
-            for by_camera in (cause.truth, cause.error)
-        )
-        return cls(cause.what, cause.path, true, error, *cause_heights(run, cause))
-
-
-@dataclass(frozen=True)
-class MonitorNumbers:
-    """monitor.json; errors at the top are those with the file's interval."""
-
-    seed: int
-    interval_s: float
-    height_rms_m: float
-    height_worst_m: float
-    height_camera_rms_m: float
-    plan_rms_m: float
-    metres_per_arcsec: float
-    times_s: Array
-    reference_time_s: float
-    monitored_times_s: Array
-    cameras: Mapping[str, CameraNumbers]
-    intersection_angle: AngleNumbers
-    cases: Mapping[str, CaseNumbers]
-    intervals: Sequence[Mapping[str, float]]
-    conversion: ConversionNumbers
-    sensitivity: Mapping[str, SlopeNumbers]
-    propagation: PropagationNumbers
-    estimator: str
-    smoothing: SmoothingNumbers | None
-    parts: Mapping[str, PartNumbers]
-    causes: Sequence[CauseNumbers]
-    correction_residual_arcsec: float
-
-    @classmethod
-    def of(cls, run: MonitorRun) -> Self:
-        """Of a run."""
-        flight, spec, conversion = run.flight, run.flight.spec, run.conversion
-        chosen = run.cases["interval"]
-        return cls(
-            seed=run.seed,
-            interval_s=spec.interval,
-            height_rms_m=chosen.height_rms,
-            height_worst_m=chosen.worst,
-            height_camera_rms_m=chosen.camera_height_rms,
-            plan_rms_m=chosen.plan_rms,
-            metres_per_arcsec=conversion.of_angle,
-            times_s=flight.times,
-            reference_time_s=spec.reference,
-            monitored_times_s=flight.times[spec.measured(spec.interval)],
-            cameras={name: CameraNumbers.of(flight, name) for name in flight.pair},
-            intersection_angle=AngleNumbers.of(run),
-            cases={name: CaseNumbers.of(case) for name, case in run.cases.items()},
-            intervals=[
-                {"interval_s": interval, **vars(SummaryNumbers.of(case))} for interval, case in run.intervals.items()
-            ],
-            conversion=ConversionNumbers(
-                conversion.of_angle,
-                conversion.of_common,
-                conversion.traced,
-                conversion.theory,
-                conversion.base_to_height,
-            ),
-            sensitivity={name: SlopeNumbers.of(run, name) for name in flight.pair},
-            propagation=PropagationNumbers.of(run),
-            estimator=flight.estimator,
-            smoothing=SmoothingNumbers.of(run),
-            parts={name: PartNumbers(rms(part), unsigned(part)) for name, part in run.parts.items()},
-            causes=[CauseNumbers.of(run, cause) for cause in flight.causes],
-            correction_residual_arcsec=run.residual / ARCSEC,
-        )
-
-
-def monitor_numbers(run: MonitorRun) -> dict[str, Any]:
-    """Contents of monitor.json without its frames."""
-    return dict(plain_data(MonitorNumbers.of(run)))
+MONITOR: Record[MonitorRun] = Record(
+    "monitor.json. Errors at the top are those with the file's interval.",
+    Quantity("seed", lambda run: run.seed, "of all random numbers"),
+    Quantity("interval_s", lambda run: run.flight.spec.interval, "between measurements, of the file"),
+    Quantity("height_rms_m", lambda run: run.cases["interval"].height_rms, "RMS error in height"),
+    Quantity("height_worst_m", lambda run: run.cases["interval"].worst, "RMS error in height at the worst time"),
+    Quantity("height_camera_rms_m", lambda run: run.cases["interval"].camera_height_rms, "in height by the cameras"),
+    Quantity("plan_rms_m", lambda run: run.cases["interval"].plan_rms, "RMS error in plan"),
+    Quantity(
+        "metres_per_arcsec",
+        lambda run: run.conversion.of_angle,
+        "of height for the intersection angle",
+        converted=False,
+    ),
+    Quantity("times_s", lambda run: run.flight.times, "of the course"),
+    Quantity("reference_time_s", lambda run: run.flight.spec.reference, "when cameras and monitor are calibrated"),
+    Quantity("monitored_times_s", lambda run: run.flight.times[run.flight.spec.measured(run.flight.spec.interval)]),
+    Quantity("cameras", lambda run: {name: (run.flight, name) for name in run.flight.pair}, record=CAMERA),
+    Quantity("intersection_angle", lambda run: run, record=ANGLE),
+    Quantity("cases", lambda run: run.cases, "by what the cameras are corrected with", record=CASE),
+    Quantity("intervals", lambda run: list(run.intervals.items()), record=INTERVAL),
+    Quantity("conversion", lambda run: run, record=CONVERSION),
+    Quantity("sensitivity", _sensitivity, record=SLOPES),
+    Quantity("propagation", lambda run: run, record=PROPAGATION),
+    Quantity("estimator", lambda run: run.flight.estimator, "by which the monitor's shifts are read"),
+    Quantity("smoothing", lambda run: run if run.smoothing else None, record=SMOOTHING),
+    Quantity("parts", lambda run: run.parts, "by source", record=PART),
+    Quantity("causes", lambda run: [(run, cause) for cause in run.flight.causes], record=CAUSE),
+    Quantity("correction_residual_arcsec", lambda run: run.residual, "largest direction error of the correction"),
+)

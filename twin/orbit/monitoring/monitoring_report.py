@@ -10,7 +10,7 @@ from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
-from twin.orbit.monitoring.monitoring_numbers import cause_heights
+from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 
-def sections(run: MonitorRun) -> tuple[Section, ...]:
+def _sections(run: MonitorRun) -> tuple[Section, ...]:
     """All parts."""
     smoothed = (_smoothed(run),) if run.smoothing else ()
     return (_angle(run), _height(run), *smoothed, _interval(run), _rest(run), _conversion(run), _noise(run))
@@ -80,7 +80,7 @@ def _height(run: MonitorRun) -> Section:
 def _smoothed(run: MonitorRun) -> Section:
     spec, stated = run.flight.spec, run.setup.disturbances
     assert stated is not None
-    chosen = run.smoothing[spec.interval]
+    chosen = run.smoothed
     found = chosen.consistency
     rows: list[tuple[Cell, ...]] = [
         (
@@ -159,7 +159,7 @@ def _rest(run: MonitorRun) -> Section:
     )
     causes: list[tuple[Cell, ...]] = []
     for cause in flight.causes:
-        without, left = cause_heights(run, cause)
+        without, left = run.cause_heights(cause)
         errors = [float(cause.error[n][0] / ARCSEC) + 0.0 for n in flight.pair]
         causes.append((cause.what, cause.path, without, left, *errors))
     table = Table(
@@ -279,13 +279,13 @@ def monitor_report(run: MonitorRun) -> Report:
         lead,
         _facts(setup),
         _table(run),
-        sections(run),
+        _sections(run),
         warnings=_warnings(run),
     )
 
 
 def _times(factor: float, less: str) -> str:
-    """By what factor an error is smaller, or larger."""
+    """Factor by which an error is smaller, or larger, in words."""
     if factor >= 1.0:
         return f"{factor:.2f} times {less}"
     return f"{1.0 / factor:.2f} times {'more' if less == 'less' else 'larger'}"
@@ -295,7 +295,7 @@ def _gain(run: MonitorRun) -> str:
     """What smoothing buys at the file's interval; empty where nothing is stated to move."""
     if not run.smoothing:
         return ""
-    chosen = run.smoothing[run.flight.spec.interval]
+    chosen = run.smoothed
     fits = "as" if chosen.agrees else "other than"
     return (
         f"smoothed together, the same measurements leave {chosen.case.camera_height_rms:.2f} m by the cameras, "
@@ -314,20 +314,13 @@ def _table(run: MonitorRun) -> Table:
         "parameters": "true four parameters (bound)",
         "true": "true cameras (bound)",
     }
-    rows: list[tuple[Cell, ...]] = []
-    for key, name in names.items():
-        if key not in run.cases:
-            continue
-        case = run.cases[key]
-        numbers = (case.height_rms, case.worst, case.camera_height_rms, case.plan_rms, rms(case.camera_plan))
-        rows.append((name, *numbers))
-    return Table(
+    return SUMMARY.table(
         "cases",
         "Errors at check points over the course",
         "RMS of all points and times; worst: RMS of the worst time; by the cameras: without image, orbit and attitude.",
-        ("cameras", "height [m]", "worst [m]", "height by the cameras [m]", "plan [m]", "plan by the cameras [m]"),
-        rows,
-        (None, 3, 3, 4, 3, 4),
+        {name: SUMMARY(run.cases[key]) for key, name in names.items() if key in run.cases},
+        [one.key for one in SUMMARY if one.head],
+        "cameras",
     )
 
 
@@ -366,7 +359,7 @@ def _warnings(run: MonitorRun) -> tuple[str, ...]:
     if run.cases["monitored"].camera_height_rms > run.cases["none"].camera_height_rms:
         out.append("monitoring makes heights worse: the monitor's own errors are larger than the cameras' changes")
     if run.smoothing:
-        chosen = run.smoothing[run.flight.spec.interval]
+        chosen = run.smoothed
         found = chosen.consistency
         if not found.agrees:
             out.append(

@@ -20,9 +20,8 @@ from analysis.orbit.forward_intersection import CalibratedLine, IntersectionErro
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.monitor import PARAMETERS
-from twin.orbit.flight.line_camera import look_angle
 from twin.orbit.monitoring.monitor_series import Readings
-from twin.orbit.monitoring.monitoring_flight import MonitorFlight, fly_monitored, in_analysis
+from twin.orbit.monitoring.monitoring_flight import Cause, MonitorFlight, fly_monitored, in_analysis
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -60,17 +59,17 @@ class CaseErrors:
 
     @property
     def plan_rms(self) -> float:
-        """Over all times, metres."""
+        """RMS error in plan over all times, metres."""
         return rms(self.plan)
 
     @property
     def height_rms(self) -> float:
-        """Over all times, metres."""
+        """RMS error in height over all times, metres."""
         return rms(self.height)
 
     @property
     def camera_height_rms(self) -> float:
-        """Over all times, metres."""
+        """RMS of what the cameras alone do in height over all times, metres."""
         return rms(self.camera_height)
 
     @property
@@ -85,14 +84,12 @@ class Conversion:
 
     Attributes:
         traced: camera -> height change when this camera alone is turned by 1 arcsec about its Y, by the trace, m.
-        angle_step: camera -> what that turn does to the intersection angle by the trace, arcsec.
         theory: camera -> the same by base to height: slant range x 1 arcsec / cos(incidence) over the difference of the
             tangents of both incidences, m.
         base_to_height: that difference.
     """
 
     traced: Mapping[str, float]
-    angle_step: Mapping[str, float]
     theory: Mapping[str, float]
     base_to_height: float
 
@@ -127,7 +124,7 @@ class Scatter:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Of spread / sigma, exceeded with a chance of `FALSE_ALARM`."""
+        """Limits of spread / sigma, exceeded with a chance of `FALSE_ALARM`."""
         free = len(self.heights) - 1
         low, high = chi2.ppf([0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM], free)
         return float(np.sqrt(low / free)), float(np.sqrt(high / free))
@@ -159,7 +156,7 @@ class Smoothing:
 
     @property
     def factor(self) -> float:
-        """By which the height error of the cameras is smaller than with interpolation."""
+        """Factor by which the height error of the cameras is smaller than with interpolation."""
         return self.interpolated.camera_height_rms / self.case.camera_height_rms
 
     @property
@@ -175,7 +172,7 @@ class Smoothing:
 
     @property
     def limit(self) -> float:
-        """Of it: exceeded with a chance of `FALSE_ALARM` at most, however errors of the times go together."""
+        """Limit of the largest ratio, exceeded with a chance of `FALSE_ALARM` at most whatever the correlations."""
         return float(norm.isf(0.5 * FALSE_ALARM / max(len(self.ratios), 1)))
 
     @property
@@ -229,6 +226,20 @@ class MonitorRun:
         """(T,) true, radians."""
         return np.asarray(self.flight.angle - self.flight.angle[self.flight.spec.referred])
 
+    @property
+    def smoothed(self) -> Smoothing:
+        """Heights smoothed from the measurements at the file's interval; there is none without a prior."""
+        return self.smoothing[self.flight.spec.interval]
+
+    def cause_heights(self, cause: Cause) -> tuple[float, float]:
+        """Height errors that a cause alone makes at its time, metres: without monitoring, and by what the monitor
+        misreads.
+        """
+        flight, mask = self.flight, _mask(self.flight)
+        slopes = {n: self.slopes[n][flight.worst] for n in flight.pair}
+        without = sum(float(-slopes[n] @ cause.truth[n]) for n in flight.pair)
+        return without, sum(float(slopes[n] @ (mask * cause.error[n])) for n in flight.pair)
+
 
 def rms(values: np.ndarray) -> float:
     """Root mean square."""
@@ -239,12 +250,12 @@ def run_monitor(setup: MonitorSetup, backend: Backend, seed: int, advance: Advan
     """Fly, measure, intersect: ``python -m twin.orbit monitor``. Raises BenchError, InputError as `fly_monitored`."""
     flight = fly_monitored(setup, backend, seed, advance)
     try:
-        return analysed(flight, setup, seed)
+        return _analysed(flight, setup, seed)
     except IntersectionError as error:
         raise BenchError(str(error), ("cameras",), "cameras that look different ways") from error
 
 
-def analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
+def _analysed(flight: MonitorFlight, setup: MonitorSetup, seed: int) -> MonitorRun:
     """All cases of a flight."""
     count, spec = len(flight.times), flight.spec
     monitored = {n: flight.monitored[n].vector * _mask(flight) for n in flight.pair}
@@ -350,7 +361,7 @@ def _errors(found: np.ndarray, true: np.ndarray) -> CaseErrors:
 
 
 def _slopes(flight: MonitorFlight) -> dict[str, np.ndarray]:
-    """By central differences of the intersection of exact image points by the calibrated cameras."""
+    """Slopes by central differences of the intersection of exact image points by the calibrated cameras."""
     out = {}
     for i, name in enumerate(flight.pair):
         table = np.empty((len(flight.times), 4))
@@ -405,20 +416,15 @@ def _parts(
 def _conversion(flight: MonitorFlight) -> Conversion:
     """At the reference, where the calibrated cameras are the true ones."""
     k = flight.spec.referred
-    view, traced, step = flight.views[k], {}, {}
-    lines = flight.lines[k]
+    view, traced = flight.views[k], {}
     first, second = flight.pair
-    plain = look_angle(lines[first], lines[second])
     calm = _found(flight, _true_pair(flight, k), k, exact_data=True)[:, 2].mean()
     slant, incidence = {}, {}
     up = view.ground / np.linalg.norm(view.ground, axis=1, keepdims=True)
     for i, name in enumerate(flight.pair):
-        turned = flight.turned[name]
         pair = _true_pair(flight, k)
-        pair[i] = in_analysis(turned, flight.calibrated[name])
+        pair[i] = in_analysis(flight.turned[name], flight.calibrated[name])
         traced[name] = float(_found(flight, pair, k, exact_data=True)[:, 2].mean() - calm)
-        both = {**lines, name: turned}
-        step[name] = (look_angle(both[first], both[second]) - plain) / ARCSEC
         arm = view.exact[i].station - view.ground
         slant[name] = np.linalg.norm(arm, axis=1)
         forward = np.cross(up, view.exact[i].attitude[:, :, 1])  # along the track, level
@@ -430,7 +436,7 @@ def _conversion(flight: MonitorFlight) -> Conversion:
         name: float(np.mean(sign * slant[name] * ARCSEC / np.cos(incidence[name]) / ratio))
         for name, sign in ((first, 1.0), (second, -1.0))
     }
-    return Conversion(FrozenMap(traced), FrozenMap(step), FrozenMap(theory), float(np.mean(np.abs(ratio))))
+    return Conversion(FrozenMap(traced), FrozenMap(theory), float(np.mean(np.abs(ratio))))
 
 
 def _scatter(flight: MonitorFlight, slopes: Mapping[str, np.ndarray]) -> Scatter:
