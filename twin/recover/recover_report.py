@@ -278,7 +278,7 @@ def _series(run: RecoverRun) -> Section:
     text: tuple[str, ...] = ()
     if together is not None:
         heads += ["filtered", "σ, filtered", "smoothed", "σ, smoothed"]
-        reads = run.last.readings(run.last.judged)
+        reads = run.last.table.of(run.last.judged)
         for number, row in enumerate(rows):
             k, one = divmod(number, len(reads))
             for estimator in ("filtered", "smoothed"):
