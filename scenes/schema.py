@@ -24,7 +24,6 @@ from rich.console import Console
 from optics.numerics.backend import BackendUnavailable
 from optics.numerics.llvm import LibraryMissing
 from scenes.kinds.file_kinds import FILE_KINDS
-from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
 from scenes.specs.load import INSTRUMENTS, library_names
 from scenes.specs.resolved import resolve_job
@@ -121,11 +120,10 @@ def _of_nodes(nodes: Mapping[str, NodeInfo]) -> dict[str, Any]:
     """Node path -> what may stand below it."""
     out = {}
     for path, info in nodes.items():
-        pivots = [*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,))]
         never = {action: False for action in ACTIONS if action not in info.allows}
         if "figure" not in info.allows:
             never["deformation"] = False
-        out[path] = {"properties": {"pivot": {"enum": pivots}, **never}}
+        out[path] = {"properties": {"pivot": {"enum": list(info.known_pivots)}, **never}}
     return out
 
 

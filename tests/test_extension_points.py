@@ -54,7 +54,6 @@ from optics.thermal.heat import Temperature
 from optics.waves.pupil_stack import circular_pupil
 from scenes.models.camera_model import surface_of
 from scenes.models.obstruction import find_obstructions
-from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from scenes.schema import json_schema
 from scenes.specs.camera import MirrorSpec
@@ -64,7 +63,8 @@ from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.orbit.flight import OrbitSpec
 from scenes.specs.procedures import FileKind, Procedure
 from scenes.specs.resolved import ExperimentSetup, resolve
-from scenes.specs.study import DesignSpec, Sampler
+from scenes.specs.samplers import Sampler
+from scenes.specs.study import DesignSpec
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import parse_yaml
@@ -72,6 +72,7 @@ from tests.scenes.mirror_reflectors import CORNER, TWO_PLATES
 from tests.twin import test_path_figure as path_figure
 from tests.twin import test_prism_images
 from tests.twin.commands import invoke
+from tests.twin.path_bench import IDEAL
 from tests.twin.study_bench import write_study as write_study_file
 from tests.twin.test_report import tables_of
 from tests.twin.test_target_images import F_NUMBER, PITCH, REGION, identity, line_ccd
@@ -82,7 +83,7 @@ from twin.orbit.flight.orbit import Orbit, acceleration, propagate
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.run.artefact import Table
 from twin.run.data_files import FrameFacts
@@ -93,8 +94,7 @@ from twin.sensors.area_detector import EmvaDetector
 from twin.study import scripted
 from twin.study.gradient.study_gradient import study_gradient
 from twin.study.report.study_report import write_report
-from twin.study.runs.base_job import Run
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult, Run
 from twin.study.runs.engine import check_responses
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
@@ -170,7 +170,7 @@ def test_nothing_that_is_added_here_stays() -> None:
 
 # --- a detector's noise -----------------------------------------------------------------------------------------------
 
-NOISE = "twin.sensors.noise_terms.NOISE_TERMS"
+NOISE = "twin.sensors.area_detector.NOISE_TERMS"
 
 
 @dataclass(frozen=True)
@@ -534,9 +534,7 @@ def write_toy(folder: Path) -> Report:
     frames = np.arange(2 * 5 * 7, dtype=np.uint16).reshape(2, 5, 7)
     result = Report("A test", "It is one.", (), (), summary, (Section("Own section"),), {"edge": frames})
     with RunFolder(folder, False) as made:
-        write_test(
-            "focus", {"x": 21}, result, RunFacts("", "focus.yaml", "llvm", 1, 0.0, 0.0, "twin.lab", "focus"), made
-        )
+        write_test("focus", {"x": 21}, result, RunFacts("", "twin.lab", 0.0, 0.0, "llvm", 1, "focus"), made)
     return result
 
 
@@ -924,7 +922,7 @@ def test_a_job_with_a_reflector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 # --- studies ----------------------------------------------------------------------------------------------------------
 
-SAMPLERS = "scenes.specs.study.SAMPLERS"
+SAMPLERS = "scenes.specs.samplers.SAMPLERS"
 FORMATS = "twin.study.study_files.FORMATS"
 MIDDLE = Sampler("all in the middle", lambda runs, factors, generator: np.full((runs, factors), 0.5))
 
@@ -966,7 +964,7 @@ def test_a_sampler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_sampler_must_keep_to_the_unit_cube(points: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     add(monkeypatch, SAMPLERS, "wrong", Sampler("wrong", lambda runs, factors, generator: points))
     with pytest.raises(ValueError, match="sampler wrong must give points"):
-        registered("scenes.specs.study.unit_cube")[2]("wrong", 3, 2, 1)
+        registered("scenes.specs.samplers.unit_cube")[2]("wrong", 3, 2, 1)
 
 
 @pytest.mark.parametrize(
@@ -991,12 +989,12 @@ def test_an_unknown_name_is_told_as_one_of_a_fixed_list_is(model: Any, text: str
     assert str(caught.value).endswith(said)
 
 
-@extends("twin.run.data_table.TABLE_FORMATS")
+@extends("twin.run.data_files.TABLE_FORMATS")
 def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names and units of the columns alone: chosen by its name, written for every table and listed."""
     text = "; ".join
     form: Callable[[Any], bytes] = lambda table: text(f"{c.name} in {c.unit}" for c in table.columns).encode()  # noqa: E731
-    add(monkeypatch, "twin.run.data_table.TABLE_FORMATS", "heads", form)
+    add(monkeypatch, "twin.run.data_files.TABLE_FORMATS", "heads", form)
     study_folder(tmp_path, "monte_carlo")
     done = invoke(twin.export.__main__.app, tmp_path / "run", "--tables", "heads", "--out", tmp_path / "out")
     assert done.exit_code == 0, done.output

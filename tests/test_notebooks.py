@@ -18,7 +18,7 @@ def test_there_are_six() -> None:
     assert len(NOTEBOOKS) == 6
 
 
-@pytest.mark.slow
+@pytest.mark.second
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     notebook = nbformat.read(path, as_version=4)

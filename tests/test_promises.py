@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs/promises.md"
-TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`( \(slow\))?")
+TEST = re.compile(r"`(tests/[\w/]+\.py)::(\w+)`( \((?:second|slow)\))?")
 
 
 def promises(text: str) -> list[str]:
@@ -19,14 +19,18 @@ def promises(text: str) -> list[str]:
 
 
 @cache
-def functions_in(file: Path) -> dict[str, bool]:
-    """Name of every test of a file -> whether all of its cases are slow."""
+def functions_in(file: Path) -> dict[str, str]:
+    """Name of every test of a file -> the mark of the tier that all of its cases belong to, "" for the default."""
     tree = ast.parse(file.read_text("utf-8"))
     marks = [ast.unparse(node) for node in tree.body if isinstance(node, ast.Assign)]
-    every = any(mark.startswith("pytestmark") and "mark.slow" in mark for mark in marks)
+    every = [mark for mark in marks if mark.startswith("pytestmark")]
+
+    def tier(decorators: list[str]) -> str:
+        marks = [one for one in decorators if "param" not in one]
+        return next((name for name in ("slow", "second") if any(f"mark.{name}" in one for one in marks)), "")
+
     return {
-        node.name: every
-        or any("mark.slow" in ast.unparse(one) and "param" not in ast.unparse(one) for one in node.decorator_list)
+        node.name: tier([*every, *map(ast.unparse, node.decorator_list)])
         for node in ast.walk(tree)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.name.startswith("test_")
     }
@@ -48,10 +52,10 @@ def test_a_promise_names_tests_that_are_there(promise) -> None:
     named = TEST.findall(promise)
     assert named, "no test would fail"
     assert len(named) == promise.count("::"), "a test that is not written as the others"
-    for file, name, slow in named:
+    for file, name, tier in named:
         there = functions_in(ROOT / file)
         assert name in there, f"{file} has no {name}"
-        assert there[name] == bool(slow), f"{name} is {'' if there[name] else 'not '}slow"
+        assert there[name] == tier.strip(" ()"), f"{name} belongs to the {there[name] or 'default'} tier"
 
 
 def test_a_promise_without_a_test_would_be_found() -> None:

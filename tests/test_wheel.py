@@ -128,7 +128,7 @@ def run(site: Path, folder: Path, *words: object) -> subprocess.CompletedProcess
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_the_printed_script_runs(installed: Path, tmp_path: Path) -> None:
     tail = "assert runs.sizes['run'] == 100 and not runs.failed.any()\nassert twin.__file__.startswith({!r})\n"
     script = tmp_path / "script.py"
@@ -140,7 +140,7 @@ def test_the_printed_script_runs(installed: Path, tmp_path: Path) -> None:
     assert re.search(r"d_f_um +-1\.210", done.stdout)
 
 
-@pytest.mark.slow
+@pytest.mark.second
 def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(installed: Path, tmp_path: Path) -> None:
     """With every file of the library, every template, and the examples that their help names."""
     assert run(installed, tmp_path, "python", "-c", "import optics").returncode == 1

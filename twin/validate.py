@@ -24,16 +24,16 @@ from twin.run.cli import (
     LARGEST_SEED,
     BackendName,
     Force,
-    Heartbeat,
     InputErrorText,
     check_backend,
     explained,
+    heartbeat,
     print_verdict,
     print_whole,
     result_table,
     time_text,
 )
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 from twin.run.provenance import program_digest
 from twin.run.run_folder import RunFolder
 from twin.validation.checks.check import (
@@ -198,7 +198,7 @@ def _run(
             at = f"{text}, about {time_text(left)} left"
             bar.update(task, completed=done, description=text)
 
-        beat = Heartbeat(errors, lambda: at, silent=False)
+        beat = heartbeat(errors, lambda: at, silent=False)
 
         if folder is None:
             with beat:

@@ -21,11 +21,11 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from analysis.measurement_error import MeasurementError, UndeterminedError
-
-__all__ = ["RigidMotion"]
+from analysis.measurement_error import MeasurementError
 
 Array = NDArray[np.float64]
+# Two directions are told apart when the places spread across them by more than this part of their largest spread.
+_LEAST_SPREAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,13 +80,6 @@ class RigidMotion:
         return self.moved(point) - np.asarray(point, np.float64)
 
 
-__all__ = ["FocalPlaneFit", "LineLevel", "ObservabilityError", "fit_focal_plane", "line_level"]
-
-_NAMES = ("piston", "slope_x", "slope_y")
-# Two directions are told apart when the places spread across them by more than this part of their largest spread.
-_LEAST_SPREAD = 1e-6
-
-
 class ObservabilityError(MeasurementError, ValueError):
     """The places measured cannot tell one of the rotations."""
 
@@ -95,37 +88,38 @@ class ObservabilityError(MeasurementError, ValueError):
 class LineLevel:
     """Level of the line CCD: its rotation about +Z' out of the Y' axis.
 
-    angle, sigma: radians. straightness: (N,) what is left across the line, metres. chi_square, degrees_of_freedom: of
-    the straight line.
+    Attributes:
+        angle: radians, right-handed about +Z'.
+        sigma: standard deviation of the angle, radians.
     """
 
     angle: float
     sigma: float
-    straightness: Array
-    chi_square: float
-    degrees_of_freedom: int
 
 
 @dataclass(frozen=True, eq=False)
 class FocalPlaneFit:
     """A weighted plane through the defocus of N places.
 
-    piston: metres. slope_x, slope_y: rises of the best focus along +X' and +Y'. covariance: (3, 3) in this order;
-        zero in the rows of what was held.
-    held: names of slopes that were taken as zero and not estimated.
-    place: (N, 2) metres. residual: (N,) defocus - plane. sigma: (N,) as given, metres.
-    chi_square, degrees_of_freedom: with the sigmas as given. p_value: chance of such a chi-square or a larger one, if
-        the best foci lie on a plane and the sigmas are right; 1 without redundancy.
-    extra_sigma: scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature of
-        field), metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked for
-        or is not there. The weights and all covariances include it.
+    Attributes:
+        piston: metres.
+        slope_x, slope_y: rises of the best focus along +X' and +Y', radians.
+        covariance: of piston, slope_x and slope_y, (3, 3).
+        place: (N, 2), metres.
+        residual: defocus minus plane, (N,), metres.
+        sigma: of the defocus as given, (N,), metres.
+        chi_square, degrees_of_freedom: with the sigmas as given.
+        p_value: chance of such a chi-square or a larger one, if the best foci lie on a plane and the sigmas are right;
+            1 without redundancy.
+        extra_sigma: scatter of the places about the plane beyond their sigmas (chips that are not coplanar, curvature
+            of field), metres, for which the weighted chi-square equals the degrees of freedom; 0 when it was not asked
+            for or is not there. The weights and all covariances include it.
     """
 
     piston: float
     slope_x: float
     slope_y: float
     covariance: Array
-    held: tuple[str, ...]
     place: Array
     residual: Array
     sigma: Array
@@ -140,12 +134,9 @@ class FocalPlaneFit:
 
         How much another measurement of the same assembly would scatter: chips that are not coplanar stay as they are.
         """
-        free = [k for k, name in enumerate(_NAMES) if name not in self.held]
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
-        gain = self.covariance[np.ix_(free, free)] @ (_design(self.place)[:, free] * weight[:, None]).T
-        out = np.zeros((3, 3))
-        out[np.ix_(free, free)] = (gain * self.sigma**2) @ gain.T
-        return out
+        gain = self.covariance @ (_design(self.place) * weight[:, None]).T
+        return np.asarray((gain * self.sigma**2) @ gain.T)
 
     def plane(self, place: ArrayLike) -> tuple[Array, Array]:
         """Height (...) of the fitted plane at places (..., 2), and its sigma (...); metres."""
@@ -160,10 +151,9 @@ class FocalPlaneFit:
         each residual shrunk by extra_sigma^2 / (extra_sigma^2 + sigma^2), so zero for a true plane, and the covariance
         has what the plane was misjudged by. A measurement afterwards adds its own sigma.
         """
-        free = [k for k, name in enumerate(_NAMES) if name not in self.held]
-        design = _design(self.place)[:, free]
+        design = _design(self.place)
         weight = 1.0 / (self.sigma**2 + self.extra_sigma**2)
-        hat = design @ self.covariance[np.ix_(free, free)] @ (design.T * weight)
+        hat = design @ self.covariance @ (design.T * weight)
         own = np.eye(len(weight))
         shrink = (self.extra_sigma**2 * weight)[:, None] * (own - hat)
         # error = e - hat (e + n) - shrink (e + n) for deviations e and noise n
@@ -192,24 +182,20 @@ class FocalPlaneFit:
 
 
 def fit_focal_plane(
-    place: ArrayLike,
-    defocus: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    hold: tuple[str, ...] = (),
-    estimate_extra: bool = False,
+    place: ArrayLike, defocus: ArrayLike, sigma: ArrayLike, *, estimate_extra: bool = False
 ) -> FocalPlaneFit:
     """Weighted least-squares plane through the defocus of N places.
-
-    Raises ObservabilityError when the places lie so that a slope cannot be told; ValueError for bad input.
 
     Args:
         place: (N, 2) X', Y', metres.
         defocus: (N,) metres, best focus minus CCD along +Z'.
         sigma: (N,) or a number, metres.
-        hold: slopes taken as zero, "slope_x" or "slope_y", where the places cannot tell them.
         estimate_extra: when the residuals are larger than the sigmas say, estimate a common extra scatter (Paule and
             Mandel, J. Res. NBS 87, 377 (1982)) and weight with it; see FocalPlaneFit.extra_sigma.
+
+    Raises:
+        ObservabilityError: the places lie so that a slope cannot be told.
+        ValueError: wrong shapes, numbers that are not finite, a sigma that is not positive.
     """
     spots, height = np.asarray(place, np.float64), np.asarray(defocus, np.float64)
     if spots.ndim != 2 or spots.shape[1] != 2 or height.shape != spots.shape[:1]:
@@ -219,12 +205,9 @@ def fit_focal_plane(
         raise ValueError("focal plane: place, defocus and sigma must be finite; leave out places without a focus")
     if not np.all(spread > 0):
         raise ValueError("focal plane: every sigma must be positive")
-    if not set(hold) <= set(_NAMES[1:]):
-        raise ValueError(f"focal plane: only slope_x and slope_y can be held, found {', '.join(hold)}")
-    free = [k for k, name in enumerate(_NAMES) if name not in hold]
-    _check_places(spots, free)
-    design = _design(spots)[:, free]
-    freedom = len(height) - len(free)
+    _check_places(spots)
+    design = _design(spots)
+    freedom = len(height) - 3
 
     def solve(extra: float) -> tuple[Array, Array, float]:
         """Parameters, covariance and weighted chi-square with an extra scatter."""
@@ -241,15 +224,11 @@ def fit_focal_plane(
         most = float(np.sqrt(np.sum((height - design @ found) ** 2) / freedom))
         extra = float(brentq(lambda s: solve(s)[2] - freedom, 0.0, most, xtol=1e-6 * most))
         found, covariance, _ = solve(extra)
-    values, full = np.zeros(3), np.zeros((3, 3))
-    values[free] = found
-    full[np.ix_(free, free)] = covariance
     return FocalPlaneFit(
-        piston=float(values[0]),
-        slope_x=float(values[1]),
-        slope_y=float(values[2]),
-        covariance=full,
-        held=tuple(name for name in _NAMES if name in hold),
+        piston=float(found[0]),
+        slope_x=float(found[1]),
+        slope_y=float(found[2]),
+        covariance=covariance,
         place=spots,
         residual=height - design @ found,
         sigma=spread,
@@ -260,59 +239,22 @@ def fit_focal_plane(
     )
 
 
-def line_level(along: ArrayLike, across: ArrayLike, sigma: ArrayLike) -> LineLevel:
-    """Level of the line CCD from positions measured along it, for example pixels sighted with a theodolite.
-
-    A line turned by g about +Z' has X' = -tan(g) Y' + constant. Raises ValueError for bad input.
-
-    Args:
-        along: Y' of N >= 2 points of the line, (N,), metres, in the frame that the line has to be level in; exact.
-        across: X' of the same points, (N,), metres.
-        sigma: of `across`, (N,) or a number, metres.
-    """
-    y, x = np.asarray(along, np.float64), np.asarray(across, np.float64)
-    if y.ndim != 1 or x.shape != y.shape or y.size < 2:
-        raise ValueError(f"line level: need two or more points along and across, found {y.shape} and {x.shape}")
-    spread = np.asarray(np.broadcast_to(np.asarray(sigma, np.float64), y.shape))
-    if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y)) and np.all(np.isfinite(spread)) and np.all(spread > 0)):
-        raise ValueError("line level: positions must be finite and sigmas finite and positive")
-    if np.ptp(y) <= 1e-12 * np.max(np.abs(y)):
-        raise UndeterminedError("line level: all points are at one place along the line; measure near both of its ends")
-    weight = spread**-2
-    arm = y - np.sum(weight * y) / np.sum(weight)
-    moment = float(np.sum(weight * arm**2))
-    slope = float(np.sum(weight * arm * x)) / moment
-    rest = x - np.sum(weight * x) / np.sum(weight) - slope * arm
-    # d atan(slope) = d slope / (1 + slope^2)
-    sigma_angle = moment**-0.5 / (1.0 + slope**2)
-    return LineLevel(-float(np.arctan(slope)), sigma_angle, rest, float(np.sum(weight * rest**2)), y.size - 2)
-
-
 def _design(place: Array) -> Array:
     """Columns 1, X', Y', (..., 3)."""
     return np.stack([np.ones(place.shape[:-1]), place[..., 0], place[..., 1]], axis=-1)
 
 
-def _check_places(place: Array, free: list[int]) -> None:
-    """ObservabilityError when the places cannot tell the free slopes, with the reason in terms of where they lie."""
-    if len(place) < len(free):
+def _check_places(place: Array) -> None:
+    """ObservabilityError when the places do not determine both slopes, with the reason in terms of where they lie."""
+    if len(place) < 3:
         raise ObservabilityError(
-            f"focal plane: {len(place)} places cannot tell {', '.join(_NAMES[k] for k in free)}; measure at least"
-            f" {len(free)}"
+            f"focal plane: {len(place)} places cannot tell piston, slope_x, slope_y; measure at least 3"
         )
-    arm = (place - place.mean(axis=0))[:, [k - 1 for k in free if k > 0]]
-    if not arm.size:
-        return
+    arm = place - place.mean(axis=0)
     _, values, axes = np.linalg.svd(arm, full_matrices=False)
     scale = max(float(values[0]), 1e-6 * float(np.max(np.abs(place))))
     if values[-1] > _LEAST_SPREAD * scale:
         return
-    names = [_NAMES[k] for k in free if k > 0]
-    if len(names) == 1:
-        raise ObservabilityError(
-            f"focal plane: all places have the same {names[0][-1].upper()}', so {names[0]} cannot be told; measure at"
-            f" others or hold {names[0]} at zero"
-        )
     if values[0] <= _LEAST_SPREAD * scale:
         raise ObservabilityError("focal plane: all places are one; neither slope can be told")
     direction = axes[0]
@@ -322,7 +264,7 @@ def _check_places(place: Array, free: list[int]) -> None:
         where, slope = "Y' = constant", "slope_y"
     else:
         where, slope = f"one straight line along ({direction[0]:+.3g}, {direction[1]:+.3g})", "the slope across it"
-    remedy = f"hold {slope} at zero" if slope in _NAMES else "place some of them off that line"
     raise ObservabilityError(
-        f"focal plane: all places lie on {where}, so {slope} cannot be told; measure another band as well or {remedy}"
+        f"focal plane: all places lie on {where}, so {slope} cannot be told; measure another band as well or place some"
+        " of them off that line"
     )

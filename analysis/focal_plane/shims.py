@@ -26,8 +26,6 @@ from scipy.spatial.transform import Rotation
 from analysis.focal_plane.plane_fit import RigidMotion
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["Mount", "ShimError", "ShimPlan", "shim_plan"]
-
 Array = NDArray[np.float64]
 # Holes carry a tilt when the smaller spread of their places is at least this part of the larger: 0.3 mm in 0.3 m.
 _LEAST_SPREAD = 1e-3
@@ -100,13 +98,11 @@ class ShimPlan:
     mount, wanted: as given.
     change: (H,) exact change of thickness at each hole, metres; + is thicker.
     change_covariance: (H, H), from the covariance of the wanted motion; without the rounding.
-    rounded_change: (H,) what is ground. thickness: (H,) the new shims, multiples of the step; None when the present
-        ones were not given (then the changes are multiples of the step).
+    rounded_change: (H,) what is ground. thickness: (H,) the new shims, multiples of the step.
     slide: (H, 3) displacement of each hole in the mounting surface that is set by hand.
     turn: rotation about the normal that is set by hand, right-handed; the twist of the wanted rotation.
     achieved: the motion with the rounded shims and turn and slide as wanted. With more than three holes, the plane that
         fits the pads best.
-    pad_misfit: (H,) height of the pads over that plane, metres; zero for three holes.
     shims_only: the motion when turn and slide are *not* made and the holes' centre only moves along the normal.
     """
 
@@ -115,27 +111,16 @@ class ShimPlan:
     change: Array
     change_covariance: Array
     rounded_change: Array
-    thickness: Array | None
+    thickness: Array
     slide: Array
     turn: float
     achieved: RigidMotion
-    pad_misfit: Array
     shims_only: RigidMotion
 
     @property
     def change_sigma(self) -> Array:
         """(H,) sigma of the exact changes, metres."""
         return np.sqrt(np.diag(self.change_covariance))
-
-    @property
-    def rounding_rotation(self) -> Array:
-        """(3,) rotation vector that rounding leaves: achieved after wanted, radians."""
-        return np.asarray(Rotation.from_matrix(self.achieved.matrix @ self.wanted.matrix.T).as_rotvec())
-
-    @property
-    def rounding_piston(self) -> float:
-        """How far O' stands along +Z' of where it was wanted, metres."""
-        return float(self.achieved.shift[2] - self.wanted.shift[2])
 
     @property
     def level_coupling(self) -> float:
@@ -149,45 +134,41 @@ class ShimPlan:
         return np.asarray((self.wanted.moved(point) - self.achieved.moved(point))[..., 2])
 
 
-def shim_plan(
-    correction: RigidMotion, mount: Mount, present: ArrayLike | None = None, least_thickness: float = 0.0
-) -> ShimPlan:
+def shim_plan(correction: RigidMotion, mount: Mount, present: ArrayLike) -> ShimPlan:
     """Shims for a rigid motion of the assembly about O'.
 
     A hole that moves by d needs n . d more shim; what is left of d lies in the mounting surface.
-    Raises ShimError when a hole would slide beyond its clearance or a shim would become too thin.
 
     Args:
         correction: for example FocalPlaneFit.correction().
         mount: where the shims are.
         present: (H,) or a number, thickness of the shims now, metres.
-        least_thickness: the thinnest shim that can be ground, metres.
+
+    Raises:
+        ShimError: a hole would slide beyond its clearance, or a shim would be thinner than nothing.
+        ValueError: a thickness that is not finite.
     """
     up, holes = mount.normal, mount.holes
     move = correction.displacement(holes)
     change = move @ up
     slide = move - np.outer(change, up)
     _check_clearance(slide, mount.clearance)
-    if present is None:
-        thickness, rounded = None, np.round(change / mount.step) * mount.step
-    else:
-        now = np.asarray(np.broadcast_to(np.asarray(present, np.float64), change.shape))
-        if not np.all(np.isfinite(now)):
-            raise ValueError("shims: the present thicknesses must be finite")
-        thickness = np.round((now + change) / mount.step) * mount.step
-        _check_thickness(thickness, now, least_thickness, mount.step)
-        rounded = thickness - now
+    now = np.asarray(np.broadcast_to(np.asarray(present, np.float64), change.shape))
+    if not np.all(np.isfinite(now)):
+        raise ValueError("shims: the present thicknesses must be finite")
+    thickness = np.round((now + change) / mount.step) * mount.step
+    _check_thickness(thickness, now, mount.step)
+    rounded = thickness - now
     # change = (r x n) . rotation + n . shift to first order
     slope = np.concatenate([np.cross(holes, up), np.broadcast_to(up, holes.shape)], axis=1)
     # Twist of the rotation about n (swing-twist decomposition of its quaternion).
     quaternion = Rotation.from_rotvec(correction.rotation).as_quat()
     turn = 2 * float(np.arctan2(quaternion[:3] @ up, quaternion[3]))
-    achieved, misfit = _seated(correction, mount, rounded)
+    achieved = _seated(correction, mount, rounded)
     centre = holes.mean(axis=0)
     untwisted = Rotation.from_rotvec(correction.rotation) * Rotation.from_rotvec(-turn * up)
     lifted = centre + up * float(np.mean(change))
     start = RigidMotion.of(untwisted.as_rotvec(), lifted - untwisted.apply(centre))
-    shims_only, _ = _seated(start, mount, change)
     return ShimPlan(
         mount=mount,
         wanted=correction,
@@ -198,14 +179,13 @@ def shim_plan(
         slide=slide,
         turn=turn,
         achieved=achieved,
-        pad_misfit=misfit,
-        shims_only=shims_only,
+        shims_only=_seated(start, mount, change),
     )
 
 
-def _seated(motion: RigidMotion, mount: Mount, change: Array) -> tuple[RigidMotion, Array]:
+def _seated(motion: RigidMotion, mount: Mount, change: Array) -> RigidMotion:
     """The motion after the assembly has settled on shims changed by (H,): the nearest one whose holes rise by `change`
-    in least squares; and by how much each pad stands above its hole's rise, (H,).
+    in least squares.
 
     It settles by tilts about axes in the mounting surface through the holes' centre and a lift along the normal, so
     turn and slide stay what they were.
@@ -215,10 +195,10 @@ def _seated(motion: RigidMotion, mount: Mount, change: Array) -> tuple[RigidMoti
     first = first / np.linalg.norm(first)
     second = np.cross(up, first)
     rotation, shift = Rotation.from_rotvec(motion.rotation), motion.shift
-    misfit = change - (rotation.apply(mount.holes) + shift - mount.holes) @ up
     # The first step is right to a few 1e-6 of itself, the others to rounding.
     for _ in range(3):
         place = rotation.apply(mount.holes) + shift
+        misfit = change - (place - mount.holes) @ up
         centre = place.mean(axis=0)
         arm = place - centre
         # a tilt by (a, b) about (first, second) lifts a hole by a (second . arm) - b (first . arm)
@@ -226,8 +206,7 @@ def _seated(motion: RigidMotion, mount: Mount, change: Array) -> tuple[RigidMoti
         step = np.linalg.lstsq(design, misfit, rcond=None)[0]
         tilt = Rotation.from_rotvec(step[0] * first + step[1] * second)
         rotation, shift = tilt * rotation, tilt.apply(shift - centre) + centre + step[2] * up
-        misfit = change - (rotation.apply(mount.holes) + shift - mount.holes) @ up
-    return RigidMotion.of(rotation.as_rotvec(), shift), misfit
+    return RigidMotion.of(rotation.as_rotvec(), shift)
 
 
 def _check_clearance(slide: Array, clearance: float) -> None:
@@ -245,15 +224,15 @@ def _check_clearance(slide: Array, clearance: float) -> None:
     )
 
 
-def _check_thickness(thickness: Array, now: Array, least: float, step: float) -> None:
-    """ShimError naming the holes whose shims would become too thin, and what to start from."""
-    thin = np.flatnonzero(thickness < least - 1e-9 * step)
+def _check_thickness(thickness: Array, now: Array, step: float) -> None:
+    """ShimError naming the holes whose shims would be thinner than nothing, and what to start from."""
+    thin = np.flatnonzero(thickness < -1e-9 * step)
     if not thin.size:
         return
     text = ", ".join(f"hole {h + 1} would get {1e3 * thickness[h]:.4g} mm" for h in thin)
-    short = step * float(np.ceil(np.max(least - thickness) / step - 1e-9))
+    short = step * float(np.ceil(np.max(-thickness) / step - 1e-9))
     raise ShimError(
-        f"shims: {text}, the least is {1e3 * least:.4g} mm; move the seat back and start from shims that are"
+        f"shims: {text}; move the seat back and start from shims that are"
         f" {1e3 * short:.4g} mm thicker at all holes, {1e3 * (float(now.max()) + short):.4g} mm at the thickest",
         tuple(int(h) for h in thin),
     )

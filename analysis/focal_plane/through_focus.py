@@ -1,7 +1,5 @@
 """Best focus from an MTF through focus: the main lobe, its vertex, and the sigma of its place.
 
-The formula and why it is used: analysis.focal_plane.through_focus.
-
 The MTF at one frequency against defocus z is a main peak between dark zeros and lower peaks of reversed contrast
 beyond them (spurious resolution; for a round pupil up to 13% of the main one). Near the peak it is a parabola, farther
 out it is flatter. To fourth order every one of these curves has nearly the same form,
@@ -35,9 +33,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import MeasurementError
 
-__all__ = ["LEAST_POINTS", "WIDEST_FRACTION", "Lobe", "main_peak"]
-
 Array = NDArray[np.float64]
+QUARTIC = 0.3
+"""q of the formula."""
+FRACTION = 0.5
+"""Points count where the fitted curve is above this part of its peak."""
 LEAST_POINTS = 5
 # Where the window holds too few points it may reach down to this part of the peak.
 WIDEST_FRACTION = 0.3
@@ -46,8 +46,8 @@ _ROUNDS, _NEWTON_STEPS = 12, 4
 _AT_REST = 1e-6
 
 
-def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where the smoothed curve is largest, (B,), and the points from there on that stay above the fraction, (B, Z).
+def _main_peak(z: Array, v: Array, weight: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where the smoothed curve is largest, (B,), and the points from there on that stay above `FRACTION`, (B, Z).
 
     The smoothing is a binomial of a twelfth of the scan's points, at least 1-2-1, weighted by the inverse variances.
 
@@ -55,7 +55,6 @@ def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArr
         z: positions in rising order, (B, Z).
         v: values there, (B, Z).
         weight: inverse variances, (B, Z).
-        fraction: of the peak.
     """
     count, size = z.shape
     top, bottom = v * weight, weight
@@ -67,7 +66,7 @@ def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArr
     # Only at points that were measured themselves.
     smooth = np.where(weight > 0, top / np.where(bottom > 0, bottom, 1.0), -np.inf)
     start = np.argmax(smooth, axis=1)
-    low = (smooth < fraction * smooth[np.arange(count), start][:, None]) & (weight > 0)
+    low = (smooth < FRACTION * smooth[np.arange(count), start][:, None]) & (weight > 0)
     index = np.arange(size)[None, :]
     # At least two measured neighbours either way, so that the first fit has a curvature.
     rank = np.cumsum(weight > 0, axis=1)
@@ -78,14 +77,12 @@ def main_peak(z: Array, v: Array, weight: Array, fraction: float) -> tuple[NDArr
     return start, (inside | near) & (weight > 0)
 
 
-class Lobe:
+class _Lobe:
     """The fit v = p (1 - u + q u^2), u = a (x - x0)^2, of B curves; x is z about a centre in units of a scale."""
 
-    def __init__(
-        self, z: Array, v: Array, weight: Array, start: NDArray[np.intp], mask: NDArray[np.bool_], quartic: float
-    ) -> None:
+    def __init__(self, z: Array, v: Array, weight: Array, start: NDArray[np.intp], mask: NDArray[np.bool_]) -> None:
         rows = np.arange(len(z))
-        self.z, self.v, self.weight, self.quartic = z, v, weight, quartic
+        self.z, self.v, self.weight = z, v, weight
         self.centre = z[rows, start]
         reach = np.max(np.where(mask, np.abs(z - self.centre[:, None]), 0.0), axis=1)
         self.scale = np.where(reach > 0, reach, 1.0)
@@ -106,14 +103,14 @@ class Lobe:
         self.a = np.where(sound, -c2 / self.p, 0.5)
         self.x0 = x0
 
-    def settle(self, fraction: float, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def settle(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Fit, choose the points within reach of the fitted vertex, and again, until both rest: (B, Z).
 
         A curve that does not come to rest gets all rounds, alone as in company.
         """
         for _ in range(_ROUNDS):
             moved = self._newton(mask, _NEWTON_STEPS)
-            chosen, wider = self.window(fraction), self.window(min(fraction, WIDEST_FRACTION))
+            chosen, wider = self.window(FRACTION), self.window(WIDEST_FRACTION)
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], wider, chosen)
             chosen = np.where((self.positions(chosen) < LEAST_POINTS)[:, None], mask, chosen)
             if np.array_equal(chosen, mask) and np.all(moved < _AT_REST):
@@ -129,8 +126,7 @@ class Lobe:
 
     def reach(self, fraction: float) -> Array:
         """Distance from the vertex, (B,), at which the fitted curve has fallen to a fraction of its peak."""
-        drop = 1.0 - fraction
-        u = drop if self.quartic == 0 else (1.0 - np.sqrt(1.0 - 4 * self.quartic * drop)) / (2 * self.quartic)
+        u = (1.0 - np.sqrt(1.0 - 4 * QUARTIC * (1.0 - fraction))) / (2 * QUARTIC)
         return np.asarray(np.sqrt(u / self.a) * self.scale)
 
     def positions(self, mask: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -145,7 +141,7 @@ class Lobe:
         away = self.x - self.x0[:, None]
         p, a = self.p[:, None], self.a[:, None]
         u = a * away**2
-        form, slope = 1.0 - u + self.quartic * u**2, 2 * self.quartic * u - 1.0
+        form, slope = 1.0 - u + QUARTIC * u**2, 2 * QUARTIC * u - 1.0
         return p * form, np.stack([form, -2 * a * away * p * slope, p * slope * away**2], axis=2)
 
     def _newton(self, mask: NDArray[np.bool_], steps: int) -> Array:
@@ -198,10 +194,6 @@ def _solve(design: Array, weight: Array, data: Array) -> Array:
     return np.asarray(np.linalg.solve(scaled, (right / size)[:, :, None])[:, :, 0] / size)
 
 
-__all__ = ["FocusError", "FocusVertex", "FocusVertices", "focus_vertex", "focus_vertices"]
-
-QUARTIC = 0.3
-FRACTION = 0.5
 # A curvature, a slope or a contrast is there above this many sigma. The highest of many places is looked at, so this
 # is more than for a single one.
 _SIGNIFICANT = 5.0
@@ -214,8 +206,6 @@ _REMEDY = {
     "peak above": "the peak lies beyond the upper end of the scan, {high:.6g}, or too near to it; move the scan up",
     "few points": "fewer than {least} positions near the peak (about {place:.6g}); take steps of at most {step:.2g}",
     "flat": "no curvature above the noise; scan a wider range or lower the noise (more frames or edge rows)",
-    "spurious": "the highest peak, {peak:.3g} at {place:.6g}, is below {lowest:.3g} and is taken for spurious"
-    " resolution; the main peak is not in the scan: widen it",
     "not finite": "a position or a value is not finite; leave the point out or give it an infinite sigma",
 }
 
@@ -224,7 +214,7 @@ class FocusError(MeasurementError, ValueError):
     """No vertex can be given.
 
     faults: index of the curve, an empty tuple for a single one -> reason: "peak below", "peak above", "few points",
-    "flat", "spurious" or "not finite". The message says what to change.
+    "flat" or "not finite". The message says what to change.
     """
 
     def __init__(self, message: str, faults: dict[tuple[int, ...], str]) -> None:
@@ -287,15 +277,7 @@ class FocusVertices:
         )
 
 
-def focus_vertex(
-    position: ArrayLike,
-    value: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    fraction: float = FRACTION,
-    quartic: float = QUARTIC,
-    lowest_peak: float = 0.0,
-) -> FocusVertex:
+def focus_vertex(position: ArrayLike, value: ArrayLike, sigma: ArrayLike) -> FocusVertex:
     """Vertex of one through-focus curve of Z points, in any order; see focus_vertices for the arguments.
 
     Raises FocusError when the curve has no peak to measure; ValueError for bad arguments.
@@ -304,39 +286,25 @@ def focus_vertex(
         position: (Z,), a length.
         value: (Z,), MTF.
         sigma: of the values, (Z,) or a number.
-        fraction: points count where the fitted curve is above this part of its peak.
-        quartic: q of the module's formula.
-        lowest_peak: a peak below this is spurious resolution.
     """
     if np.ndim(value) != 1:
         raise ValueError(f"through focus: one curve must be (Z,), found {np.shape(value)}")
-    return focus_vertices(position, value, sigma, fraction=fraction, quartic=quartic, lowest_peak=lowest_peak).at()
+    return focus_vertices(position, value, sigma).at()
 
 
-def focus_vertices(
-    position: ArrayLike,
-    value: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    fraction: float = FRACTION,
-    quartic: float = QUARTIC,
-    lowest_peak: float = 0.0,
-    strict: bool = True,
-) -> FocusVertices:
+def focus_vertices(position: ArrayLike, value: ArrayLike, sigma: ArrayLike, *, strict: bool = True) -> FocusVertices:
     """Vertices of many through-focus curves at once.
+
+    Within a scan the highest smoothed value decides which peak is the main one.
 
     Args:
         position: (..., Z) or (Z,), length.
         value: (..., Z), MTF.
         sigma: of the values, broadcast to them, positive; infinite for a point that was not measured.
-        fraction: points count where the fitted curve is above this part of its peak, 0.25 to 0.95.
-        quartic: q of the module's formula, 0 to 0.33; 0 is the plain parabola.
-        lowest_peak: a peak below this is spurious resolution, and the scan has missed the main one. Within a scan the
-            highest smoothed value decides, but only the user can know that the scan went past the main peak.
         strict: raise FocusError for the first faults found; else return them in `fault`.
     """
     where, data, spread = (np.asarray(item, dtype=np.float64) for item in (position, value, sigma))
-    _check(where, data, spread, fraction, quartic)
+    _check(where, data, spread)
     shape = data.shape
     size = shape[-1]
     z, v, s = (np.broadcast_to(item, shape).reshape(-1, size) for item in (where, data, spread))
@@ -346,15 +314,15 @@ def focus_vertices(
     z, v = np.take_along_axis(z, order, 1), np.take_along_axis(v, order, 1)
     weight = np.take_along_axis(np.where(broken, 0.0, s**-2.0), order, 1)
 
-    start, mask = main_peak(z, v, weight, fraction)
-    model = Lobe(z, v, weight, start, mask, quartic)
-    mask = model.settle(fraction, mask)
+    start, mask = _main_peak(z, v, weight)
+    model = _Lobe(z, v, weight, start, mask)
+    mask = model.settle(mask)
     peak, place, bend, covariance = model.result(mask)
 
-    fault = _faults(model, mask, peak, place, bend, covariance, lowest_peak)
+    fault = _faults(model, mask, place, bend, covariance)
     fault[broken.any(axis=1)] = "not finite"
     if strict:
-        _raise(fault, shape, z, weight, peak, place, model.reach(WIDEST_FRACTION), lowest_peak)
+        _raise(fault, shape, z, weight, place, model.reach(WIDEST_FRACTION))
     used = np.zeros(z.shape, dtype=bool)
     np.put_along_axis(used, order, mask, axis=1)
     used[fault != ""] = False
@@ -378,19 +346,16 @@ def focus_vertices(
 
 
 def _faults(
-    model: Lobe,
+    model: _Lobe,
     mask: NDArray[np.bool_],
-    peak: Array,
     place: Array,
     bend: Array,
     covariance: Array,
-    lowest_peak: float,
 ) -> NDArray[np.str_]:
     """(B,) empty, or why a curve has no vertex."""
     fault = np.full(len(place), "", dtype="<U12")
     scarce = model.positions(model.window(WIDEST_FRACTION)) < LEAST_POINTS
     enough = model.positions(model.weight > 0) >= LEAST_POINTS
-    fault[peak < lowest_peak] = "spurious"
     fault[scarce] = "few points"
     bent = -bend / np.sqrt(np.maximum(covariance[:, 2, 2], 1e-300))
     standing = _contrast(model, mask) > _SIGNIFICANT
@@ -413,7 +378,7 @@ def _faults(
     return fault
 
 
-def _contrast(model: Lobe, mask: NDArray[np.bool_]) -> Array:
+def _contrast(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
     """By how many sigma the mean of the chosen points is above the mean of all others, (B,)."""
     inside, outside = np.where(mask, model.weight, 0.0), np.where(mask, 0.0, model.weight)
     sums = [np.maximum(part.sum(axis=1), 1e-300) for part in (inside, outside)]
@@ -421,7 +386,7 @@ def _contrast(model: Lobe, mask: NDArray[np.bool_]) -> Array:
     return np.asarray((means[0] - means[1]) / np.sqrt(1 / sums[0] + 1 / sums[1]))
 
 
-def _trend(model: Lobe, mask: NDArray[np.bool_]) -> Array:
+def _trend(model: _Lobe, mask: NDArray[np.bool_]) -> Array:
     """Slope of the straight line through the chosen points in units of its sigma, (B,)."""
     weight = np.where(mask, model.weight, 0.0)
     middle = (weight * model.x).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-300)
@@ -435,10 +400,8 @@ def _raise(
     shape: tuple[int, ...],
     z: Array,
     weight: Array,
-    peak: Array,
     place: Array,
     reach: Array,
-    lowest_peak: float,
 ) -> None:
     """FocusError when a curve has a fault; the message names the first few."""
     bad = np.flatnonzero(fault != "")
@@ -457,8 +420,6 @@ def _raise(
             "place": place[b],
             # LEAST_POINTS in the window wherever the steps fall; less a quarter, for too few points look too wide.
             "step": 0.75 * 2 * reach[b] / LEAST_POINTS,
-            "peak": peak[b],
-            "lowest": lowest_peak,
         }
         text = _REMEDY[faults[index]].format(**values)
         lines.append(f"curve {', '.join(map(str, index))}: {text}" if index else text)
@@ -466,7 +427,7 @@ def _raise(
     raise FocusError(f"through focus: {'; '.join(lines[:3])}{more}", faults)
 
 
-def _check(where: Array, data: Array, spread: Array, fraction: float, quartic: float) -> None:
+def _check(where: Array, data: Array, spread: Array) -> None:
     """ValueError for arguments that cannot be meant."""
     if data.ndim < 1 or where.shape[-1:] != data.shape[-1:]:
         raise ValueError(f"through focus: position {where.shape} and value {data.shape} must end in the same Z points")
@@ -479,7 +440,3 @@ def _check(where: Array, data: Array, spread: Array, fraction: float, quartic: f
         ) from error
     if not np.all(spread > 0):
         raise ValueError("through focus: every sigma must be positive")
-    if not 0.25 <= fraction <= 0.95:
-        raise ValueError(f"through focus: fraction must be within 0.25 to 0.95, found {fraction}")
-    if not 0.0 <= quartic <= 0.33:
-        raise ValueError(f"through focus: quartic must be within 0 to 0.33, found {quartic}")

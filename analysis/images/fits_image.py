@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from analysis.images.image_header import ImageError, ImageHeader, different_pages, full_scale, no_such_page
 
-__all__ = ["MAGIC", "fits_header", "fits_planes", "fits_time"]
-
 MAGIC = b"SIMPLE  ="
 _SCIENCE = "SCI"
 _MJD_ZERO = datetime(1858, 11, 17, tzinfo=UTC)

@@ -14,6 +14,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,15 @@ from numpy.typing import NDArray
 from analysis.images import fits_image, tiff_image
 from analysis.images.image_header import JPEG_MAGIC, PNG_MAGIC, ImageError, ImageHeader, jpeg_header, png_header
 
-__all__ = ["GAMMAS", "ImageError", "ImageFile", "Region", "tone_curve"]
+__all__ = ["GAMMAS", "ImageError", "ImageFile", "Region", "recorded", "tone_curve"]
 
 Array = NDArray[np.float64]
 MOST_BYTES = 1 << 29
-"""Of one page when it is decoded, and of the frames of one file together."""
+"""Largest size of one decoded page, and of the frames of one file together."""
 MOST_PIXELS = 4_000_000
-"""Of one region: the fits need some 250 bytes for each."""
+"""Largest region: the fits need some 250 bytes for each pixel."""
 MOST_STACKED = 16_000_000
-"""Of one region in all pages together."""
+"""Largest region in all pages together."""
 GAMMAS = ("srgb", "1", "2.2")
 """Examples of the tone curves."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -256,7 +257,7 @@ def _header(path: Path, page: int | None, choose: str) -> ImageHeader:
 
 
 def _reason(error: Exception) -> str:
-    """In one line, and without what only a reader's author can make something of."""
+    """Reason of an error in one line, without what only the reader's author understands."""
     text = " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return "it does not fit into memory"
@@ -305,3 +306,24 @@ def _luminance(colour: Array, linear: Callable[[Array], Array], full_scale: floa
     grey = linear(colour[..., :3]) @ _LUMINANCE
     # one saturated channel spoils the sum
     return np.where((colour[..., :3] >= full_scale).any(axis=-1), full_scale, grey)
+
+
+def recorded(path: Path) -> tuple[datetime | None, str]:
+    """Time of the first frame, UTC if the file names no time zone, None where it does not say; and the note in it.
+
+    The time at which a file was written or changed does not count: a copy has another one.
+
+    Args:
+        path: of an image file.
+    """
+    # a header that cannot be read says nothing; whether the image can be is told where it is
+    try:
+        with path.open("rb") as file:
+            magic = file.read(9)
+        if magic.startswith(tiff_image.MAGIC):
+            return tiff_image.tiff_origin(path)
+        if magic == fits_image.MAGIC:
+            return fits_image.fits_time(path), ""
+    except Exception:
+        return None, ""
+    return None, ""

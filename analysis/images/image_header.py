@@ -18,7 +18,7 @@ class ImageError(Exception):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Of the pages that belong together.
+    """Header of the pages that belong together.
 
     Attributes:
         kind: TIFF, FITS, PNG or JPEG.

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from analysis.images.image_header import ImageError, ImageHeader, different_pages, full_scale, no_such_page
 
-__all__ = ["MAGIC", "tiff_header", "tiff_origin", "tiff_pages"]
-
 # what it logs of a spoilt file would stand beside the sentence in which the file is refused
 tifffile.logger().addHandler(logging.NullHandler())
 

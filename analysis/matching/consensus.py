@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 from analysis.matching.options import checked_places
 from analysis.measurement_error import UndeterminedError
 
-__all__ = ["Consensus", "DisplacementField", "consensus"]
-
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 # Of missing every all-right sample while this share is wrong.

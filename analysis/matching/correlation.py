@@ -17,8 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from analysis.matching.options import Reason, checked_image, checked_places, checked_templates
 
-__all__ = ["distinct_points"]
-
 Array = NDArray[np.float64]
 _SMOOTHING = 1.0
 # Standard deviation of the Gaussian window of the tensor, px: half of a window of matching.
@@ -104,7 +102,7 @@ def _strength(rows: NDArray[np.generic]) -> NDArray[np.float32]:
 
 
 def _apart(place: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
-    """Without the later of two that lie within reach: equal neighbours are both maxima."""
+    """The places without the later of two that lie within reach, since equal neighbours are both maxima."""
     keep = np.zeros(len(place), bool)
     # maxima are reach apart unless they are equal, so few share a cell of this size
     side = reach + 1
@@ -118,8 +116,6 @@ def _apart(place: NDArray[np.intp], reach: int) -> NDArray[np.intp]:
         kept.setdefault(cell, []).append(k)
     return place[keep]
 
-
-__all__ = ["LARGEST_REACH", "Peaks", "search"]
 
 LARGEST_REACH = 200
 # Half-width of the main lobe, px: other peaks count from there.
@@ -213,6 +209,6 @@ def _second(field: NDArray[np.float32], row: int, column: int) -> float:
 
 
 def _vertex(three: Array) -> float:
-    """Of the parabola through three values about the largest, px from the middle one."""
+    """Vertex of the parabola through three values about the largest, px from the middle one."""
     bend = three[0] - 2.0 * three[1] + three[2]
     return float(0.5 * (three[0] - three[2]) / bend) if bend < 0 else 0.0

@@ -33,19 +33,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.matching import window_checks
 from analysis.matching.options import MatchOptions, Reason, checked_image, checked_places, checked_templates, joined
 from analysis.matching.spline import SplineStack, low_passed
 from analysis.matching.template_noise import TemplateNoise, noise_energy, template_noise
-from analysis.matching.window_checks import (
-    ResidualCorrelation,
-    WindowHalves,
-    WindowRelief,
-    residual_correlation,
-    window_halves,
-    window_relief,
-)
-
-__all__ = ["Fits", "least_squares"]
+from analysis.matching.window_checks import ResidualCorrelation, WindowHalves, WindowRelief
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
@@ -392,8 +384,8 @@ def _summary(
         smoothing * hidden,
         iterations,
         reason,
-        residual_correlation(*fitted, side, of_template.inverse),
+        window_checks.residual_correlation(*fitted, side, of_template.inverse),
         of_template,
-        window_relief(*fitted, side),
-        window_halves(*fitted, side),
+        window_checks.window_relief(*fitted, side),
+        window_checks.window_halves(*fitted, side),
     )

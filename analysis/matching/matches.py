@@ -59,12 +59,7 @@ class Matches:
 
 
 def match(
-    image: ArrayLike,
-    templates: ArrayLike,
-    predicted: ArrayLike,
-    *,
-    reach: int,
-    options: MatchOptions | None = None,
+    image: ArrayLike, templates: ArrayLike, predicted: ArrayLike, *, reach: int, options: MatchOptions | None = None
 ) -> Matches:
     """Find templates in an image, each near its predicted place.
 

@@ -11,8 +11,6 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["checked_image", "checked_places", "checked_templates"]
-
 Array = NDArray[np.float64]
 # A parabola and a 5 x 5 window within the margins need that much.
 _LEAST_TEMPLATE = 11
@@ -71,9 +69,6 @@ def checked_templates(templates: ArrayLike, what: str) -> Array:
     return array
 
 
-__all__ = ["Reason"]
-
-
 class Reason(IntEnum):
     """Code of a verdict; `text` says it in words."""
 
@@ -118,8 +113,6 @@ _TEXTS = {
 }
 
 
-__all__ = ["joined"]
-
 Part = TypeVar("Part")
 
 
@@ -130,9 +123,6 @@ def joined(parts: Sequence[Part]) -> Part:
         column = [getattr(part, field.name) for part in parts]
         columns[field.name] = joined(column) if is_dataclass(column[0]) else np.concatenate(column)
     return type(parts[0])(**columns)
-
-
-__all__ = ["MatchOptions"]
 
 
 @dataclass(frozen=True)

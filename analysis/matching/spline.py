@@ -14,8 +14,6 @@ from scipy.interpolate import BSpline, PPoly
 
 from analysis.matching.options import checked_image
 
-__all__ = ["SplineStack", "low_passed", "resampled"]
-
 Array = NDArray[np.float64]
 _DEGREE = 5
 # Pixels beyond a patch that its spline sees: the prefilter decays by 0.43 a pixel, so the rest is 1e-8.

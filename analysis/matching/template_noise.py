@@ -34,8 +34,6 @@ from numpy.typing import NDArray
 
 from analysis.matching.spline import SplineStack, low_passed
 
-__all__ = ["TemplateNoise", "noise_energy", "template_noise"]
-
 Array = NDArray[np.float64]
 # Least curvature over the normal matrix, of any combination of unknowns: more than three fifths noise is not known.
 _LEAST = 0.4
@@ -49,7 +47,7 @@ _REACH, _PHASES = 30, 64
 
 @dataclass(frozen=True, eq=False)
 class TemplateNoise:
-    """Of n fits with q unknowns; NaN where there is none, or where it is mostly noise.
+    """Noise of the templates in n fits with q unknowns; NaN where there is no fit, or where it is mostly noise.
 
     Attributes:
         inverse: (n, q, q) H^-1.
@@ -165,7 +163,7 @@ def _inverse(square: Array, curvature: Array) -> Array:
 
 def _force(place: Array, linear: Array, smoothing: Array, moved: Array) -> Array:
     """(n, q) expectation of F by white noise in the template that has unit variance after the gain."""
-    mean, wave = np.moveaxis(np.array([noise_gain(float(one)) for one in smoothing]), 1, 0)
+    mean, wave = np.moveaxis(np.array([_noise_gain(float(one)) for one in smoothing]), 1, 0)
     phase = 2.0 * np.pi * place
     # (3, n, 2, p): energy of the value, of value by second derivative, of the second derivative, along rows and columns
     energy = mean.T[:, :, None, None] + wave.T[:, :, None, None] * np.cos(phase)
@@ -200,7 +198,7 @@ def noise_energy(factors: Array, smoothing: float) -> Array:
         factors: (n, 1 or 3) gain and perhaps sharpness along rows and columns.
         smoothing: rms of the low pass, px.
     """
-    mean = noise_gain(smoothing)[0][:, None, None]
+    mean = _noise_gain(smoothing)[0][:, None, None]
     size = factors.shape[1]
     energy = np.einsum("ni,ij,nj->n", factors, _products(mean, mean)[0, :size, :size, 0], factors)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -208,7 +206,7 @@ def noise_energy(factors: Array, smoothing: float) -> Array:
 
 
 @lru_cache(maxsize=32)
-def noise_gain(smoothing: float) -> Array:
+def _noise_gain(smoothing: float) -> Array:
     """(2, 3) energy that white noise of unit variance keeps along one axis, after low pass and interpolation.
 
     Of the value, of value by second derivative (px^-2) and of the second derivative (px^-4); first the mean over the

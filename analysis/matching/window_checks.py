@@ -48,7 +48,7 @@ STEP = 1.0
 
 @dataclass(frozen=True, eq=False)
 class WindowHalves:
-    """Of n fits and four splits; NaN where there is none.
+    """How far apart halves of windows put the places of n fits, in four splits; NaN where there is no fit.
 
     Attributes:
         apart: (n, 4, 2) place of the one half minus that of the other, px.
@@ -124,7 +124,7 @@ def window_halves(design: Array, residual: Array, side: int) -> WindowHalves:
 
 
 def _critical() -> float:
-    """Of the largest chi-square of the splits, two degrees of freedom each."""
+    """Limit of the largest chi-square of the splits, which have two degrees of freedom each."""
     return 2.0 * math.log(SPLITS / FALSE_ALARM)
 
 
@@ -144,7 +144,7 @@ _LEAST = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ResidualCorrelation:
-    """Of n fits; lags are half of those within `LAG`.
+    """Correlation of the residuals of n fits; lags are half of those within `LAG`.
 
     Attributes:
         variance: (n,) of the residuals, DN^2, by redundancy.
@@ -245,7 +245,7 @@ _HELD = 2.5
 
 @dataclass(frozen=True, eq=False)
 class WindowRelief:
-    """Of n fits; NaN where there is none.
+    """What residuals of n fits show of relief within their windows; NaN where there is no fit.
 
     Attributes:
         score: (n,) q, DN^2.

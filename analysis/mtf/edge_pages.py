@@ -20,21 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from analysis.mtf import slanted_edge
 from analysis.mtf.edge_location import EdgeError, EdgeLine, checked_region, locate_edge
 from analysis.mtf.edge_spread import EdgeDesign, EdgeSpread, fit_edge_spread
-from analysis.mtf.slanted_edge import (
-    CORE_WIDTHS,
-    EdgeMtf,
-    FittedEdge,
-    PagePlaces,
-    check_phases,
-    checked_frequency,
-    core_width,
-    edge_result,
-    fit_edge,
-    rising,
-    rising_line,
-)
+from analysis.mtf.slanted_edge import EdgeMtf
 from analysis.spots.noise import NoiseModel
 
 __all__ = ["different_pages", "grey_step", "left_over", "mean_page", "measure_pages"]
@@ -91,8 +80,6 @@ def measure_pages(
     *,
     noise: NoiseModel | None = None,
     saturation: float | None = None,
-    oversampling: int = 4,
-    frequency: ArrayLike | None = None,
     step: float = 0.0,
 ) -> EdgeMtf:
     """MTF of the one edge that all pages show.
@@ -101,13 +88,10 @@ def measure_pages(
         pages: (P, H, W) grey values, linear in light; pages that repeat another one to the bit do not count.
         noise: the detector's model, as in `slanted_edge.measure_edge`.
         saturation: as there; one page that reaches it is enough.
-        oversampling: knots of the edge-spread function per pixel.
-        frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
         step: between the grey values of a page, which are rounded to it; 0 for real numbers.
 
     Raises:
         EdgeError: the region does not show one measurable edge, or pages cannot be laid over each other.
-        ValueError: oversampling or frequency make no sense.
     """
     given = np.asarray(pages)
     if given.ndim != 3 or given.dtype.kind not in "uif":
@@ -115,17 +99,16 @@ def measure_pages(
     kept = different_pages(given)
     same = len(given) - len(kept)
     given = given[kept]
-    wanted = checked_frequency(frequency, oversampling)
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
     grey = checked_region(mean_page(given, saturation), saturation)
     every = np.asarray(given, np.float64)
-    run = _Run(noise, wanted, oversampling, step, same)
+    run = _Run(noise, step, same)
     try:
         line = locate_edge(grey)
-        up = rising(grey, line)
-        fitted = fit_edge(up, *rising_line(line, up.shape[1]), oversampling)
-        stack = _Stack.of(rising(every, line), fitted)
+        up = slanted_edge.rising(grey, line)
+        fitted = slanted_edge.fit_edge(up, *slanted_edge.rising_line(line, up.shape[1]))
+        stack = _Stack.of(slanted_edge.rising(every, line), fitted)
         shift = stack.differences(step, up)
         if len(every) == 1 or shift.p_value >= FALSE_ALARM:
             stack = stack.moved(shift.line)
@@ -144,8 +127,6 @@ class _Run:
     """What is asked for."""
 
     noise: NoiseModel | None
-    frequency: Array
-    oversampling: int
     step: float
     same: int
 
@@ -154,7 +135,7 @@ class _Run:
         pages: Array,
         frames: int,
         line: EdgeLine,
-        fitted: FittedEdge,
+        fitted: slanted_edge.FittedEdge,
         stack: _Stack,
         shift: _Shift,
         aligned: bool,
@@ -162,15 +143,15 @@ class _Run:
         """Of pages (1, H, W), their mean, or (P, H, W), laid over each other; every one is the mean of some frames."""
         count = len(stack.line)
         rounded = [left_over(rms, self.step) for rms in shift.page_noise]
-        found = edge_result(
-            pages, line, fitted, self.noise, frames // len(pages), self.frequency, (rounded[0], rounded[1])
+        found = slanted_edge.edge_result(
+            pages, line, fitted, self.noise, frames // len(pages), slanted_edge.FREQUENCY, (rounded[0], rounded[1])
         )
         place, slope = stack.line.T
         spread = np.sqrt(np.stack([np.diag(one) for one in shift.covariance]))
         cosine = np.cos(np.arctan(slope)) ** 2
         # the line is that of the fit, the edge at half height a little beside it
         own = place - place.mean()
-        places = PagePlaces(
+        places = slanted_edge.PagePlaces(
             position=found.position + (own if line.sign > 0 else -own),
             position_sigma=spread[:, 0],
             angle=line.sign * np.arctan(slope),
@@ -228,7 +209,7 @@ class _Stack:
     levels: Array
 
     @classmethod
-    def of(cls, pages: Array, fitted: FittedEdge) -> _Stack:
+    def of(cls, pages: Array, fitted: slanted_edge.FittedEdge) -> _Stack:
         """All pages at the place and the levels of their mean."""
         line = np.tile([fitted.offset, fitted.slope], (len(pages), 1))
         return cls(pages, line, fitted.spread, np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1)))
@@ -275,7 +256,7 @@ class _Stack:
             design = self.spread.design(x[p].ravel())
             value = self.spread.value(design)
             fall = np.zeros(page.size)
-            close = np.abs(design.x[design.inside]) <= self.spread.core / CORE_WIDTHS
+            close = np.abs(design.x[design.inside]) <= self.spread.core / slanted_edge.CORE_WIDTHS
             fall[design.inside[close]] = -self.spread.core_slope(design)[close]
             fall *= math.cos(math.atan(self.line[p, 1]))
             along = np.repeat(self.along, page.shape[1])
@@ -348,7 +329,7 @@ def _own_lines(pages: Array, line: EdgeLine) -> Array | None:
             return None
         if (found.axis, found.sign) != (line.axis, line.sign):
             return None
-        out.append(rising_line(found, rising(page, line).shape[1]))
+        out.append(slanted_edge.rising_line(found, slanted_edge.rising(page, line).shape[1]))
     return np.array(out)
 
 
@@ -359,7 +340,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
             f"the edge moves between the pages, and {len(pages)} of {pages[0].size} pixels are too many to be laid over"
             f" each other, {MOST_PIXELS} in all are possible: take a smaller region, or fewer pages"
         )
-    up = rising(pages, line)
+    up = slanted_edge.rising(pages, line)
     lines = _own_lines(pages, line)
     if lines is None and stack is None:
         raise EdgeError(
@@ -374,7 +355,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
     left, right = (np.median(part, axis=(1, 2)) for part in (up[..., :8], up[..., -8:]))
     levels = np.column_stack([left, right - left])
     turning = False
-    current = _fitted(up, start, levels, 2)
+    current = _fitted(up, start, levels, slanted_edge.COARSE)
     for number in range(_STEPS):
         shift = current.differences(run.step)
         change = shift.line.copy()
@@ -384,7 +365,7 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         gain = current.levels[:, 1] / current.spread.contrast
         new = current.levels + shift.levels * gain[:, None]
         own = np.abs(change) / np.sqrt(np.diagonal(shift.covariance, axis1=1, axis2=2))
-        current = _fitted(up, current.line + change, new, 2)
+        current = _fitted(up, current.line + change, new, slanted_edge.COARSE)
         if not turning and number >= _SETTLED and shift.turned:
             turning = True
         elif number >= _SETTLED and np.max(own) < _DONE:
@@ -393,13 +374,15 @@ def _aligned(pages: Array, line: EdgeLine, stack: _Stack | None, run: _Run) -> E
         raise EdgeError(
             "the pages cannot be laid over each other: the edge does not look alike in them; measure single pages"
         )
-    final = _fitted(up, current.line, current.levels, run.oversampling)
+    final = _fitted(up, current.line, current.levels, slanted_edge.OVERSAMPLING)
     sigma = np.stack([np.diag(one) for one in shift.covariance])
     normal = np.cos(np.arctan(final.line[:, 1])) ** 2
     jitter = float(np.mean(normal * (sigma[:, 0] + turning * sigma[:, 1] * np.mean(final.along**2))))
     offset, slope = final.line.mean(axis=0)
-    design = EdgeDesign.of(final.distance().ravel(), final.spread.core, run.oversampling)
-    fitted = FittedEdge(float(offset), float(slope), np.tile(final.along, len(up)), design, final.spread, jitter)
+    design = EdgeDesign.of(final.distance().ravel(), final.spread.core, slanted_edge.OVERSAMPLING)
+    fitted = slanted_edge.FittedEdge(
+        float(offset), float(slope), np.tile(final.along, len(up)), design, final.spread, jitter
+    )
     chi = final.differences(run.step)
     # of pages that differ: how far the lines stand apart
     apart = final.line - final.line.mean(axis=0)
@@ -428,8 +411,8 @@ def _fitted(up: Array, lines: Array, levels: Array, oversampling: int) -> _Stack
         np.arctan(slope)
     )[:, None, None]
     distance, grey = place.ravel(), even.ravel()
-    check_phases(distance, rows * len(up), float(slope.mean()))
-    design = EdgeDesign.of(distance, core_width(distance, grey, plateau), oversampling)
+    slanted_edge.check_phases(distance, rows * len(up), float(slope.mean()))
+    design = EdgeDesign.of(distance, slanted_edge.core_width(distance, grey, plateau), oversampling)
     spread = fit_edge_spread(design, grey)
     # levels of the pages against those of the fit
     factor = spread.contrast / contrast

@@ -38,6 +38,11 @@ _LARGEST_GAP = 0.3
 # Block means of 4 x 4 px that stick out of the fitted edge by more than this share of the contrast.
 _OTHER_STRUCTURE = 0.1
 _LINE_STEPS = 2
+OVERSAMPLING, COARSE = 4, 2
+"""Knots of the edge-spread function per pixel; and while the line is sought, whose slope must not follow the noise."""
+FREQUENCY = np.linspace(0.0, 1.0, 65)
+FREQUENCY.setflags(write=False)
+"""Frequencies at which an MTF is given by default, cycles/pixel."""
 # Samples of the spread functions that are handed out.
 _SHOWN_PER_PIXEL = 16
 
@@ -48,7 +53,6 @@ def measure_edge(
     noise: NoiseModel | None = None,
     frames: int = 1,
     saturation: float | None = None,
-    oversampling: int = 4,
     frequency: ArrayLike | None = None,
     rounding: tuple[float, float] = (0.0, 0.0),
 ) -> EdgeMtf:
@@ -62,31 +66,30 @@ def measure_edge(
             variance is estimated from the residuals on both sides of the edge and taken as linear in the grey value.
         frames: how many frames the region is the mean of, used with `noise` only.
         saturation: grey value of saturation; default the model's, else plateaus of equal values are looked for.
-        oversampling: knots of the edge-spread function per pixel.
         frequency: (F,) cycles/pixel, increasing, default 0 to 1 in steps of 1/64.
         rounding: rms of what rounding leaves in the dark and in the bright level, grey values (`edge_pages.left_over`).
 
     Raises:
         EdgeError: the region does not show one measurable edge.
-        ValueError: oversampling or frequency make no sense.
+        ValueError: frequencies that make no sense.
     """
-    wanted = checked_frequency(frequency, oversampling)
+    wanted = FREQUENCY if frequency is None else _checked_frequency(frequency)
     if saturation is None and noise is not None:
         saturation = noise.saturation_dn
     grey = checked_region(region, saturation)
     line = locate_edge(grey)
     up = rising(grey, line)
-    fitted = fit_edge(up, *rising_line(line, up.shape[1]), oversampling)
+    fitted = fit_edge(up, *rising_line(line, up.shape[1]))
     return edge_result(up[None], line, fitted, noise, frames, wanted, rounding)
 
 
-def checked_frequency(frequency: ArrayLike | None, oversampling: int) -> Array:
-    """Frequencies (F,) of `measure_edge`. ValueError if they or the oversampling make no sense."""
-    wanted = np.linspace(0.0, 1.0, 65) if frequency is None else np.array(frequency, dtype=np.float64)
+def _checked_frequency(frequency: ArrayLike) -> Array:
+    """Frequencies (F,) of `measure_edge`. ValueError if they make no sense."""
+    wanted = np.array(frequency, dtype=np.float64)
     if wanted.ndim != 1 or wanted.size < 2 or not np.all(np.diff(wanted) > 0) or wanted[0] < 0:
         raise ValueError("frequency must be at least two increasing values >= 0, in cycles/pixel")
-    if not (isinstance(oversampling, int) and 2 <= oversampling <= 16) or wanted[-1] > oversampling / 2:
-        raise ValueError(f"oversampling must be an integer of 2 to 16 and at least twice {wanted[-1]:g} cycles/pixel")
+    if wanted[-1] > OVERSAMPLING / 2:
+        raise ValueError(f"frequency must be at most {OVERSAMPLING / 2:g} cycles/pixel, found {wanted[-1]:g}")
     return wanted
 
 
@@ -117,14 +120,13 @@ class FittedEdge:
     jitter: float = 0.0
 
 
-def fit_edge(rising: Array, offset: float, slope: float, oversampling: int) -> FittedEdge:
+def fit_edge(rising: Array, offset: float, slope: float) -> FittedEdge:
     """Line and edge-spread function of a region (H, W) from `rising`.
 
     Args:
         rising: grey values.
         offset: column of the line in the middle row, about.
         slope: of the line, about.
-        oversampling: knots per pixel.
 
     Raises:
         EdgeError: too few sampling phases, or no sharp edge.
@@ -140,8 +142,7 @@ def fit_edge(rising: Array, offset: float, slope: float, oversampling: int) -> F
             check_phases(distance, rows, slope)
             core = core_width(distance, grey, min(offset, columns - 1 - offset) - abs(slope) * (rows - 1) / 2.0)
         last = step == _LINE_STEPS
-        # few knots for the line: its slope must not follow the noise
-        design = EdgeDesign.of(distance, core, oversampling if last else 2)
+        design = EdgeDesign.of(distance, core, OVERSAMPLING if last else COARSE)
         spread = fit_edge_spread(design, grey)
         if not last:
             parts, normal, near = _line_parts(design, spread, along, columns)

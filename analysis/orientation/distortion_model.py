@@ -15,14 +15,14 @@ no constant term as long as W counts exactly from the direction that images to O
 -f d (1 + tan^2 W): (3) leaves f d in the distortion of every point, and (2) puts f d (1 + 5 / (3 tan^2 W_edge)) into p,
 which is 3500 f d for a field of +-1.25 deg. The model with a constant is free of this:
 
-    L = c + f tan W - p tan^2 W + d2 tan^2 W + k3 tan^3 W + k5 tan^5 W
+    L = c + f tan W - p tan^2 W + k3 tan^3 W
 
-- `constant` c, `principal_distance` f, `principal_point` p: the interior orientation, metres;
-- `decentring` d2, m: decentring distortion. In one dimension it is the same function as a principal point p = -d2, and
-  so is, to first order, a radial distortion whose centre lies off the zero of W by w: -3 k3 w tan^2 W. No measurement
-  along one line separates them, and asking for both is an error;
-- `radial3` k3, `radial5` k5, m: radial distortion. With r = f tan W it is K1 r^3 + K2 r^5, K1 = k3 / f^3 (1/m^2) and
-  K2 = k5 / f^5 (1/m^4); positive is a pincushion. Software that *adds* a correction to the image has the other sign.
+- `constant` c, `principal_distance` f, `principal_point` p: the interior orientation, metres. In one dimension a
+  decentring distortion d2 tan^2 W is the same function as a principal point p = -d2, and so is, to first order, a
+  radial distortion whose centre lies off the zero of W by w: -3 k3 w tan^2 W. No measurement along one line separates
+  them;
+- `radial3` k3, m: radial distortion. With r = f tan W it is K1 r^3, K1 = k3 / f^3 (1/m^2); positive is a pincushion.
+  Software that *adds* a correction to the image has the other sign.
 
 Angles in radians, lengths in metres. Leading axes of L and W are sets.
 """
@@ -35,20 +35,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from analysis.measurement_error import MeasurementError
-from analysis.monitor.model_fit import RankError
-
-__all__ = [
-    "TERMS",
-    "InseparableTermsError",
-    "OrientationError",
-    "design",
-    "distortion",
-    "principal_distance",
-    "principal_distance_and_point",
-    "principal_point",
-    "readings",
-    "slope",
-]
 
 Array = NDArray[np.float64]
 # power of tan W and sign of each term
@@ -56,9 +42,7 @@ _POWER = {
     "constant": (0, 1.0),
     "principal_distance": (1, 1.0),
     "principal_point": (2, -1.0),
-    "decentring": (2, 1.0),
     "radial3": (3, 1.0),
-    "radial5": (5, 1.0),
 }
 TERMS = tuple(_POWER)
 # Line cameras see a few degrees; beyond this an angle is rather in degrees than in radians.
@@ -69,17 +53,6 @@ _SINGULAR = 1e-9
 
 class OrientationError(MeasurementError, ValueError):
     """The readings do not determine what is asked for; the message says what to change."""
-
-
-class InseparableTermsError(OrientationError, RankError):
-    """Terms that the angles of the test cannot tell apart.
-
-    `terms`: their names. `null_vectors` (1, P): the combination of all fitted terms that changes the spots least.
-    """
-
-    def __init__(self, message: str, null_vectors: Array, terms: tuple[str, ...]) -> None:
-        RankError.__init__(self, message, null_vectors)
-        self.terms = terms
 
 
 def readings(position: ArrayLike, angle: ArrayLike) -> tuple[Array, Array]:
@@ -196,15 +169,10 @@ def principal_point(position: ArrayLike, angle: ArrayLike, principal_distance: A
 
 
 def design(angle: ArrayLike, terms: Sequence[str]) -> Array:
-    """dL/d(term) (..., P) at angles (...), rad. Raises OrientationError for unknown, repeated or equal terms."""
+    """dL/d(term) (..., P) at angles (...), rad. Raises OrientationError for unknown or repeated terms."""
     unknown = [term for term in terms if term not in _POWER]
     if unknown or len(set(terms)) != len(terms):
         raise OrientationError(f"interior orientation: terms must be different ones of {TERMS}, found {tuple(terms)}")
-    if {"principal_point", "decentring"} <= set(terms):
-        raise OrientationError(
-            "interior orientation: principal_point and decentring are the same tan^2 term along one line and cannot be"
-            " fitted together; keep one of the two"
-        )
     t = np.tan(np.asarray(angle, dtype=np.float64))
     return np.stack([sign * t**power for power, sign in (_POWER[term] for term in terms)], axis=-1)
 

@@ -7,10 +7,7 @@ the same (eq. 2) and remarks that p is about a pixel; this says with numbers whe
 radial terms). Errors of a turntable are common to many points (eccentricity, graduation, the zero), so the noise is a
 full covariance. The paper weights all points alike; its estimates stay unbiased under such noise, but sigmas from the
 scatter of the residuals are wrong, for a common error hides in the parameters. Here every sigma comes from the given
-covariance (sandwich). Generalised least squares is the alternative with the smallest sigmas.
-
-What counts as distortion depends on the f, p and c that it is counted from: `InteriorOrientation.printed` gives eq.
-(1), `residual` what is left after the whole model, `curve` the smooth distortion from a calibration of choice.
+covariance (sandwich). Generalised least squares, which has the smallest sigmas, serves for chi-square.
 
 A point of the line at y looks, from the camera's Z, at
 
@@ -35,7 +32,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from analysis.orientation.distortion_model import InseparableTermsError, OrientationError, design, readings, slope
+from analysis.orientation.distortion_model import OrientationError, design, readings, slope
 
 Array = NDArray[np.float64]
 # With columns of length one, the worst combination of terms has this many times the sigma of the best. Five terms over
@@ -46,7 +43,7 @@ _WORST_CONDITION = 1e3
 def gain(columns: Array, root: Array | None = None) -> Array:
     """Least-squares inverse (P, N) of columns (N, P): all points alike, or generalised least squares.
 
-    root: (N, N) from `noise_root`. Columns are scaled to length one, for powers of tan W differ by magnitudes.
+    root: (N, N) from `_noise_root`. Columns are scaled to length one, for powers of tan W differ by magnitudes.
     """
     white = columns if root is None else np.linalg.solve(root, columns)
     length = np.linalg.norm(white, axis=0)
@@ -54,10 +51,8 @@ def gain(columns: Array, root: Array | None = None) -> Array:
     return np.asarray(inverse if root is None else inverse @ np.linalg.inv(root), dtype=np.float64)
 
 
-def condition_number(columns: Array, names: tuple[str, ...], angle: Array) -> float:
-    """Condition number of columns (N, P) of these terms at angles (N,), rad, scaled to length one.
-
-    Raises InseparableTermsError, naming the terms that take part in the worst combination, when it is too large.
+def _check_separable(columns: Array, names: tuple[str, ...], angle: Array) -> None:
+    """OrientationError, naming the terms that take part in the worst combination, where angles do not separate them.
 
     Args:
         columns: of the design, (N, P).
@@ -68,22 +63,19 @@ def condition_number(columns: Array, names: tuple[str, ...], angle: Array) -> fl
     _, values, vt = np.linalg.svd(columns / np.where(length > 0, length, 1.0))
     condition = float(values[0] / max(values[-1], 1e-300))
     if condition <= _WORST_CONDITION:
-        return condition
+        return
     part = np.abs(vt[-1]) / np.max(np.abs(vt[-1]))
-    mixed = tuple(name for name, share in zip(names, part, strict=True) if share > 0.1)
-    null = vt[-1:] / np.where(length > 0, length, 1.0)
+    mixed = [name for name, share in zip(names, part, strict=True) if share > 0.1]
     low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
     side = ", all on one side of zero" if low * high > 0 else ""
-    raise InseparableTermsError(
+    raise OrientationError(
         f"interior orientation: angles from {low:.6g} to {high:.6g} deg{side}, cannot separate {', '.join(mixed)}"
         f" (condition number {condition:.2g}); measure at more angles over both halves of the"
-        " field, or leave a term out",
-        null / np.max(np.abs(null)),
-        mixed,
+        " field, or leave a term out"
     )
 
 
-def noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
+def _noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
     """Covariance (N, N) from a covariance (N, N) or sigmas (N,) or ().
 
     Raises OrientationError, with the given name, for another shape, values that are not finite, negative sigmas.
@@ -109,7 +101,7 @@ def noise_matrix(given: ArrayLike, count: int, name: str) -> Array:
     return 0.5 * (noise + noise.T)
 
 
-def noise_root(noise: Array) -> Array:
+def _noise_root(noise: Array) -> Array:
     """Cholesky factor of a covariance (N, N): solve(root, x) has unit covariance.
 
     Raises OrientationError when the covariance is not positive definite.
@@ -127,32 +119,27 @@ def noise_root(noise: Array) -> Array:
 
 # Significance in sigmas: false alarm 0.3 %.
 _SIGNIFICANT = 3.0
+POINT_TOLERANCE = 10e-6
+"""Sigma up to which the principal point counts as observable, metres: about a pixel, the size that paper 004 expects of
+it.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class PointReport:
     """What the test can say of the principal point p.
 
-    value: m; zero when p was not fitted. sigma: m, of p, or of the p that could have been fitted beside the other
-    terms; infinite when it could not.
-    fitted: whether p is one of the terms. observable: sigma is no larger than the tolerance that was asked for.
-    significant: |value| exceeds 3 sigma. edge_effect: sigma tan^2 W at the widest angle, m. noise: median sigma of a
-    point, m. statement: all this in a sentence.
+    Attributes:
+        observable: whether the sigma of p, or of the p that could have been fitted beside the other terms, is no larger
+            than `POINT_TOLERANCE`.
+        statement: this in a sentence, with numbers.
     """
 
-    value: float
-    sigma: float
-    fitted: bool
     observable: bool
-    significant: bool
-    edge_effect: float
-    noise: float
     statement: str
 
 
-def point_report(
-    names: tuple[str, ...], values: Array, angle: Array, noise: Array, weighted: bool, tolerance: float
-) -> PointReport:
+def _point_report(names: tuple[str, ...], values: Array, angle: Array, noise: Array) -> PointReport:
     """What a fit of these terms says of p, or would say with p beside them.
 
     Args:
@@ -160,18 +147,16 @@ def point_report(
         values: of the terms, (P,), m.
         angle: (N,) rad.
         noise: (N, N) m^2.
-        weighted: generalised least squares.
-        tolerance: m, largest sigma of an observable p.
     """
     fitted = "principal_point" in names
-    asked = names if fitted or "decentring" in names else (*names, "principal_point")
-    k = asked.index("principal_point" if "principal_point" in asked else "decentring")
+    asked = names if fitted else (*names, "principal_point")
+    k = asked.index("principal_point")
     columns = design(angle, asked)
     try:
         if len(columns) < len(asked):
             raise OrientationError("interior orientation: no point is left for p")
-        condition_number(columns, asked, angle)
-        row = gain(columns, noise_root(noise) if weighted else None)[k]
+        _check_separable(columns, asked, angle)
+        row = gain(columns)[k]
         sigma = float(np.sqrt(row @ noise @ row))
     except OrientationError:
         sigma = np.inf
@@ -179,7 +164,7 @@ def point_report(
     widest = float(np.max(np.abs(angle)))
     edge = sigma * np.tan(widest) ** 2
     typical = float(np.median(np.sqrt(np.diagonal(noise))))
-    observable, significant = sigma <= tolerance, abs(value) > _SIGNIFICANT * sigma
+    observable, significant = sigma <= POINT_TOLERANCE, abs(value) > _SIGNIFICANT * sigma
     low, high = np.rad2deg(np.min(angle)), np.rad2deg(np.max(angle))
     even = abs(low + high) < 0.01 * (high - low)
     field = f"+-{0.5 * (high - low):.4g} deg" if even else f"{low:.4g} to {high:.4g} deg"
@@ -189,9 +174,7 @@ def point_report(
         f"one sigma of it moves the edge of the field by {1e6 * edge:.2g} um against {1e6 * typical:.2g} um of noise"
     )
     if not fitted:
-        if "decentring" in names:
-            text = f"p is taken as zero: the tan^2 term was fitted as decentring, +- {1e3 * sigma:.2g} mm. {same}"
-        elif np.isfinite(sigma):
+        if np.isfinite(sigma):
             able = "observable" if observable else "not observable"
             text = f"p is taken as zero; fitted, it would be known to +- {1e3 * sigma:.2g} mm: {able} over {field}."
         else:
@@ -201,36 +184,15 @@ def point_report(
     elif significant:
         text = (
             f"{size}: a tan^2 term is there, but as a place of the principal point it is not observable over {field} to"
-            f" {1e6 * tolerance:.3g} um. {same}"
+            f" {1e6 * POINT_TOLERANCE:.3g} um. {same}"
         )
     else:
         text = f"{size}: not observable over {field}; {effect}; take p = 0 (eq. 3). {same}"
-    return PointReport(value, sigma, fitted, observable, significant, edge, typical, text)
+    return PointReport(observable, text)
 
 
-_CALIBRATION = ("constant", "principal_distance", "principal_point")
 # A principal distance with a larger relative sigma is no result; the angles are then nearly constant.
 _WORST_DISTANCE = 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class PrintedDistortion:
-    """Distortion by eq. (1), with f and p of eq. (2), or f of eq. (3) and p = 0.
-
-    distortion: (N,) m; covariance: (N, N) m^2, of rank N - 2 or N - 1. principal_distance, principal_point: m.
-    parameter_covariance: (2, 2) m^2 of f and p, zero for a p that was not fitted.
-    """
-
-    distortion: Array
-    covariance: Array
-    principal_distance: float
-    principal_point: float
-    parameter_covariance: Array
-
-    @property
-    def rms(self) -> float:
-        """Rms over the points, m."""
-        return float(np.sqrt(np.mean(self.distortion**2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,26 +200,22 @@ class InteriorOrientation:
     """Result of a fit over N points with P terms.
 
     terms: names as in `analysis.orientation.distortion_model.TERMS`. values: (P,) m. covariance: (P, P) m^2.
-    weighted: generalised least squares; else all points alike, with the sandwich covariance.
     angle, position: (N,) rad, m, as measured. noise: (N, N) m^2, of positions and angles together.
-    residual: (N,) m, position - model. residual_covariance: (N, N) m^2, of rank N - P.
-    chi_square: least sum of squares in the metric of the noise, whichever estimator was chosen; it has
-    degrees_of_freedom = N - P when model and noise are right. condition: of the columns scaled to length one.
+    residual: (N,) m, position - model.
+    chi_square: least sum of squares in the metric of the noise; it has degrees_of_freedom = N - P when model and noise
+    are right.
     point: about the principal point.
     """
 
     terms: tuple[str, ...]
     values: Array
     covariance: Array
-    weighted: bool
     angle: Array
     position: Array
     noise: Array
     residual: Array
-    residual_covariance: Array
     chi_square: float
     degrees_of_freedom: int
-    condition: float
     point: PointReport
 
     def value(self, term: str) -> float:
@@ -276,83 +234,16 @@ class InteriorOrientation:
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     @property
+    def residual_covariance(self) -> Array:
+        """(N, N), m^2, of rank N - P."""
+        columns = design(self.angle, self.terms)
+        left = np.eye(len(self.angle)) - columns @ gain(columns)
+        return np.asarray(left @ self.noise @ left.T)
+
+    @property
     def probability(self) -> float:
         """Chance of a chi-square at least this large if model and noise are right; nan without degrees of freedom."""
         return float(stats.chi2.sf(self.chi_square, self.degrees_of_freedom)) if self.degrees_of_freedom else np.nan
-
-    def printed(self, fit_principal_point: bool) -> PrintedDistortion:
-        """Eq. (1) with eq. (2), or with eq. (3) and p = 0, on the same readings and noise."""
-        terms = ("principal_distance", "principal_point")[: 2 if fit_principal_point else 1]
-        columns = design(self.angle, terms)
-        solve = gain(columns)
-        found = solve @ self.position
-        left = np.eye(len(self.position)) - columns @ solve
-        spread = np.zeros((2, 2))
-        spread[: len(terms), : len(terms)] = solve @ self.noise @ solve.T
-        return PrintedDistortion(
-            distortion=np.asarray(self.position - columns @ found),
-            covariance=np.asarray(left @ self.noise @ left.T),
-            principal_distance=float(found[0]),
-            principal_point=float(found[1]) if fit_principal_point else 0.0,
-            parameter_covariance=spread,
-        )
-
-    def curve(self, angle: ArrayLike, reference: Sequence[str] | None = None) -> tuple[Array, Array]:
-        """Smooth distortion and its sigma, each (...), m, at angles (...), rad: the model minus a calibration.
-
-        reference: None takes out the fitted constant, f and p and leaves radial terms and decentring. Names of these
-            three take out their best fit to the curve at the points of the test instead: ("principal_distance",) gives
-            distortion as by eq. (3), with ("principal_distance", "principal_point") as by eq. (2).
-        Errors are those of the fit; what the model does not hold shows in `residual`.
-        """
-        where = np.asarray(angle, dtype=np.float64)
-        rows = design(where, self.terms)
-        if reference is None:
-            rows = rows * np.array([term not in _CALIBRATION for term in self.terms])
-        else:
-            wrong = [term for term in reference if term not in _CALIBRATION]
-            if wrong or not reference:
-                raise OrientationError(f"distortion curve: reference must be names out of {_CALIBRATION}, or None")
-            taken = gain(design(self.angle, reference)) @ design(self.angle, self.terms)
-            rows = rows - design(where, reference) @ taken
-        variance = np.einsum("...i,ij,...j->...", rows, self.covariance, rows)
-        return np.asarray(rows @ self.values), np.sqrt(np.maximum(variance, 0.0))
-
-    def look_angle(self, position: ArrayLike) -> Array:
-        """Angle W (...), rad, that images to positions (...), m: the model inverted by Newton steps."""
-        target = np.asarray(position, dtype=np.float64)
-        angle = np.arctan((target - self.value("constant")) / self.value("principal_distance"))
-        for _ in range(20):
-            step = (target - design(angle, self.terms) @ self.values) / slope(angle, self.terms, self.values)
-            angle = angle + step
-            if np.all(np.abs(step) < 1e-15):
-                break
-        if not np.all(np.abs(angle) <= 2 * np.max(np.abs(self.angle))):
-            raise OrientationError(
-                "interior orientation: positions lie far beyond the field of the test, where the distortion is unknown"
-            )
-        return angle
-
-    def compensated(self, position: ArrayLike, reference: Sequence[str] | None = None) -> tuple[Array, Array]:
-        """Image coordinates (...), m, freed from the distortion `curve`, and the sigma of the correction, (...), m."""
-        removed, sigma = self.curve(self.look_angle(position), reference)
-        return np.asarray(np.asarray(position, dtype=np.float64) - removed), sigma
-
-    @property
-    def statements(self) -> tuple[str, ...]:
-        """Plain sentences for a report: fit, noise, principal point."""
-        n, dof = len(self.position), self.degrees_of_freedom
-        rms = 1e6 * float(np.sqrt(np.mean(self.residual**2)))
-        f, sigma = self.value("principal_distance"), self.sigma("principal_distance")
-        lines = [f"f = {1e3 * f:.4f} +- {1e3 * sigma:.2g} mm from {n} points; residual {rms:.3g} um rms."]
-        if dof:
-            text = f"Chi-square {self.chi_square:.4g} for {dof} degrees of freedom"
-            if self.probability < 1e-3:
-                text += ": the model lacks a term, or the noise is larger than stated"
-            elif self.probability > 1 - 1e-3:
-                text += ": the noise is smaller than stated"
-            lines.append(text + ".")
-        return (*lines, self.point.statement)
 
 
 def fit_interior_orientation(
@@ -362,13 +253,8 @@ def fit_interior_orientation(
     terms: Sequence[str] = ("constant", "principal_distance", "principal_point", "radial3"),
     *,
     angle_covariance: ArrayLike | None = None,
-    weighted: bool = False,
-    point_tolerance: float = 10e-6,
 ) -> InteriorOrientation:
-    """Least squares for the terms of the model, linear in all of them.
-
-    Raises OrientationError for bad readings or noise, fewer angles than terms, nearly constant angles, angles that
-    count against the positions; InseparableTermsError for terms that these angles cannot tell apart.
+    """Least squares for the terms of the model, linear in all of them, all points alike.
 
     Args:
         position: (N,), m.
@@ -377,9 +263,10 @@ def fit_interior_orientation(
         terms: names out of `TERMS`, with principal_distance among them.
         angle_covariance: the same of the angles, rad^2 or rad; it acts through dL/dW. Its effect on tan W itself
             (attenuation) is of the order (sigma_W / W)^2, below 1e-8, and left out.
-        weighted: generalised least squares instead of equal weights.
-        point_tolerance: m, sigma up to which p counts as observable; about a pixel, the size that paper 004 expects of
-            p.
+
+    Raises:
+        OrientationError: bad readings or noise, fewer angles than terms, nearly constant angles, angles that count
+            against the positions, terms that these angles do not separate.
     """
     where, turned = readings(position, angle)
     names = tuple(terms)
@@ -396,16 +283,15 @@ def fit_interior_orientation(
             f"interior orientation: {distinct} different angles for {len(names)} unknowns ({', '.join(names)}); measure"
             " at more angles or fit fewer terms"
         )
-    condition = condition_number(columns, names, turned)
-    first = gain(columns) @ where
-    noise = noise_matrix(covariance, len(where), "covariance")
-    if angle_covariance is not None:
-        rate = slope(turned, names, first)
-        noise = noise + rate[:, None] * noise_matrix(angle_covariance, len(where), "angle_covariance") * rate
-    root = noise_root(noise)
-    best = gain(columns, root)
-    solve = best if weighted else gain(columns)
+    _check_separable(columns, names, turned)
+    solve = gain(columns)
     values = solve @ where
+    noise = _noise_matrix(covariance, len(where), "covariance")
+    if angle_covariance is not None:
+        rate = slope(turned, names, values)
+        noise = noise + rate[:, None] * _noise_matrix(angle_covariance, len(where), "angle_covariance") * rate
+    root = _noise_root(noise)
+    best = gain(columns, root)
     spread = solve @ noise @ solve.T
     k = names.index("principal_distance")
     f, sigma = float(values[k]), float(np.sqrt(spread[k, k]))
@@ -419,21 +305,17 @@ def fit_interior_orientation(
             f"interior orientation: the principal distance comes out as {f:.6g} m; angles and spot positions count in"
             " opposite senses, change the sign of one of them"
         )
-    left = np.eye(len(where)) - columns @ solve
     return InteriorOrientation(
         terms=names,
         values=values,
         covariance=spread,
-        weighted=weighted,
         angle=turned,
         position=where,
         noise=noise,
         residual=where - columns @ values,
-        residual_covariance=left @ noise @ left.T,
         chi_square=float(np.sum(np.linalg.solve(root, where - columns @ (best @ where)) ** 2)),
         degrees_of_freedom=len(where) - len(names),
-        condition=condition,
-        point=point_report(names, values, turned, noise, weighted, point_tolerance),
+        point=_point_report(names, values, turned, noise),
     )
 
 
@@ -446,16 +328,13 @@ _STEPS = 20
 class LineOrientation:
     """Fit of `LINE_TERMS`.
 
-    values: (4,) rad, m, m, 1/m^2. covariance: (4, 4) in these units. residual: (N,) m, places minus model.
+    Attributes:
+        values: (4,), rad, m, m, 1/m^2.
+        covariance: (4, 4) in these units.
     """
 
     values: Array
     covariance: Array
-    residual: Array
-
-    def look_angle(self, position: ArrayLike) -> Array:
-        """W (...), rad, that images to positions (...), m."""
-        return _model(self.values, np.asarray(position, np.float64))[0]
 
     @property
     def sigma(self) -> Array:
@@ -495,6 +374,5 @@ def line_orientation(fit: InteriorOrientation) -> LineOrientation:
         values = values + step
         spread = solve @ fit.noise @ solve.T
         if np.all(np.abs(step) < 1e-6 * np.sqrt(np.diagonal(spread))):
-            angle, _, rate = _model(values, fit.position)
-            return LineOrientation(values, spread, -(fit.angle - angle) * rate)
+            return LineOrientation(values, spread)
     raise OrientationError("interior orientation: the line's principal point and distortion do not converge")

@@ -4,8 +4,8 @@ Of n readings one is rejected when so large a deviation from their mean is expec
 
     n P(|z| > |x - mean| / s) < 1/2,    s^2 = sum (x - mean)^2 / (n - 1),
 
-with the two-sided tail P of the normal distribution. The textbook rule is applied once. Applied again to what is left
-it finds errors that hid behind a larger one, but it also takes more of the good readings; so it is an option.
+with the two-sided tail P of the normal distribution. The rule is applied once, as in textbooks. Applied again to what
+is left it would find errors that hid behind a larger one, but it would also take more of the good readings.
 
 The rule always takes some good readings (of ten normal ones 0.28 on average), and takes the outermost, so that the RMS
 of those it leaves is too small. `normal_reduction` says by how much.
@@ -29,7 +29,7 @@ Radians. Nothing here knows the turntable's true error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -38,15 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import beta, chi2, norm
 
 from analysis.measurement_error import UndeterminedError
-from analysis.turntable.angle_fits import (
-    FITS,
-    GAP_ORDER,
-    AngleFit,
-    CrossValidation,
-    NotConvergedError,
-    cross_validate,
-    fit,
-)
+from analysis.turntable import angle_fits
 
 Array = NDArray[np.float64]
 FEWEST = 3
@@ -58,14 +50,11 @@ def limit(n: ArrayLike) -> Array:
     return np.asarray(norm.isf(0.25 / np.asarray(n, np.float64)))
 
 
-def chauvenet(
-    readings: ArrayLike, repeated: bool = False, present: NDArray[np.bool_] | None = None
-) -> NDArray[np.bool_]:
+def chauvenet(readings: ArrayLike, present: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
     """Which readings to keep, (..., n) bool.
 
     Args:
         readings: (..., n); the last axis holds the repeats of one quantity, in any unit.
-        repeated: apply the rule again to what is left, until nothing more goes.
         present: (..., n), which of them were taken, where quantities have different numbers of repeats; the others
             hold any finite number and are not kept. None for all.
 
@@ -77,18 +66,14 @@ def chauvenet(
         raise ValueError("Chauvenet's criterion: readings must be finite; leave failed readings out")
     keep = np.ones(x.shape, bool) if present is None else np.array(present, bool)
     x = np.where(keep, x, 0.0)
-    for _ in range(x.shape[-1] if repeated else 1):
-        count = keep.sum(-1, keepdims=True)
-        deviation = np.abs(x - np.mean(x, -1, keepdims=True, where=keep))
-        s = np.sqrt(np.sum(deviation**2, -1, keepdims=True, where=keep) / np.maximum(count - 1, 1))
-        # the comparison without a division: equal readings have s = 0 and stay
-        gross = keep & (deviation > limit(count) * s) & (count >= FEWEST)
-        # deviations of rounding size are not gross errors
-        gross &= deviation > 8.0 * np.finfo(float).eps * np.max(np.abs(x), -1, keepdims=True)
-        if not np.any(gross):
-            break
-        keep &= ~gross
-    return keep
+    count = keep.sum(-1, keepdims=True)
+    deviation = np.abs(x - np.mean(x, -1, keepdims=True, where=keep))
+    s = np.sqrt(np.sum(deviation**2, -1, keepdims=True, where=keep) / np.maximum(count - 1, 1))
+    # the comparison without a division: equal readings have s = 0 and stay
+    gross = (deviation > limit(count) * s) & (count >= FEWEST)
+    # deviations of rounding size are not gross errors
+    gross &= deviation > 8.0 * np.finfo(float).eps * np.max(np.abs(x), -1, keepdims=True)
+    return keep & ~gross
 
 
 def rejection_rate(n: int) -> float:
@@ -147,7 +132,6 @@ class CalibrationSeries:
         comparisons: reading - angle of the reference, (N, repeats), radians.
         reference_sigma: standard deviation of the reference's own error at one position, as its certificate states,
             radians. It is the same in all repeats.
-        repeated: apply Chauvenet's criterion until nothing more goes; the textbook applies it once.
         present: which comparisons were made, (N, repeats), where angles have different numbers of them; the others
             count for nothing. None for all.
     """
@@ -155,7 +139,6 @@ class CalibrationSeries:
     angle: Array
     comparisons: Array
     reference_sigma: float = 0.0
-    repeated: bool = False
     present: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
@@ -179,7 +162,7 @@ class CalibrationSeries:
     @cached_property
     def keep(self) -> NDArray[np.bool_]:
         """Comparisons that Chauvenet's criterion keeps, (N, repeats)."""
-        return chauvenet(self.comparisons, self.repeated, self.present)
+        return chauvenet(self.comparisons, self.present)
 
     @property
     def taken(self) -> NDArray[np.bool_]:
@@ -197,9 +180,19 @@ class CalibrationSeries:
         return self.comparisons.shape[1]
 
     @property
+    def gone(self) -> NDArray[np.bool_]:
+        """Comparisons that Chauvenet's criterion takes out, (N, repeats)."""
+        return self.taken & ~self.keep
+
+    @property
+    def from_mean(self) -> Array:
+        """Comparisons minus the mean of those that are kept at their angle, (N, repeats), radians."""
+        return self.comparisons - self.mean[:, None]
+
+    @property
     def rejected(self) -> int:
         """How many comparisons went."""
-        return int(np.sum(self.taken & ~self.keep))
+        return int(np.sum(self.gone))
 
     @cached_property
     def mean(self) -> Array:
@@ -280,40 +273,39 @@ class CalibrationSeries:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One fit with its cross-validation on the calibration points, or why there is none.
+    """One fit with its cross-validation on the calibration points."""
 
-    Attributes:
-        name: of the fit.
-        fit: None if it failed.
-        validation: None if it failed.
-        failure: what went wrong, "" if nothing did.
-    """
-
-    name: str
-    fit: AngleFit | None
-    validation: CrossValidation | None
-    failure: str = ""
+    fit: angle_fits.AngleFit
+    validation: angle_fits.CrossValidation
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """All trials in the order in which they were asked for, and the name of the one that is chosen."""
+    """The fits that were tried, and which of them is chosen.
 
-    trials: tuple[Trial, ...]
+    Attributes:
+        trials: name of a fit -> its trial, in the order in which they were asked for.
+        failed: name of a fit -> why it failed.
+        chosen: name of the fit with the smallest cross-validation RMS.
+    """
+
+    trials: Mapping[str, Trial]
+    failed: Mapping[str, str]
     chosen: str
 
     def __getitem__(self, name: str) -> Trial:
-        """The trial of a fit. Raises KeyError if there is none."""
-        for trial in self.trials:
-            if trial.name == name:
-                return trial
-        raise KeyError(name)
+        """The trial of a fit.
+
+        Raises:
+            KeyError: there is none of that name, or it failed.
+        """
+        return self.trials[name]
 
 
 def choose(
     series: CalibrationSeries,
     seed: int = 0,
-    names: Sequence[str] = tuple(FITS),
+    names: Sequence[str] = tuple(angle_fits.FITS),
     folds: int = 10,
     progress: Callable[[str], None] | None = None,
 ) -> Choice:
@@ -326,20 +318,20 @@ def choose(
         ValueError: fewer angles than a fit needs, or no fit succeeded.
     """
     say = progress or (lambda text: None)
-    trials = []
+    trials: dict[str, Trial] = {}
+    failed: dict[str, str] = {}
     for name in names:
         say(f"fit and cross-validate: {name.replace('_', ' ')}")
         points = series.angle, series.mean, series.sigma
         try:
-            trials.append(Trial(name, fit(name, *points, seed), cross_validate(name, *points, seed, folds)))
-        except NotConvergedError as error:
-            trials.append(Trial(name, None, None, str(error)))
-    good = {trial.name: trial.validation.rms for trial in trials if trial.validation is not None}
-    if not good:
-        raise UndeterminedError(
-            f"no fit of the dividing error succeeded: {'; '.join(t.failure for t in trials) or 'none asked'}"
-        )
-    return Choice(tuple(trials), min(good, key=lambda name: good[name]))
+            trials[name] = Trial(
+                angle_fits.fit(name, *points, seed), angle_fits.cross_validate(name, *points, seed, folds)
+            )
+        except angle_fits.NotConvergedError as error:
+            failed[name] = str(error)
+    if not trials:
+        raise UndeterminedError(f"no fit of the dividing error succeeded: {'; '.join(failed.values()) or 'none asked'}")
+    return Choice(trials, failed, min(trials, key=lambda name: trials[name].validation.rms))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +358,7 @@ class DividingCompensation:
             noise too.
     """
 
-    fit: AngleFit
+    fit: angle_fits.AngleFit
     step: float
     common: float
     smooth: float
@@ -417,10 +409,7 @@ def step_kernel(first: Array, second: Array, step: float) -> Array:
 
 
 def compensate(
-    series: CalibrationSeries,
-    choice: Choice,
-    held_out: CalibrationSeries | None = None,
-    name: str | None = None,
+    series: CalibrationSeries, choice: Choice, held_out: CalibrationSeries | None = None
 ) -> DividingCompensation:
     """The compensation of a chosen fit, with its misfit estimated from residuals beyond their noise.
 
@@ -437,18 +426,15 @@ def compensate(
         series: calibration.
         choice: what `choose` made of it.
         held_out: a separate series at other angles within the region.
-        name: another fit than the chosen one.
 
     Raises:
-        ValueError: that fit failed; held-out angles outside of the region.
+        ValueError: held-out angles outside of the region.
     """
-    trial = choice[name or choice.chosen]
-    if trial.fit is None or trial.validation is None:
-        raise UndeterminedError(f"compensation: {trial.failure}")
+    trial = choice[choice.chosen]
     excess = trial.validation.excess
     common = white = 0.0
     if held_out is not None:
-        excess /= 4.0 ** GAP_ORDER[trial.name]
+        excess /= 4.0 ** angle_fits.GAP_ORDER[choice.chosen]
         residual = held_out.mean - trial.fit(held_out.angle)
         noise = np.diag(held_out.sigma**2) + trial.fit.covariance(held_out.angle)
         common = max(0.0, float(np.mean(residual) ** 2 - np.mean(noise)))

@@ -41,7 +41,7 @@ class DesignError(PhysicalError, ValueError):
     """The constraints cannot be held together, or the start does not pass light.
 
     Attributes:
-        violated: kinds of the constraints that are not held, of ``constraint_values``; the one that is broken by the
+        violated: kinds of the constraints that are not held; the one that is broken by the
             largest share of what it asks for first.
     """
 
@@ -99,51 +99,58 @@ class Design:
         return rms_error(self.after) < (1.0 - LEAST_GAIN) * rms_error(self.before)
 
 
-def constraint_values(evaluation: Evaluation, operands: Operands) -> tuple[np.ndarray, list[str]]:
-    """Violations (C,), metres, positive when violated (the first, of the principal distance, in both directions), and
-    what each is about.
+def _violations(
+    operands: Operands, along: Any, across: Any, extents: np.ndarray, clearances: np.ndarray, share: float = 1.0
+) -> np.ndarray:
+    """Violations (C,), metres, positive when violated (the first, of the principal distance, in both directions).
+
+    Args:
+        operands: what is asked for.
+        along: principal distance, metres.
+        across: the same across the line, metres.
+        extents: (E,), metres.
+        clearances: (P,), metres.
+        share: of the limits. With 0 and derivatives in place of the numbers, variables last, it gives those of the
+            violations, (C, V).
     """
     out: list[Any] = []
-    names = []
     if operands.principal_distance is not None:
-        out.append(evaluation.principal_distance - operands.principal_distance)
-        names.append("principal distance")
+        out.append(along - share * operands.principal_distance)
     if operands.anamorphism is not None:
-        out += _anamorphism(evaluation.principal_distance, evaluation.distance_across, operands.anamorphism)
-        names += ["anamorphism"] * 2
+        out += [along - (1.0 + operands.anamorphism) * across, (1.0 - operands.anamorphism) * across - along]
     if operands.envelope is not None:
         # one constraint for each pair of surfaces: their largest alone would have a kink wherever two pairs are equal
-        out += list(evaluation.extents - operands.envelope)
-        names += ["envelope"] * len(evaluation.extents)
+        out += list(extents - share * operands.envelope)
     if operands.clearance is not None:
-        out += list(operands.clearance - evaluation.clearances)
-        names += ["clearance"] * len(evaluation.clearances)
-    return np.array(out), names
+        out += list(share * operands.clearance - clearances)
+    return np.array(out)
 
 
-def _anamorphism(along: Any, across: Any, most: float) -> list[Any]:
-    """By how much f along is above, and below, what f across allows, metres; of derivatives likewise."""
-    return [along - (1.0 + most) * across, (1.0 - most) * across - along]
+def _values(evaluation: Evaluation, operands: Operands) -> np.ndarray:
+    """Violations of an evaluation, (C,)."""
+    e = evaluation
+    return _violations(operands, e.principal_distance, e.distance_across, e.extents, e.clearances)
 
 
-def _constraint_slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
+def _slopes(evaluation: Evaluation, operands: Operands) -> np.ndarray:
     """Derivatives of the violations, (V, C)."""
-    assert evaluation.d_residuals is not None
-    columns: list[np.ndarray] = []
-    if operands.principal_distance is not None:
-        assert evaluation.d_principal_distance is not None
-        columns.append(evaluation.d_principal_distance)
-    if operands.anamorphism is not None:
-        assert evaluation.d_principal_distance is not None
-        assert evaluation.d_distance_across is not None
-        columns += _anamorphism(evaluation.d_principal_distance, evaluation.d_distance_across, operands.anamorphism)
-    if operands.envelope is not None:
-        assert evaluation.d_extents is not None
-        columns += list(evaluation.d_extents.T)
-    if operands.clearance is not None:
-        assert evaluation.d_clearances is not None
-        columns += list(-evaluation.d_clearances.T)
-    return np.stack(columns, axis=1) if columns else np.zeros((len(evaluation.d_residuals), 0))
+    e = evaluation
+    assert e.d_residuals is not None
+    assert e.d_extents is not None
+    assert e.d_clearances is not None
+    found = _violations(operands, e.d_principal_distance, e.d_distance_across, e.d_extents.T, e.d_clearances.T, 0.0)
+    return np.ascontiguousarray(found.reshape(-1, len(e.d_residuals)).T)
+
+
+def _asked(evaluation: Evaluation, operands: Operands) -> list[tuple[str, float]]:
+    """What each constraint is about, and what it asks for: metres, of the anamorphism a share of f."""
+    asked = (
+        ("principal distance", operands.principal_distance, 1),
+        ("anamorphism", operands.anamorphism, 2),
+        ("envelope", operands.envelope, len(evaluation.extents)),
+        ("clearance", operands.clearance, len(evaluation.clearances)),
+    )
+    return [(kind, limit) for kind, limit, count in asked if limit is not None for _ in range(count)]
 
 
 def _equations(operands: Operands, count: int) -> np.ndarray:
@@ -167,35 +174,6 @@ def judged(
         return merit, merit.evaluate(start)
     except (AimError, BeamMissedError) as error:
         raise DesignError(f"the prescription that the design starts from passes no light: {error}") from error
-
-
-def optimise(
-    backend: Backend,
-    start: Prescription,
-    variables: Sequence[Variable],
-    beams: Beams,
-    operands: Operands,
-    steps: int = 1,
-    iterations: int = ITERATIONS,
-    advance: Advance | None = None,
-) -> Design:
-    """Optimise a prescription from one start.
-
-    Args:
-        backend: where to trace.
-        start: where to begin; it must pass all light.
-        variables: what may vary, and within which bounds.
-        beams: fields and pupil.
-        operands: merit and constraints.
-        steps: of the envelope from the start's to the goal's.
-        iterations: of least squares, at most, at the last step.
-        advance: told (done, total) after each step.
-
-    Raises:
-        DesignError: the start passes no light or breaks a bound, or constraints cannot be held together.
-    """
-    merit, before = judged(backend, start, variables, beams, operands)
-    return descend(merit, start, before, start, variables, steps, iterations, advance)
 
 
 def descend(
@@ -252,15 +230,14 @@ def _step(
             found = merit.evaluate(start.with_values(variables, x * size), variables if differentiate else None)
         except (AimError, BeamMissedError):
             return None
-        g, _ = constraint_values(found, merit.operands)
+        g = _values(found, merit.operands)
         if found.d_residuals is None:
             return Sample(found.residuals, g)
-        slopes = _constraint_slopes(found, merit.operands) * size[:, None]
+        slopes = _slopes(found, merit.operands) * size[:, None]
         return Sample(found.residuals, g, found.d_residuals.T * size, slopes.T)
 
     x0 = start.values(variables) / size
-    count = len(constraint_values(merit.evaluate(start), merit.operands)[0])
-    equal = _equations(merit.operands, count)
+    equal = _equations(merit.operands, len(_values(merit.evaluate(start), merit.operands)))
     low, high = np.array([v.low for v in variables]) / size, np.array([v.high for v in variables]) / size
     found = constrained_least_squares(evaluate, x0, equal, low, high, iterations, SETTLED, 0.1 * HELD)
     return start.with_values(variables, found.x * size), found.jacobians, found.converged
@@ -286,13 +263,13 @@ def held_by(
         before: the start.
     """
     there = merit.evaluate(prescription, variables)
-    g, names = constraint_values(there, merit.operands)
-    if not len(g):
+    g, asked = _values(there, merit.operands), _asked(there, merit.operands)
+    if not asked:
         return ()
     assert there.d_residuals is not None
     size = _sizes(prescription, variables)
     fall = -2.0 * (there.d_residuals @ there.residuals) * size
-    slopes = _constraint_slopes(there, merit.operands) * size[:, None]
+    slopes = _slopes(there, merit.operands) * size[:, None]
     equal = _equations(merit.operands, len(g))
     at_limit = np.flatnonzero((g > -_AT_LIMIT) | equal)
     columns = [slopes[:, k] for k in at_limit]
@@ -301,22 +278,13 @@ def held_by(
         columns.append(-slopes[:, 0])
         owners.append(0)
     weights, _ = nnls(np.stack(columns, axis=1), fall)
-    start = constraint_values(before, merit.operands)[0]
+    start = _values(before, merit.operands)
     worth: dict[int, float] = {}
     for owner, weight in zip(owners, weights, strict=True):
         worth[owner] = worth.get(owner, 0.0) + float(weight) / (2.0 * rms_error(there))
-    limits = _limits(merit.operands, len(there.extents), len(there.clearances))
-    told = _constraint_names(merit, prescription, names)
-    found = [Held(told[k], limits[k], float(start[k]), gain) for k, gain in worth.items() if gain > 0.0]
+    told = _constraint_names(merit, prescription, [kind for kind, _ in asked])
+    found = [Held(told[k], asked[k][1], float(start[k]), gain) for k, gain in worth.items() if gain > 0.0]
     return tuple(sorted(found, key=lambda held: -held.worth))
-
-
-def _limits(operands: Operands, extents: int, clearances: int) -> list[float]:
-    """What every one of ``constraint_values`` asks for, metres."""
-    out = [] if operands.principal_distance is None else [operands.principal_distance]
-    out += [] if operands.anamorphism is None else [operands.anamorphism] * 2
-    out += [] if operands.envelope is None else [operands.envelope] * extents
-    return out + ([] if operands.clearance is None else [operands.clearance] * clearances)
 
 
 def _constraint_names(merit: MeritFunction, prescription: Prescription, names: Sequence[str]) -> list[str]:
@@ -368,13 +336,14 @@ _SMALLEST = {
 
 def _require_held(merit: MeritFunction, after: Evaluation) -> None:
     """Raise DesignError that names the constraints which are not held, the worst first."""
-    g, names = constraint_values(after, merit.operands)
+    g, asked = _values(after, merit.operands), _asked(after, merit.operands)
+    names = [kind for kind, _ in asked]
     violated = np.where(_equations(merit.operands, len(g)), np.abs(g), g)
     kinds = tuple(dict.fromkeys(name for value, name in zip(violated, names, strict=True) if not value < 50.0 * HELD))
     if not kinds:
         return
     worst = {kind: max((k for k, name in enumerate(names) if name == kind), key=violated.__getitem__) for kind in kinds}
-    limits = np.abs(_limits(merit.operands, len(after.extents), len(after.clearances)))
+    limits = np.abs([limit for _, limit in asked])
     limits = np.where(np.array(names) == "anamorphism", limits * after.distance_across, limits)
     kinds = tuple(sorted(kinds, key=lambda kind: -violated[worst[kind]] / max(limits[worst[kind]], HELD)))
     parts = [f"{kind} (off by {1e3 * g[worst[kind]]:.3g} mm)" for kind in kinds]

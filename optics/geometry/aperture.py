@@ -111,7 +111,7 @@ class Circle:
         return self.radius
 
     def grown(self, size: float) -> Circle:
-        """The same on a body of another size, 1 being the nominal one."""
+        """Return this shape on a body that has grown to another size, 1 being the nominal one."""
         return Circle(size * self.radius, (size * self.centre[0], size * self.centre[1]), size * self.inner)
 
     def outline(self, points: int = 96) -> np.ndarray:
@@ -140,7 +140,7 @@ class _TwoHalves:
         return min(self.half_x, self.half_y)
 
     def grown(self, size: float) -> Self:
-        """The same on a body of another size, 1 being the nominal one."""
+        """Return this shape on a body that has grown to another size, 1 being the nominal one."""
         return type(self)(*self._scaled(size), (size * self.centre[0], size * self.centre[1]))
 
     def _scaled(self, size: Any) -> tuple[Any, Any]:
@@ -287,7 +287,7 @@ class Edge:
 
 
 def turned_over(edge: Edge) -> Edge:
-    """The same edge told in a frame that is turned about its x by half a turn: y becomes -y."""
+    """Tell the edge in a frame that is turned about its x by half a turn: y becomes -y."""
     shape = edge.shape
     (x, y) = shape.centre
     if isinstance(shape, Polygon):

@@ -6,6 +6,7 @@ along (the corner in space, say). A polygon of fewer corners repeats one; a poly
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from optics.numerics.quadrature import gauss
 
 _NO_LIMIT = 1e30
-"""Of a side without length: finite, so that it can be multiplied."""
+"""Limit that a side without length gets: finite, so that it can be multiplied."""
 
 _AT_ONCE = 2**13
 """Nodes on boundaries worked on together: their polynomials stay in the cache."""
@@ -98,7 +99,7 @@ def clip(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np.ndar
 
 
 def widened(polygons: np.ndarray, corners: int) -> np.ndarray:
-    """The same polygons (N, V, D) with at least ``corners`` corners."""
+    """Polygons (N, V, D) with corners repeated so that each has at least ``corners``."""
     missing = corners - polygons.shape[1]
     if missing <= 0:
         return polygons
@@ -106,7 +107,7 @@ def widened(polygons: np.ndarray, corners: int) -> np.ndarray:
 
 
 def compact(polygons: np.ndarray) -> np.ndarray:
-    """The same polygons (N, V, D) without corners that repeat the one before them but for rounding."""
+    """Polygons (N, V, D) without corners that repeat the one before them but for rounding."""
     step = polygons[..., :2] - np.roll(polygons[..., :2], 1, axis=1)
     kept = np.hypot(step[..., 0], step[..., 1]) > _SAME
     return _packed(polygons, kept)
@@ -159,13 +160,18 @@ def intersect(polygons: np.ndarray, normal: np.ndarray, limit: np.ndarray) -> np
     return polygons
 
 
-def difference(polygons: np.ndarray, holes: np.ndarray) -> list[np.ndarray]:
+def difference(polygons: np.ndarray, holes: np.ndarray, order: Iterable[int] | None = None) -> list[np.ndarray]:
     """What is left of each convex polygon (N, V, D) outside of a counterclockwise convex one (N, W, D): some convex
     pieces, (N, ., D) each, many of them empty.
+
+    Args:
+        polygons: convex.
+        holes: counterclockwise, convex.
+        order: in which the holes' sides are cut along, one piece for each; from the first to the last if not given.
     """
     normal, limit = sides(holes)
     out = []
-    for w in range(limit.shape[1]):
+    for w in range(limit.shape[1]) if order is None else order:
         out.append(clip(polygons, -normal[:, w], -limit[:, w]))
         polygons = clip(polygons, normal[:, w], limit[:, w])
     return out

@@ -13,14 +13,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from optics.geometry.zernike import (
-    cartesian_terms,
-    order_of,
-    triangle_index,
-    triangle_polynomial,
-    triangle_size,
-    zernike,
-)
+from optics.geometry import zernike
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -107,14 +100,14 @@ class XYPolynomial:
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Height and slopes."""
-        coefficients: list[Any] = [0.0] * triangle_size(4)
+        coefficients: list[Any] = [0.0] * zernike.triangle_size(4)
         for (a, b), c in self._terms().items():
-            coefficients[triangle_index(a, b)] = c
-        return triangle_polynomial(x, y, coefficients, 4)
+            coefficients[zernike.triangle_index(a, b)] = c
+        return zernike.triangle_polynomial(x, y, coefficients, 4)
 
 
 LAST_NOLL = 36
-"""Of the Zernike terms of a sag: all to radial order 7."""
+"""Highest Noll index of a sag's Zernike terms: all to radial order 7."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +170,7 @@ class ZernikeSag:
         if not self.radius:
             return np.zeros(np.broadcast_shapes(np.shape(x), np.shape(y)))
         u, v = (np.asarray(x) - self.x0) / self.radius, (np.asarray(y) - self.y0) / self.radius
-        return np.asarray(sum(a * zernike(j, u, v) for j, a in self.amplitudes.items()))
+        return np.asarray(sum(a * zernike.zernike(j, u, v) for j, a in self.amplitudes.items()))
 
     def height(self, x: Any, y: Any) -> tuple[Any, Any, Any]:
         """Height and slopes."""
@@ -185,13 +178,13 @@ class ZernikeSag:
 
         none = self.radius == 0.0
         scale = dr.select(none, 0.0, 1.0 / dr.select(none, 1.0, self.radius))
-        order = order_of(range(1, LAST_NOLL + 1))
-        coefficients: list[Any] = [0.0] * triangle_size(order)
+        order = zernike.order_of(range(1, LAST_NOLL + 1))
+        coefficients: list[Any] = [0.0] * zernike.triangle_size(order)
         for j, amplitude in self.amplitudes.items():
-            for a, b, c in cartesian_terms(j):
-                place = triangle_index(a, b)
+            for a, b, c in zernike.cartesian_terms(j):
+                place = zernike.triangle_index(a, b)
                 coefficients[place] = coefficients[place] + c * amplitude
-        height, slope_x, slope_y = triangle_polynomial(
+        height, slope_x, slope_y = zernike.triangle_polynomial(
             (x - self.x0) * scale, (y - self.y0) * scale, coefficients, order
         )
         return height, slope_x * scale, slope_y * scale

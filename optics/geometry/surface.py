@@ -35,7 +35,7 @@ class ZernikeFigure:
         object.__setattr__(self, "terms", FrozenMap({int(k): float(v) for k, v in self.terms.items()}))
 
     def numbers(self, order: int) -> FigureNumbers:
-        """The same as a polynomial of an order that is at least the figure's own, ``order``."""
+        """Write the figure as a polynomial of an order that is at least the figure's own, ``order``."""
         return FigureNumbers(*self.centre, tuple(zernike.monomials(self.terms, order, self.radius)))
 
     @property
@@ -99,7 +99,7 @@ class GridFigure:
         return GridFigure(self.values + other.values, self.bounds)
 
     def sampled_as(self, other: GridFigure) -> GridFigure:
-        """The same figure on the samples of another one."""
+        """Resample the figure on the grid of another one."""
         x0, x1, y0, y1 = other.bounds
         rows, columns = other.values.shape
         x, y = np.meshgrid(np.linspace(x0, x1, columns), np.linspace(y0, y1, rows))
@@ -354,7 +354,7 @@ class Surface:
         return self.figure if isinstance(self.figure, GridFigure) else None
 
     def with_figure(self, figure: Figure | None) -> Surface:
-        """The same shape with another figure."""
+        """Return the shape with another figure."""
         return replace(self, figure=figure)
 
     def grown(self, scale: float) -> Surface:

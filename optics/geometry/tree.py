@@ -101,7 +101,7 @@ class Motion:
 
 
 AT_REST = Motion()
-"""Of a body that a state does not name."""
+"""Motion of a body that a state does not name."""
 
 State = Mapping[str, Motion]
 """A perturbed state: body path -> motion; bodies not named stand at their nominal pose."""
@@ -238,7 +238,7 @@ class RigidTree:
 
     @cached_property
     def _nominal_complex(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same as complex sums round it."""
+        """Nominal poses as complex sums round them."""
         return self._at_rest(np.complex128)
 
     def _at_rest(self, dtype: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -103,11 +103,6 @@ class Finish:
             raise ValueError("more than all of the light would come back")
 
     @property
-    def absorptance(self) -> float:
-        """Share that stays in the surface (below the critical angle)."""
-        return 0.0 if self.bare else max(0.0, 1.0 - self.reflectance - self.transmission - self.diffuse)
-
-    @property
     def numbers(self) -> tuple[float, ...]:
         """reflectance, transmission, bare, diffuse, and the lobe's share, scale, exponent, kind."""
         lobe = (0.0, 1.0, 2.0, 0.0) if self.scatter is None else self.scatter.lobe.numbers

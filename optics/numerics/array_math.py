@@ -38,12 +38,12 @@ def norm(vector: np.ndarray) -> np.ndarray:
 
 
 def determinant(matrix: np.ndarray) -> np.ndarray:
-    """Of 2 x 2 matrices (..., 2, 2)."""
+    """Determinants of 2 x 2 matrices (..., 2, 2)."""
     return np.asarray(matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0])
 
 
 def inverse(matrix: np.ndarray) -> np.ndarray:
-    """Of 2 x 2 matrices (..., 2, 2) by Cramer's rule; not finite where they are singular."""
+    """Inverses of 2 x 2 matrices (..., 2, 2) by Cramer's rule; not finite where they are singular."""
     (a, b), (c, d) = np.moveaxis(np.asarray(matrix), (-2, -1), (0, 1))
     adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
     with np.errstate(divide="ignore", invalid="ignore"):

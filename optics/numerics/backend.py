@@ -111,10 +111,4 @@ def load_backend(name: str = "llvm") -> Backend:
         )
         raise BackendUnavailable(f"the {name} backend is not available on this machine: {remedy}")
     types = importlib.import_module(f"drjit.{name}.ad")
-    return Backend(
-        name=name,
-        Float=types.Float64,
-        UInt=types.UInt32,
-        Bool=types.Bool,
-        Vector3=types.Array3f64,
-    )
+    return Backend(name=name, Float=types.Float64, UInt=types.UInt32, Bool=types.Bool, Vector3=types.Array3f64)

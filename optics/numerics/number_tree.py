@@ -65,7 +65,7 @@ def _mapped(function: Callable[..., Any], tree: Any, others: tuple[Any, ...]) ->
 
 
 def _mapped_alone(function: Callable[[Any], Any], tree: Any) -> Any:
-    """Of one tree. Every trace does this to hundreds of numbers, most of which stand beside one another."""
+    """Map the leaves of one tree. Every trace does this to hundreds of numbers, most of which stand side by side."""
     whole, names = isinstance(tree, tuple), _names(tree.__class__)
     if not whole and names is None:
         return function(tree)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -94,10 +92,6 @@ class Element:
         except ValueError as error:
             raise ValueError(f"element {self.name!r}: {error}") from None
 
-    def with_aperture(self, aperture: Aperture | None) -> Element:
-        """The same element with another aperture."""
-        return replace(self, aperture=aperture)
-
 
 @dataclass(frozen=True)
 class Assembly:
@@ -136,11 +130,6 @@ class Assembly:
         object.__setattr__(self, "media", FrozenMap(self.media))
         object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
 
-    @cached_property
-    def known_numbers(self) -> dict[Any, Any]:
-        """What `optics.raytrace.system` has worked out of elements as designed; it depends on nothing but this."""
-        return {}
-
     def sequence(self, name: str) -> tuple[Element, ...]:
         """The elements of a named sequence.
 
@@ -152,10 +141,6 @@ class Assembly:
     def with_element(self, element: Element) -> Assembly:
         """A copy in which the element of that name is replaced or added."""
         return replace(self, elements={**self.elements, element.name: element})
-
-    def with_sequence(self, name: str, names: Sequence[str]) -> Assembly:
-        """A copy with one more sequence."""
-        return replace(self, sequences={**self.sequences, name: tuple(names)})
 
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None

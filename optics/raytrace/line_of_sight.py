@@ -78,29 +78,6 @@ def chief_rays(
     return places, leaving
 
 
-def chief_directions(
-    backend: Backend,
-    to_stop: SystemBatch,
-    to_object: SystemBatch,
-    points: np.ndarray,
-    guess: np.ndarray,
-    transverse: np.ndarray,
-    start: tuple[np.ndarray, np.ndarray] | None = None,
-) -> np.ndarray:
-    """Object-space directions of ``chief_rays``, toward the scene, world, (B, M, 3).
-
-    Args:
-        backend: where to trace.
-        to_stop: B systems from the image to the stop.
-        to_object: the same systems from the image to the scene.
-        points: image points, world, (B, M, 3), metres.
-        guess: rough direction from the image to the last mirror, broadcastable to (B, M, 3).
-        transverse: direction near which the first transverse axis is taken, (3,).
-        start: as of `aim_chief_rays`.
-    """
-    return chief_rays(backend, to_stop, to_object, points, guess, transverse, start)[1]
-
-
 @dataclass(frozen=True, eq=False)
 class LineChange:
     """True change of a line camera against its nominal state, for B states.

@@ -199,11 +199,7 @@ def prism_0(mount: Mount) -> ReflectorParts:
     """
     shift, width = mount.length, mount.width
     half = 0.5 * width + EDGE
-    if shift < half + 0.5 * width:
-        raise UnphysicalError(
-            f"{mount.path}: a rhomboid of width {1e3 * width:.4g} mm cannot displace the beam by only "
-            f"{1e3 * shift:.4g} mm; at least {1e3 * (half + 0.5 * width):.4g} mm"
-        )
+    _require_length(mount, "a rhomboid", "displace", half + 0.5 * width)
     x = 0.5 * shift
     planes: list[Plane] = [
         ("entry", (0, 0, -1), (-x, 0, -half), Coating.TRANSMITTING),
@@ -234,22 +230,12 @@ def hollow_transfer(mount: Mount) -> ReflectorParts:
     x, y, height = 0.5 * length, hand * off, apex[2] - 0.5 * length
     # how far roof_a reaches back along the transfer, over the ridge's side, and the mirror toward it
     least = sqrt(2.0) * off + (sqrt(3.0) + 1.0) * half + 3.0 * (EDGE + _thickness(width))
-    if length < least:
-        raise UnphysicalError(
-            f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot transfer the beam by only "
-            f"{1e3 * length:.4g} mm; at least {1e3 * least:.4g} mm"
-        )
+    _require_length(mount, "mirrors", "transfer", least)
     up, along, turned = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.5, -hand * _S, -0.5])
     mirrors = [
-        (Passage("mirror", "mirror", Interaction.REFLECT, np.array([-x, y, height]), up), (1, 0, -1)),
-        (
-            Passage("roof_a", "roof_a", Interaction.REFLECT, np.array([x - sqrt(2.0) * off, y, height]), along),
-            (-_S, -hand, -_S),
-        ),
-        (
-            Passage("roof_b", "roof_b", Interaction.REFLECT, np.array([x, -y, height - sqrt(2.0) * off]), turned),
-            (-_S, hand, -_S),
-        ),
+        (_mirror("mirror", [-x, y, height], up), (1, 0, -1)),
+        (_mirror("roof_a", [x - sqrt(2.0) * off, y, height], along), (-_S, -hand, -_S)),
+        (_mirror("roof_b", [x, -y, height - sqrt(2.0) * off], turned), (-_S, hand, -_S)),
     ]
     return _on_frame(mount, mirrors, apex, 2)
 
@@ -274,23 +260,31 @@ def periscope(mount: Mount) -> ReflectorParts:
         ValueError: the displacement is so small that one stands in the other's beam.
     """
     shift, width = mount.length, mount.width
-    least = width + 2.0 * (EDGE + _thickness(width))
-    if shift < least:
-        raise UnphysicalError(
-            f"{mount.path}: mirrors of width {1e3 * width:.4g} mm cannot displace the beam by only "
-            f"{1e3 * shift:.4g} mm; at least {1e3 * least:.4g} mm"
-        )
+    _require_length(mount, "mirrors", "displace", width + 2.0 * (EDGE + _thickness(width)))
     x, along_z, along_x = 0.5 * shift, np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
     mirrors = [
-        (Passage("mirror_a", "mirror_a", Interaction.REFLECT, -x * along_x, along_z), (1, 0, -1)),
-        (Passage("mirror_b", "mirror_b", Interaction.REFLECT, x * along_x, along_x), (-1, 0, 1)),
+        (_mirror("mirror_a", [-x, 0.0, 0.0], along_z), (1, 0, -1)),
+        (_mirror("mirror_b", [x, 0.0, 0.0], along_x), (-1, 0, 1)),
     ]
     return _on_frame(mount, mirrors, (0.0, 0.0, 0.0), 1)
 
 
+def _require_length(mount: Mount, what: str, does: str, least: float) -> None:
+    """Refuse a reflector whose parts would cut the beam, since it displaces it by less than ``least`` metres."""
+    if mount.length < least:
+        width, length = 1e3 * mount.width, 1e3 * mount.length
+        text = f"{mount.path}: {what} of width {width:.4g} mm cannot {does} the beam by only {length:.4g} mm"
+        raise UnphysicalError(f"{text}; at least {1e3 * least:.4g} mm")
+
+
 def _thickness(width: float) -> float:
-    """Of a mirror's plate, metres: an eighth of its length, which is sqrt(2) times the beam's width."""
+    """Thickness of a mirror's plate, metres: an eighth of its length, which is sqrt(2) times the beam's width."""
     return 0.18 * width
+
+
+def _mirror(name: str, place: Sequence[float], direction: np.ndarray) -> Passage:
+    """What the beam does at a mirror of its own face."""
+    return Passage(name, name, Interaction.REFLECT, np.array(place), direction)
 
 
 def _on_frame(
@@ -394,16 +388,8 @@ def _faces(
         centre = np.zeros(3) if passage.face in shared else frame.inverse().apply(passage.place)
         cosine = abs(float(inner(frame.rotation[:, 2], passage.direction)))
         aperture = Ellipse(0.5 * width / cosine, 0.5 * width, (float(centre[0]), float(centre[1])))
-        elements.append(
-            Element(
-                f"{mount.key}/{passage.name}",
-                _footprint(path, passage, shared),
-                plane(),
-                passage.interaction,
-                aperture,
-                solid=solid,
-            )
-        )
+        name, body = f"{mount.key}/{passage.name}", _footprint(path, passage, shared)
+        elements.append(Element(name, body, plane(), passage.interaction, aperture, solid=solid))
     return tuple(bodies), tuple(elements), tuple(faces)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -70,7 +71,7 @@ class FrameNumbers:
 
     @property
     def coordinates(self) -> tuple[CoordinateNumbers, CoordinateNumbers, CoordinateNumbers]:
-        """Of x, y and z."""
+        """Numbers of the coordinates x, y and z."""
         return self.x, self.y, self.z
 
 
@@ -124,18 +125,11 @@ def media_along(chain: Sequence[Element]) -> list[Medium]:
 def structure_of(elements: Sequence[Element], states: Sequence[State], graded: tuple[bool, bool]) -> Structure:
     """Common structure of the i-th elements of all chains."""
     grid = any(_has_grid(e, states) for e in elements)
-    kinds = {
-        (
-            e.interaction,
-            e.surface.is_plane,
-            None if e.aperture is None else type(e.aperture.numbers()),
-        )
-        for e in elements
-    }
+    apertures = [None if e.aperture is None else type(e.aperture.numbers()) for e in elements]
+    kinds = {(e.interaction, e.surface.is_plane, own) for e, own in zip(elements, apertures, strict=True)}
     if len(kinds) != 1:
-        raise ValueError(
-            f"elements of different kinds cannot be batched: {', '.join(sorted(e.name for e in elements))}"
-        )
+        names = ", ".join(sorted(e.name for e in elements))
+        raise ValueError(f"elements of different kinds cannot be batched: {names}")
     interaction, is_plane, aperture = kinds.pop()
     # a plane may have terms that are zero, and the terms that a surface lacks are
     terms = kinds_of([term for e in elements for term in e.surface.terms])
@@ -217,12 +211,7 @@ def numbers_of(
 
 
 def _index_numbers(
-    assembly: Assembly,
-    element: Element,
-    medium: Medium,
-    graded: bool,
-    states: Sequence[State],
-    placed: PlacedBodies,
+    assembly: Assembly, element: Element, medium: Medium, graded: bool, states: Sequence[State], placed: PlacedBodies
 ) -> IndexNumbers:
     """Index (S,) of a medium beside an element, with its gradient in the element's frame where it is graded."""
     if medium.solid is None:
@@ -406,7 +395,7 @@ class Poses:
     translation: np.ndarray
 
     def last(self) -> FrameNumbers:
-        """Of the last elements."""
+        """Poses of the last elements."""
         return FrameNumbers.of(self.rotation[:, -1], self.translation[:, -1])
 
 
@@ -489,11 +478,8 @@ def assemble(
     graded = {path for state in states for path, motion in state.items() if any(motion.index_gradient)}
     structures = []
     for i in range(len(chains[0])):
-        gradients = (
-            any(m[i].solid in graded for m in media),
-            any(m[i + 1].solid in graded for m in media),
-        )
-        structures.append(structure_of([chain[i] for chain in chains], states, gradients))
+        before, after = (any(m[k].solid in graded for m in media) for k in (i, i + 1))
+        structures.append(structure_of([chain[i] for chain in chains], states, (before, after)))
     real = step is None and not np.iscomplexobj(placed.rotation)
     touched = touched_bodies(assembly, states, placed) if real else None
 
@@ -504,13 +490,12 @@ def assemble(
         if touched is None or any(not touched.isdisjoint(bodies_of(chain, i, along)) for chain, along in parts):
             return None
         key = (i, tuple(tuple(element.name for element in chain[: i + 2]) for chain in chains), structures[i])
-        known = assembly.known_numbers
+        known = _known_numbers(assembly)
         if key not in known:
             nominal = assembly.place()
             own = [numbers_of(assembly, c, i, m, structures[i], ({},), nominal, None) for c, m in parts]
             known[key] = KeptNumbers(_joined(own))
-        out: KeptNumbers = known[key]
-        return out
+        return known[key]
 
     def joined(i: int, known: KeptNumbers | None) -> ElementNumbers:
         """The numbers of the i-th elements of all chains."""
@@ -544,6 +529,12 @@ def assemble(
         len(states),
         tuple(known if len(states) == 1 else None for known in kept),
     )
+
+
+@lru_cache(maxsize=16)
+def _known_numbers(assembly: Assembly) -> dict[Any, KeptNumbers]:
+    """What ``assemble`` has worked out of the elements of an assembly as designed; kept for those used last."""
+    return {}
 
 
 def _joined(parts: Sequence[Numbers]) -> Numbers:

@@ -81,7 +81,7 @@ class GradedRay:
         return cls(p, tangent, index, gradient, along, gx * gx + gy * gy + gz * gz)
 
     def detached(self) -> GradedRay:
-        """The same without derivatives."""
+        """Return the rays without derivatives."""
         import drjit as dr
 
         return GradedRay(
@@ -133,8 +133,8 @@ below 1e-3, so that each step gains at least six digits; three reach rounding. A
 invalid."""
 
 FURTHER_STEPS = 2
-"""As many more for a surface with further terms of its sag, and for an aspheric face of a lens, which may depart by
-millimetres."""
+"""As many further Newton steps for a surface with further terms of its sag, and for an aspheric face of a lens, which
+may depart by millimetres."""
 
 SECTION = 6
 """Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and

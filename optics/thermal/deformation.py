@@ -95,7 +95,7 @@ class Finder:
         return self._last[1]
 
     def _found(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As ``shapes``, by a search."""
+        """Shape functions as ``shapes`` gives them, found by a search."""
         best = np.full(len(points), np.inf)
         cell = np.zeros(len(points), int)
         place = np.zeros_like(points)

@@ -210,7 +210,7 @@ def _skin_area(nodes: np.ndarray, tetrahedra: np.ndarray) -> float:
 
 
 _Edges = list[tuple[int, int]]
-"""Of one face, numbers of corners, each with the face on its left when seen from outside."""
+"""Triangles of one face: numbers of corners, each with the face on its left when seen from outside."""
 
 
 def _apart(points: np.ndarray, least: float) -> np.ndarray:

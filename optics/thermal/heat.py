@@ -30,7 +30,7 @@ class Temperature:
         return float(self.change + np.dot(self.gradient, point))
 
     def seen_from(self, child: Pose) -> Temperature:
-        """The same field in the frame of a body that stands at ``child`` in this one's frame."""
+        """Tell the field in the frame of a body that stands at ``child`` in this one's frame."""
         return Temperature(self.at(child.translation), triple(child.rotation.T @ np.array(self.gradient)))
 
 

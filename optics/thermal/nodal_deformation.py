@@ -44,7 +44,7 @@ WIDEST_GAP = 4.0
 """Distance from a place of the aperture to its nearest node, in mean spacings of the nodes, that is refused."""
 LARGEST_GROWTH = 0.02
 LARGEST_FIGURE = 1e-3
-"""Of the change of sag, metres: beyond that a table has another unit or another frame than is told."""
+"""Largest change of sag, metres: beyond that a table has another unit or another frame than is told."""
 PRINTED = 0.3
 """Share of the residual that nodes left out may contradict before it is called the mesh's."""
 SEEN = 1e-9
@@ -120,7 +120,7 @@ class NodalDeformation:
         return self.between > SEEN and self.between > PRINTED * self.rms(self.residual)
 
     def motion(self) -> Motion:
-        """The same as a motion of the face's body."""
+        """Return the deformation as a motion of the face's body."""
         return Motion(self.rotate, self.shift, figure=self.figure, stretch=self.growth, grid=self.grid)
 
 

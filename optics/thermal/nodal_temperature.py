@@ -21,9 +21,10 @@ from optics.thermal.nodal_deformation import LEAST_NODES, NodesError
 MOST_WARM_NODES = 200_000
 """More take Delaunay's triangulation minutes."""
 FLAT = 1e-6
-"""Of the longest extent: nodes within a layer so thin lie in a plane."""
+"""Share of the longest extent: nodes within a layer so thin lie in a plane."""
 _JITTER = 1e-7
-"""Of the extents, by which nodes are moved before they are triangulated: a lattice leaves its tetrahedra a choice."""
+"""Share of the extents by which nodes are moved before they are triangulated: a lattice leaves its tetrahedra a choice.
+"""
 _EDGE = 1e-6
 """Barycentric coordinate down to which a place counts as inside of the outermost tetrahedra."""
 _MOST_STEPS = 2000
@@ -148,7 +149,7 @@ class NodalTemperature:
 
     @property
     def departures(self) -> np.ndarray:
-        """Of the nodes from the linear fit, kelvin, (N,)."""
+        """Departures of the nodes from the linear fit, kelvin, (N,)."""
         return self._rest
 
     def departure(self) -> float:

@@ -214,7 +214,7 @@ class ElasticBody:
         return out.reshape(-1, 3)
 
     def _supported(self, values: np.ndarray, support: Kinematic) -> np.ndarray:
-        """The same deformation, moved rigidly to where the support lets it be."""
+        """Move a deformation rigidly to where the support lets it be."""
         at_points = Displacement(self.nodes, values, self._finder).at(support.points)
         modes = rigid_modes(support.points).reshape(6, 3, 3)
         matrix = np.stack([support.released(mode) for mode in modes], axis=-1)

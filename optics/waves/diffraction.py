@@ -1,4 +1,4 @@
-"""Diffraction images: the matrix Fourier transform of a traced pupil onto a detector's own grid, and Huygens' sum.
+"""Diffraction images: the matrix Fourier transform of a traced pupil onto a detector's own grid.
 
 Convention: time factor exp(-i w t), a wave of phase exp(+i k L) with L its optical path.
 
@@ -46,7 +46,7 @@ class PupilField:
         return PupilField(self.u[piece], self.v[piece], self.eikonal[piece], self.amplitude[piece], self.wavelength)
 
     def in_lengths_of(self, size: np.ndarray) -> PupilField:
-        """The same images in coordinates x / size, y / size: those of pixels that have grown by ``size``, (B,).
+        """Tell the images in coordinates x / size, y / size: those of pixels that have grown by ``size``, (B,).
 
         Phases u x + v y stay, and so does the power: an image is then photons per area of the nominal pixels.
         """
@@ -216,46 +216,6 @@ def _waves(frequency: np.ndarray, grid: Grid, factor: np.ndarray | float, kind: 
         np.multiply(out[..., :more], turn.astype(kind)[..., None], out=out[..., done : done + more])
         turn = turn * turn
         done += more
-    return out
-
-
-def huygens(
-    points: np.ndarray,
-    path: np.ndarray,
-    direction: np.ndarray,
-    amplitude: np.ndarray,
-    wavelength: float,
-    pixels: np.ndarray,
-    normal: np.ndarray | None = None,
-    chunk: int = 256,
-) -> np.ndarray:
-    """Irradiance by Huygens' sum of spherical wavelets from points on the exit wavefront; slow, the check of ``image``.
-
-    Args:
-        points: (N, 3) points on the exit reference sphere, metres.
-        path: (N,) optical path at these points.
-        direction: (N, 3) unit ray directions there.
-        amplitude: (N,) area element times field amplitude at the points (m^2 * field).
-        wavelength: metres.
-        pixels: (M, 3) points where the irradiance is wanted.
-        normal: (3,) unit normal of the detector: each wavelet counts with the root of the cosine of its incidence, so
-            that the result is power per detector area, as in ``image``; None: square to the light.
-        chunk: pixels done at once, to bound memory.
-
-    Returns:
-        (M,) irradiance, 1/m^2 for unit power (sum amplitude * field = 1).
-    """
-    k = 2.0 * np.pi / wavelength
-    out = np.empty(len(pixels))
-    for start in range(0, len(pixels), chunk):
-        arm = pixels[start : start + chunk, None, :] - points[None]
-        distance = np.linalg.norm(arm, axis=-1)
-        obliquity = np.einsum("mnx,nx->mn", arm, direction) / distance
-        if normal is not None:
-            obliquity = obliquity * np.sqrt(np.abs(arm @ normal) / distance)
-        phase = k * ((path - path[0]) + (distance - distance[:, :1]))
-        field = np.sum(amplitude * obliquity / distance * np.exp(1j * phase), axis=1) / wavelength
-        out[start : start + chunk] = np.abs(field) ** 2
     return out
 
 

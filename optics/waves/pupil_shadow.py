@@ -27,11 +27,11 @@ from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 
 RIM_SIDES = 256
-"""Of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of it
-takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
+"""Sides of the polygon that stands for the pupil's edge where it meets a shadow. It has the edge's area; what an arc of
+it takes of a shadow is right to some 1e-6 of a round pupil, and where the same arc cuts twice to 4e-6."""
 
 FEW_SIDES = 64
-"""The same for many pupils at once: 16 times the errors."""
+"""Sides of that polygon for many pupils at once: 16 times the errors."""
 
 LARGEST = 0.5
 """Size of a piece, in radii of the pupil: a wavefront is continued from a piece to its box, the corners of which may
@@ -48,6 +48,10 @@ _TURNED = 1e-12
 
 _ROUND = 1e-10
 """Term of an edge's radius, below which it is none."""
+
+_ROOM = 1e-5
+"""By which the area of a part of a polygon may leave what is possible, of a pupil of radius 1: arcs are integrated by
+Gauss' rule."""
 
 SMALLEST = 1e-9
 """Area of a piece, of a pupil of radius 1, below which it is nothing."""
@@ -79,7 +83,7 @@ class PupilShadow:
 
     @property
     def area(self) -> np.ndarray:
-        """Of each pupil's shadow, (B,), in p."""
+        """Area of each pupil's shadow, (B,), in p."""
         return np.asarray(np.sum(area(self.pieces), axis=-1))
 
     @cached_property
@@ -120,7 +124,7 @@ class PupilShadow:
         return points.reshape(*shift.shape, -1), weights.reshape(*shift.shape, -1)
 
     def parts(self, shift: np.ndarray, count: int) -> ShadowParts:
-        """The same as ``overlap``, part by part."""
+        """Quadrature as ``overlap`` gives it, part by part."""
         moves = np.stack([shift.real, shift.imag], axis=-1)
         full = area(self.pieces) > SMALLEST
         points, weights = self.whole(count)
@@ -188,21 +192,26 @@ class ShadowParts:
     weights: np.ndarray
 
 
-def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
+def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarray, list[int]]:
     """Pieces that do not overlap.
 
     Args:
         polygons: convex, counterclockwise, (B, V, 2) each.
+        fewest: take the largest polygons first and cut each other one along the sides that cut off most, which leaves
+            few pieces of polygons with many sides.
 
     Returns:
         Pieces (B, K, W, 2), and of which polygon each is; what several share belongs to the first.
     """
     done: list[np.ndarray] = []
     owners: list[int] = []
-    for number, polygon in enumerate(polygons):
-        parts = [polygon]
+    order = range(len(polygons))
+    if fewest:
+        order = sorted(order, key=lambda number: -float(np.mean(area(polygons[number]))))
+    for number in order:
+        parts = [polygons[number]]
         for before in done:
-            parts = [rest for part in parts for rest in _without(part, before)]
+            parts = [rest for part in parts for rest in _without(part, before, fewest)]
         done += parts
         owners += [number] * len(parts)
     width = max((part.shape[1] for part in done), default=3)
@@ -210,17 +219,25 @@ def separate(polygons: list[np.ndarray]) -> tuple[np.ndarray, list[int]]:
     return pieces, owners
 
 
-def _without(part: np.ndarray, before: np.ndarray) -> list[np.ndarray]:
+def _without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
     """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils."""
     empty = area(before) < SMALLEST
     if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
         return [part]
     whole = np.where(empty[:, None, None], part, part[:, :1])  # an empty polygon has no sides that could bound it
-    return [piece for piece in (whole, *difference(part, before)) if np.any(area(piece) > SMALLEST)]
+    if fewest:
+        normal, limit = sides(before)
+        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
+        pieces = difference(part, before, np.argsort(off)[::-1])
+    else:
+        pieces = difference(part, before)
+    # of a polygon that is empty but for rounding the sides are there, and would leave the part a second time
+    pieces = [np.where(empty[:, None, None], piece[:, :1], piece) for piece in pieces]
+    return [piece for piece in (whole, *pieces) if np.any(area(piece) > SMALLEST)]
 
 
 def tiled(pieces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same shadows (B, K, V, 2) in pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
+    """Cut shadows (B, K, V, 2) into pieces that are no larger than LARGEST along x and y, (B, L, W, 2), and of which
     of the K each is, (L,).
     """
     owners = np.arange(pieces.shape[1])
@@ -357,10 +374,6 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     size, slope = _radius_and_slope(radius, turn)
     arc = turn * size
     arc_rise = 0.5 * weight * angle[..., None] * (turn * (slope + 1j * size)).imag
-    every, rises = (
-        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
-        for both in ((place, arc), (rise, arc_rise))
-    )
     # the region's box: of both ends of straight pieces, and of nodes on arcs
     corners = np.concatenate([first, last, arc.reshape(len(arc), arc.shape[1] * arc.shape[2])], axis=1)
     counted = np.concatenate([straight, straight, np.repeat(bent, len(share), axis=1)], axis=1)
@@ -370,7 +383,20 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     )
     none = ~np.any(counted, axis=1)
     low[none], high[none] = 0.0, 0.0
-    return from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    # What only fills the rows must not lie on the pupil's edge: in units of a narrow box that is millions away, where
+    # polynomials make of a rounding error in its angle, 1e-17, any number.
+    middle = 0.5 * (low + high) @ np.array([1.0, 1j])
+    used = np.concatenate([np.repeat(kept, len(share), axis=1) for kept in (straight, bent)], axis=1)
+    every, rises = (
+        np.concatenate([part.reshape(len(part), part.shape[1] * part.shape[2]) for part in both], axis=1)
+        for both in ((place, arc), (rise, arc_rise))
+    )
+    every, rises = np.where(used, every, middle[:, None]), np.where(used, rises, 0.0)
+    points, weights = from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
+    total = np.sum(weights, axis=-1)
+    if not np.all((total > -_ROOM) & (total < np.abs(area(polygons)) + _ROOM)):
+        raise ArithmeticError("a part of a shadow within the pupil came out larger than the whole of it")
+    return points, weights
 
 
 def _some(pairs: np.ndarray, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

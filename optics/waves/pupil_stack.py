@@ -45,7 +45,7 @@ _EDGE_SAMPLES = 32
 _AT_ONCE = 2**14
 """Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
 _SHADOWS_AT_ONCE = 2**16
-"""The same for shadows, where the way to the points is longer than what is done there."""
+"""Nodes at once for shadows, where the way to the points is longer than what is done there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +245,7 @@ class PupilStack:
         return eikonal, amplitude
 
     def _values_at(self, owner: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same at p (F, Q) in pupils (F,)."""
+        """Values at places p (F, Q) of pupils (F,)."""
         order, place, most = in_rows(owner, len(self.axes))
         points = np.zeros((len(self.axes), most, p.shape[1]), complex)
         points[owner[order], place] = p[order]
@@ -415,7 +415,7 @@ class PupilFunction:
         """Direction cosines (u, v, w) at p, of p's shape; w > 0 along the detector's normal, downstream."""
         u = self.centre[0] + self.axes[0, 0] * p.real + self.axes[0, 1] * p.imag
         v = self.centre[1] + self.axes[1, 0] * p.real + self.axes[1, 1] * p.imag
-        return u, v, np.sqrt(1.0 - u * u - v * v)
+        return u, v, np.sqrt(np.maximum(1.0 - u * u - v * v, 0.0))
 
     def values(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Eikonal (metres) and amplitude density at p, of p's shape."""

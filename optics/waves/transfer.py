@@ -158,12 +158,7 @@ def _products(pupil: PupilFunction, points: np.ndarray, shift: np.ndarray) -> tu
 
 
 def _spans(
-    pupil: PupilFunction,
-    shift: np.ndarray,
-    right: np.ndarray,
-    left: np.ndarray,
-    wave: np.ndarray,
-    defocus: np.ndarray,
+    pupil: PupilFunction, shift: np.ndarray, right: np.ndarray, left: np.ndarray, wave: np.ndarray, defocus: np.ndarray
 ) -> np.ndarray:
     """How fast the phase runs across and along the chords for the worst defocus, (2, S), radians per radian of the
     angle in which Gauss' nodes lie evenly: half its range where it is linear.

@@ -60,7 +60,7 @@ def _quantity(option: str, text: str | None, kind: Kind) -> float | None:
     try:
         value = parse_quantity(text, kind)
     except Problem as problem:
-        raise InputError(Issue(f"{option}: {problem.problem}", "", None, (), problem.found, problem.allowed)) from None
+        raise InputError(Issue(f"{option}: {problem.problem}", found=problem.found, allowed=problem.allowed)) from None
     if not value > 0.0:
         raise InputError(Issue(f"{option} is not greater than zero", "", None, (), text))
     return value
@@ -107,14 +107,13 @@ def read_prescription(path: Path, glasses: Sequence[Path] = (), wavelength: floa
     if kind is None:
         raise InputError(Issue("what kind of file is this?", str(path), allowed=", ".join(READS)))
     if kind == "batoid":
-        from scenes.lens.batoid_file import read_batoid
+        from scenes.lens.batoid_reader import read_batoid
 
         if wavelength is None:
             raise InputError(Issue("a file of batoid names no wavelength", str(path), allowed='--wavelength "620 nm"'))
         return read_batoid(path, wavelength)
     if wavelength is not None:
-        problem = "--wavelength is for files of batoid; this one names its own"
-        raise InputError(Issue(problem, str(path)))
+        raise InputError(Issue("--wavelength is for files of batoid; this one names its own", str(path)))
     known = read_catalogues(glasses)
     if kind == "Zemax":
         from scenes.lens.zemax_reader import read_zemax
@@ -188,8 +187,7 @@ def write(
         Path | None, typer.Option(readable=False, help="A job: the camera as it stands in the job's perturbed state.")
     ] = None,
     mounted: Annotated[
-        str | None,
-        typer.Option("--camera", help="With --perturbed: which of the instrument's cameras."),
+        str | None, typer.Option("--camera", help="With --perturbed: which of the instrument's cameras.")
     ] = None,
     force: Force = False,
 ) -> None:
@@ -219,7 +217,7 @@ def write(
 
             content = zemax_text(lens).replace("\n", "\r\n").encode("utf-16")
         else:
-            from scenes.lens.batoid_file import batoid_text
+            from scenes.lens.batoid_writer import batoid_text
 
             text, more = batoid_text(lens)
             notes += more
@@ -248,7 +246,7 @@ def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backe
     from scenes.specs.job import check_nodes
     from scenes.specs.load import load_camera
     from scenes.specs.resolved import resolve
-    from scenes.yaml.errors import names_text, nearest
+    from scenes.yaml.errors import names_text, unknown
 
     resolved = resolve(job_file)
     wanted = load_camera(str(camera)).name
@@ -260,8 +258,7 @@ def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backe
     if mounted is None and len(places) > 1:
         raise InputError(Issue("which of them?", str(job_file), None, (), None, f"--camera {' or '.join(places)}"))
     if mounted is not None and mounted not in places:
-        meant = nearest(mounted, places)
-        raise InputError(Issue("no such camera", str(job_file), None, (), mounted, names_text(places), meant))
+        raise InputError(unknown("no such camera", mounted, places).at(str(job_file)))
     instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
     check_nodes(resolved.job, instrument.nodes)
     state = job_state(resolved.job, ThermalModel(instrument))

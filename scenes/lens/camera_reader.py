@@ -19,30 +19,18 @@ from optics.raytrace.assembly import Interaction
 from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
-from scenes.lens.prescription import (
-    SEQUENCE,
-    LensSurface,
-    Note,
-    Prescription,
-    edge_entry,
-    edge_size,
-    facing,
-    without_rim,
-)
-from scenes.models.camera_design import camera_file
+from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription, edge_entries, facing, without_rim
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
 
 PITCH = 7e-6
-"""Of a line CCD's pixels where none is asked for, metres."""
+"""Pitch of a line CCD's pixels where none is asked for, metres."""
 LARGEST_TILT = math.radians(45.0)
 SAME = 1e-9
 """Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
 the same code: what is left is the rounding of poses and numbers."""
-_LARGEST_EDGE = 100.0
-"""Metres; beyond that an edge is none."""
 _SINGLE_FIELD = math.radians(0.05)
 _RIM, _FINE_RIM = 12, 720
 _LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
@@ -250,7 +238,7 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     terms = _terms(lens, surface, shape)
     if terms:
         out["sag"] = terms
-    edges = [edge_entry(edge) for edge in surface.every_edge if edge_size(edge) < _LARGEST_EDGE]
+    edges = edge_entries(surface.every_edge)
     if edges:
         out["edges"] = edges
     if surface.interaction in _LIGHT:
@@ -342,7 +330,7 @@ def _pupil(lens: Prescription, narrow: CameraModel, plain: dict[str, Any], backe
 
 
 def _axial_focal_length(model: CameraModel, backend: Backend) -> float:
-    """Of rays beside the axis, wherever the image stands, metres."""
+    """Focal length of rays beside the axis, wherever the image stands, metres."""
     bare, names = model.bare_assembly(apertures=False), model.mirrors
     stop = names.index(model.spec.stop)
     centre = field_direction(model.spec, 0.0, 0.0)
@@ -447,9 +435,4 @@ def camera_text(made: ReadCamera, lens: Prescription) -> str:
     remark = [f"Read from {lens.file} by python -m scenes.lens read."]
     remark += [f"{name}: {surface}" for name, surface in made.names.items() if name != surface]
     remark += [str(note) for note in made.notes]
-    return camera_file(made.camera, printable_lines(remark))
-
-
-def printable_lines(lines: list[str]) -> str:
-    """Lines as one text without what a reader of YAML would refuse in a remark."""
-    return "\n".join(printable(line) for line in lines)
+    return made.camera.file_text("\n".join(printable(line) for line in remark))

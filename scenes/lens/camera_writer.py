@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -66,17 +67,8 @@ def _cut(model: CameraModel, name: str) -> tuple[Any, ...]:
 def field_angles(model: CameraModel) -> tuple[tuple[float, float], ...]:
     """Middle, ends and corners of the field, angles about x and y whose tangents are the light's, radians."""
     spec = model.spec
-    shares = [
-        (0.0, 0.0),
-        (1.0, 0.0),
-        (-1.0, 0.0),
-        (0.0, 1.0),
-        (0.0, -1.0),
-        (1.0, 1.0),
-        (1.0, -1.0),
-        (-1.0, 1.0),
-        (-1.0, -1.0),
-    ]
+    sides = [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)]
+    shares = [(0.0, 0.0), *sides, *product((1.0, -1.0), repeat=2)]
     return tuple((x * spec.field.x, spec.field_bias + y * spec.field.y) for x, y in shares)
 
 

@@ -21,26 +21,9 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Edge
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
-from optics.raytrace.assembly import Interaction
 from scenes.lens.codev_statements import CodevSurface, CodevSystem, statements, take
-from scenes.lens.prescription import (
-    FARTHEST,
-    LARGEST_ORDER,
-    NO_GLASSES,
-    Chain,
-    Glasses,
-    LensSurface,
-    Note,
-    Prescription,
-    Pupil,
-    clear,
-    even_asphere,
-    glass_key,
-    polynomial,
-)
-from scenes.lens.statements import Source, Statement, read_lines
-
-_D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9
+from scenes.lens.prescription import LARGEST_ORDER, Prescription, Pupil, clear, even_asphere, polynomial
+from scenes.lens.statements import NO_GLASSES, Chain, Glasses, Source, Statement, index_of, read_lines, require_d_line
 
 
 def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
@@ -64,9 +47,8 @@ def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     if not system.surfaces:
         raise source.error("no surface in this file", len(lines), allowed="SO, S, ... SI of a CODE V sequence")
     if system.surfaces[-1].name != "SI":
-        raise source.error(
-            "the sequence has no image: it is cut off", system.surfaces[-1].line, allowed="SI at its end"
-        )
+        problem = "the sequence has no image: it is cut off"
+        raise source.error(problem, system.surfaces[-1].line, allowed="SI at its end")
     if len(system.surfaces) < 3:
         raise source.error("too few surfaces", system.surfaces[-1].line, allowed="object, optics and image")
     return _prescription(system, glasses)
@@ -80,7 +62,7 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
     if reference > len(system.waves):
         raise source.error("the reference wavelength is none of those given", read[0].line, reference)
     wavelength = system.waves[reference - 1]
-    chain, index, glass, stop = Chain(), 1.0, "", -1
+    chain = Chain(source)
     if read[0].medium:
         raise source.error("an object in glass", read[0].line, read[0].medium)
     for k, surface in enumerate(read[1:], start=1):
@@ -99,14 +81,13 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
             chain.move((0.0, 0.0, surface.thickness * scale))
         if surface.kind != "REV":
             chain.move(shift, rotation)
-        made, index, glass = _made(system, surface, chain.pose, index, glass, wavelength, glasses)
-        if surface.stop:
-            if stop >= 0:
-                raise source.error("a second stop", surface.line)
-            stop = len(chain.surfaces)
-        idle = made.interaction is Interaction.PASS and not made.every_edge and made.surface.is_plane
-        if not idle or surface.stop or last:
-            chain.add(made)
+        shape = _shape(system, surface)
+        try:
+            edges = _edges_of(surface)
+        except ValueError as error:
+            raise source.error(str(error), surface.line) from None
+        behind = _behind(source, surface, wavelength, glasses)
+        chain.meet(surface.name, shape, edges, behind, surface.line, surface.stop, last)
         if surface.kind == "DAR":
             chain.pose = before
         elif surface.kind == "BEN":
@@ -118,27 +99,18 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
             chain.pose = chain.pose @ back
         if not last:
             chain.move((0.0, 0.0, surface.thickness * scale))
-    if stop < 0:
-        stop = 0
-        source.notes.append(Note(0, "", f"no STO: taken to be {chain.surfaces[0].name}"))
-    if stop == len(chain.surfaces) - 1:
-        raise source.error("the image is the stop", chain.surfaces[stop].line)
     pupil = system.pupil
     if pupil is not None and pupil.kind == "diameter":
         pupil = Pupil("diameter", pupil.value * scale, pupil.line)
-    distance = read[0].thickness * scale
-    return Prescription(
-        system.name or Path(source.file).stem,
-        source.file,
-        tuple(chain.surfaces),
-        stop,
-        wavelength,
-        tuple(dict.fromkeys(system.waves)),
-        _fields(system),
-        system.field_kind,
-        pupil,
-        distance if abs(distance) < FARTHEST else math.inf,
-        tuple(source.notes),
+    return chain.prescription(
+        "STO",
+        read[0].thickness * scale,
+        system.name,
+        wavelength=wavelength,
+        wavelengths=tuple(dict.fromkeys(system.waves)),
+        fields=_fields(system),
+        field_kind=system.field_kind,
+        pupil=pupil,
     )
 
 
@@ -150,54 +122,27 @@ def _fields(system: CodevSystem) -> tuple[tuple[float, float], ...]:
     return tuple(zip(x, y, strict=True))
 
 
-def _made(
-    system: CodevSystem,
-    surface: CodevSurface,
-    pose: Pose,
-    index: float,
-    glass: str,
-    wavelength: float,
-    glasses: Glasses,
-) -> tuple[LensSurface, float, str]:
-    """A surface with what lies behind it."""
-    source, medium = system.source, surface.medium.strip("'\"")
-    shape = _shape(system, surface)
-    try:
-        aperture, blocked = _edges_of(surface)
-    except ValueError as error:
-        raise source.error(str(error), surface.line) from None
-    if medium.upper() in ("REFL", "REFR_TIR", "TIRO"):
-        if medium.upper() != "REFL":
+def _behind(source: Source, surface: CodevSurface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
+    """Index and name of what lies behind a surface; None for a mirror. Six digits and a point are a fictitious glass,
+    index and dispersion.
+    """
+    medium = surface.medium.strip("'\"")
+    match medium.upper():
+        case "" | "AIR":
+            return 1.0, ""
+        case "REFL":
+            return None
+        case "REFR_TIR" | "TIRO":
             raise source.error("total reflection is not known here", surface.line, medium)
-        how = Interaction.REFLECT
-        made = LensSurface(surface.name, pose, shape, how, index, aperture, surface.line, glass, blocked)
-        return made, index, glass
-    behind = 1.0 if medium.upper() in ("", "AIR") else _index(source, surface, medium, wavelength, glasses)
-    how = Interaction.PASS if behind == index else Interaction.REFRACT
-    glass = "" if behind == 1.0 else medium
-    return LensSurface(surface.name, pose, shape, how, behind, aperture, surface.line, glass, blocked), behind, glass
-
-
-def _index(source: Source, surface: CodevSurface, medium: str, wavelength: float, glasses: Glasses) -> float:
-    """Of the glass behind a surface; six digits and a point are a fictitious glass, index and dispersion."""
     whole, point, rest = medium.partition(".")
-    if (point and whole.isdigit() and rest.isdigit()) or ":" in medium:
-        if abs(wavelength - _D_LINE) > _D_WIDTH:
-            problem = "a fictitious glass, whose index is stated at 587.56 nm alone"
-            raise source.error(problem, surface.line, f"{medium} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
-        if ":" in medium:
-            word = medium.partition(":")[0]
-            statement = Statement(surface.line, "S", (word,), medium)
-            return source.finite(statement, 0, "the index")
-        return 1.0 + float(f"0.{whole}")
-    found = glasses.get(glass_key(medium))
-    if found is None:
-        problem, allowed = "unknown glass", "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
-        raise source.error(problem, surface.line, medium, allowed)
-    try:
-        return found(wavelength)
-    except ValueError as error:
-        raise source.error(str(error), surface.line) from None
+    stated, colon, _ = medium.partition(":")
+    if (point and whole.isdigit() and rest.isdigit()) or colon:
+        require_d_line(source, "fictitious", medium, wavelength, surface.line)
+        statement = Statement(surface.line, "S", (stated,), medium)
+        index = source.finite(statement, 0, "the index") if colon else 1.0 + float(f"0.{whole}")
+    else:
+        index = index_of(source, glasses, medium, wavelength, surface.line)
+    return index, "" if index == 1.0 else medium
 
 
 def _shape(system: CodevSystem, surface: CodevSurface) -> Surface:

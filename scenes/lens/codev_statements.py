@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 
 from scenes.lens.prescription import Pupil
-from scenes.lens.statements import MOST_SURFACES, Source, Statement, is_number, joined, split_words
+from scenes.lens.statements import MOST_SURFACES, Source, Statement, is_number, joined, statement_of
 
 UNITS = {"M": 1e-3, "MM": 1e-3, "C": 1e-2, "CM": 1e-2, "I": 25.4e-3, "IN": 25.4e-3}
 _POWERS = {name: 4 + 2 * k for k, name in enumerate("ABCDEFGHJ")}
@@ -19,6 +19,7 @@ OF_NO_EFFECT = frozenset(
     "RGL TEM PRE XDC YDC ZDC ADC BDC CDC IWT COM TOL DLT DLR DLN DLZ VIE OUT CUR PIM PIK MHT MWT EDI PUI PUX "
     "PUY".split()
 )
+_SYSTEM = frozenset("RDM DIM EPD FNO NA NAO WL REF TIT TITLE PRV ZOO FLD VUX VLX VUY VLY".split())
 _GEOMETRY = frozenset("XDE YDE ZDE ADE BDE CDE".split())
 _REFUSED = {
     "RET": "a return to the frame of another surface",
@@ -87,30 +88,17 @@ class CodevSystem:
 
 def statements(lines: list[str]) -> list[Statement]:
     """Commands between semicolons; & at the end of a line goes on, ! begins a remark."""
-    out, pending, begun = [], "", 0
+    out: list[Statement | None] = []
+    pending, begun = "", 0
     for number, text in enumerate(lines, start=1):
-        text, begun = _without_remark(text), begun or number
+        text, begun = _cut(text, "!")[0], begun or number
         if text.rstrip().endswith("&"):
             pending += text.rstrip()[:-1] + " "
             continue
-        for part in _parts(pending + text):
-            words = split_words(part)
-            if words:
-                out.append(Statement(begun, words[0].upper(), words[1:], part.strip()))
+        out += [statement_of(begun, part) for part in _cut(pending + text, ";")]
         pending, begun = "", 0
-    for part in _parts(pending):
-        words = split_words(part)
-        if words:
-            out.append(Statement(begun, words[0].upper(), words[1:], part.strip()))
-    return out
-
-
-def _without_remark(text: str) -> str:
-    return _cut(text, "!")[0]
-
-
-def _parts(text: str) -> list[str]:
-    return _cut(text, ";")
+    out += [statement_of(begun, part) for part in _cut(pending, ";")]
+    return [one for one in out if one is not None]
 
 
 def _cut(text: str, mark: str) -> list[str]:
@@ -133,42 +121,20 @@ def take(system: CodevSystem, s: Statement) -> None:
     source, command = system.source, s.command
     if command in ("SO", "S", "SI") or (command[0] == "S" and command[1:].isdigit()):
         _surface(system, s)
-    elif command in (
-        "RDM",
-        "DIM",
-        "EPD",
-        "FNO",
-        "NA",
-        "NAO",
-        "WL",
-        "REF",
-        "TIT",
-        "TITLE",
-        "PRV",
-        "ZOO",
-        "FLD",
-    ) or command in (
-        *_FIELDS,
-        "VUX",
-        "VLX",
-        "VUY",
-        "VLY",
-    ):
+    elif command in _SYSTEM or command in _FIELDS:
         _take_system(system, s)
     elif command in _REFUSED:
         raise source.error(f"{_REFUSED[command]} is not known here", s.line, s.text)
-    elif command in OF_NO_EFFECT or (command in ("CUF", "HOR") and not any(_numbers(source, s))):
+    elif command in OF_NO_EFFECT or (command in ("CUF", "HOR") and not any(source.numbers(s))):
         pass
     elif command in ("RDY", "THI", "CUY", "GLA", "INS", "DEL", "REFL", "RMD", "SCA", "FLY"):
-        raise source.error(
-            "a change of surfaces that have been given before", s.line, s.text, "the sequence of surfaces"
-        )
+        problem = "a change of surfaces that have been given before"
+        raise source.error(problem, s.line, s.text, "the sequence of surfaces")
     elif _qualified(s):
         # a statement for a surface that it names, not for the last one
         if command in (*_GEOMETRY, "K", "CON", "ASP", *_POWERS, "STO", "DAR", "BEN", "REV", "SPS", "SCO"):
-            raise source.error(
-                "a change of a surface that was given before", s.line, s.text, "statements below the surface"
-            )
+            problem = "a change of a surface that was given before"
+            raise source.error(problem, s.line, s.text, "statements below the surface")
         source.note(s, "not understood")
     elif system.surfaces and _take_surface(system, system.surfaces[-1], s):
         pass
@@ -192,10 +158,6 @@ def _qualified(s: Statement) -> bool:
     """Whether the first word names a surface: S4, SI, S3..5."""
     word = s.words[0].upper() if s.words else ""
     return word in ("SI", "SO", "SS") or (word[:1] == "S" and word[1:2].isdigit())
-
-
-def _numbers(source: Source, s: Statement) -> tuple[float, ...]:
-    return tuple(source.finite(s, k, "a number") for k in range(len(s.words)))
 
 
 def _take_system(system: CodevSystem, s: Statement) -> None:
@@ -223,7 +185,7 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
                 kind = {"EPD": "diameter", "FNO": "f_number", "NAO": "object_na"}[s.command]
                 system.pupil = Pupil(kind, value, s.line)
         case "WL":
-            waves = tuple(v / 1e9 for v in _numbers(source, s))
+            waves = tuple(v / 1e9 for v in source.numbers(s))
             wrong = [w for w in waves if not 1e-7 <= w <= 1e-4]
             if wrong or not waves:
                 raise source.error("no wavelength of light", s.line, s.text, "100 to 100000 nm")
@@ -238,10 +200,10 @@ def _take_system(system: CodevSystem, s: Statement) -> None:
         case "ZOO" | "FLD":
             source.note(s, "not understood")
         case "VUX" | "VLX" | "VUY" | "VLY":
-            if any(_numbers(source, s)):
+            if any(source.numbers(s)):
                 source.note(s, "vignetting factors are not carried; beams are as wide as the stop lets them")
         case _:
-            values = _numbers(source, s)
+            values = source.numbers(s)
             system.field_kind = _FIELDS[s.command]
             if system.field_kind == "angles":
                 if any(not abs(v) < 89.0 for v in values):
@@ -303,7 +265,7 @@ def _take_surface(system: CodevSystem, surface: CodevSurface, s: Statement) -> b
             else:
                 raise source.error("a coefficient that is not known here", s.line, s.text, "SCO C1 to SCO C66")
         case "CUF":
-            if any(_numbers(source, s)):
+            if any(source.numbers(s)):
                 raise source.error("a curvature of a Fresnel base is not known here", s.line, s.text)
         case "DAR" | "BEN" | "REV":
             surface.kind = s.command

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from optics.materials.glass import GLASSES
 from optics.numerics.frozen_map import FrozenMap
-from scenes.lens.prescription import Glasses, glass_key
-from scenes.lens.statements import Source, Statement, read_lines, split_words
+from scenes.lens.statements import Glasses, Source, glass_key, read_lines, statement_of
 
 
 def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
@@ -127,10 +126,8 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
     name, formula, begun = "", 0, 0
     coefficients: tuple[float, ...] = ()
     for number, text in enumerate(read_lines(source, "a glass catalogue"), start=1):
-        words = split_words(text)
-        if not words:
+        if (s := statement_of(number, text)) is None:
             continue
-        s = Statement(number, words[0].upper(), words[1:], text.strip())
         match s.command:
             case "NM":
                 if name:
@@ -141,7 +138,7 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                     known = ", ".join(f"{k} {title}" for k, (title, _) in FORMULAS.items())
                     raise source.error("an unknown dispersion formula", number, formula, known)
             case "CD" if name:
-                given = [source.finite(s, k, "a coefficient") for k in range(len(s.words))]
+                given = source.numbers(s, "a coefficient")
                 coefficients = tuple([*given, *[0.0] * 12][: max(12, len(given))])
             case "LD" if name:
                 if not coefficients:

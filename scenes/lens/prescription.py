@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from math import comb, pi, remainder
 from typing import Any
 
@@ -16,13 +16,12 @@ from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.tree import Body, RigidTree
 from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
-from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 LARGEST_ORDER = 10
-"""Of polynomials and Zernike terms; beyond it monomials lose digits."""
+"""Largest order of polynomials and Zernike terms; beyond it monomials lose digits."""
 _POLYNOMIAL = {(a, n - a): (f"x{a}" if a > 1 else "x" * a) + (f"y{n - a}" if n - a > 1 else "y" * (n - a))
                for n in (2, 3, 4) for a in range(n + 1)}  # fmt: skip
 
@@ -153,7 +152,7 @@ def clear(
 
 
 def facing(surface: LensSurface) -> LensSurface:
-    """The same surface in a frame whose z has no part against the prescription's: turned about its own x by half a
+    """Tell a surface in a frame whose z has no part against the prescription's: turned about its own x by half a
     turn where it has, which is the same body.
     """
     if surface.pose.rotation[2, 2] >= 0.0:
@@ -161,9 +160,12 @@ def facing(surface: LensSurface) -> LensSurface:
     return turned_over(surface)
 
 
+OVER = Pose(np.diag([1.0, -1.0, -1.0]))
+"""Half a turn about x."""
+
+
 def turned_over(surface: LensSurface) -> LensSurface:
-    """The same surface, told in a frame that is turned about its x by half a turn."""
-    over = Pose(np.diag([1.0, -1.0, -1.0]))
+    """Tell a surface in a frame that is turned about its x by half a turn."""
     shape = surface.surface
     terms = []
     for term in shape.terms:
@@ -184,7 +186,7 @@ def turned_over(surface: LensSurface) -> LensSurface:
         edge = replace(edge, centre=(edge.centre[0], -edge.centre[1]))
     return replace(
         surface,
-        pose=surface.pose @ over,
+        pose=surface.pose @ OVER,
         surface=Surface(-shape.curvature, shape.conic, even, figure, tuple(terms)),
         aperture=edge,
         edges=tuple(map(aperture.turned_over, surface.edges)),
@@ -213,7 +215,16 @@ def without_rim(surface: LensSurface) -> LensSurface:
     return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
 
 
-def edge_size(edge: Edge) -> float:
+_LARGEST_EDGE = 100.0
+"""Metres; beyond that an edge is none."""
+
+
+def edge_entries(edges: Iterable[Edge]) -> list[dict[str, Any]]:
+    """Edges as a camera's file has them, without those that are too large to cut anything."""
+    return [_entry(edge) for edge in edges if _size(edge) < _LARGEST_EDGE]
+
+
+def _size(edge: Edge) -> float:
     """Largest number of an edge, metres."""
     shape = edge.shape
     numbers = [*shape.centre]
@@ -229,8 +240,7 @@ def edge_size(edge: Edge) -> float:
     return max(map(abs, numbers))
 
 
-def edge_entry(edge: Edge) -> dict[str, Any]:
-    """An edge as a camera's file has it."""
+def _entry(edge: Edge) -> dict[str, Any]:
     shape = edge.shape
     kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
 
@@ -259,12 +269,6 @@ def edge_entry(edge: Edge) -> dict[str, Any]:
 
 SEQUENCE = "imaging"
 """Name of the way of the light in a prescription's assembly."""
-
-FARTHEST = 1e8
-"""An object beyond this distance is at infinity, metres; programs write it as 1e10 or 1e13 millimetres."""
-
-Glasses = Mapping[str, Callable[[float], float]]
-"""Name of a glass as ``glass_key`` makes it -> refractive index by wavelength, metres."""
 
 
 @dataclass(frozen=True)
@@ -379,7 +383,7 @@ class Prescription:
         return InputError(Issue(problem, self.file, line or None, (), found, allowed))
 
     def with_notes(self, *notes: Note) -> Prescription:
-        """The same with more of them."""
+        """Return the prescription with further notes."""
         return replace(self, notes=(*self.notes, *notes))
 
     def assembly(self, apertures: bool = True) -> Assembly:
@@ -396,40 +400,3 @@ class Prescription:
             for s in self.surfaces
         }
         return Assembly(RigidTree(bodies), elements, {SEQUENCE: tuple(s.name for s in self.surfaces)})
-
-
-def glass_key(name: str) -> str:
-    """A glass's name as it is looked for: letters and digits alone, without the maker's name behind ``_``.
-
-    CODE V writes NBK7_SCHOTT for what Zemax and its makers call N-BK7.
-    """
-    head = name.strip("'\"").partition("_")[0] or name
-    return "".join(c for c in head.upper() if c.isalnum())
-
-
-@dataclass
-class Chain:
-    """Surfaces as a reader meets them, one frame after the other; a reader's own workspace.
-
-    Attributes:
-        pose: frame that the next surface stands in.
-        surfaces: so far.
-    """
-
-    pose: Pose = field(default_factory=Pose)
-    surfaces: list[LensSurface] = field(default_factory=list)
-
-    def move(self, shift: Sequence[float] = (0.0, 0.0, 0.0), rotation: np.ndarray | None = None) -> None:
-        """Go on in a frame that is shifted by a vector in the present axes and then turned about its own."""
-        self.pose = self.pose @ Pose(np.eye(3) if rotation is None else rotation, np.array(shift, np.float64))
-
-    def add(self, surface: LensSurface) -> None:
-        """One more surface, under another name where its own is taken."""
-        names = {s.name for s in self.surfaces}
-        name, k = surface.name, 2
-        while name in names:
-            name, k = f"{surface.name}_{k}", k + 1
-        self.surfaces.append(replace(surface, name=name))
-
-
-NO_GLASSES: Glasses = FrozenMap()

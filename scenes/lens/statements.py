@@ -1,14 +1,24 @@
-"""Foreign prescription files as numbered statements: encodings, words, numbers, and what is said of a wrong one."""
+"""Foreign prescription files as numbered statements: encodings, words, numbers, what is said of a wrong one; and the
+chain of surfaces that a reader makes of them.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
-from scenes.lens.prescription import Note
+import numpy as np
+
+from optics.geometry.aperture import Aperture, Edge
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
+from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Interaction
+from scenes.lens.prescription import LensSurface, Note, Prescription
 from scenes.yaml.errors import InputError, Issue, shown
 from scenes.yaml.input_file import read_bytes
 
@@ -69,6 +79,10 @@ class Source:
         whole = statement.text if len(statement.text) <= 60 else statement.text[:57] + "..."
         self.notes.append(Note(statement.line, whole, text))
 
+    def numbers(self, statement: Statement, what: str = "a number") -> tuple[float, ...]:
+        """All words of a statement as finite numbers. Raises InputError as ``number``."""
+        return tuple(self.finite(statement, k, what) for k in range(len(statement.words)))
+
     def number(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
         """The number in one of the statement's words.
 
@@ -93,7 +107,7 @@ class Source:
         return value
 
     def finite(self, statement: Statement, place: int, what: str, default: float | None = None) -> float:
-        """As ``number``, refusing infinity."""
+        """The number in one of the statement's words, as of ``number``, refusing infinity."""
         value = self.number(statement, place, what, default)
         if not math.isfinite(value):
             raise self.error(f"{what} of {statement.command} is infinite", statement.line, statement.text)
@@ -105,9 +119,8 @@ class Source:
         """A whole number between limits. Raises InputError as ``number``."""
         value = self.finite(statement, place, what, default)
         if value != int(value) or not least <= value <= most:
-            raise self.error(
-                f"{what} of {statement.command}", statement.line, value, f"whole numbers {least} to {most}"
-            )
+            allowed = f"whole numbers {least} to {most}"
+            raise self.error(f"{what} of {statement.command}", statement.line, value, allowed)
         return int(value)
 
 
@@ -163,6 +176,152 @@ def split_words(text: str) -> tuple[str, ...]:
     return tuple(re.findall(r"\"[^\"]*\"|'[^']*'|[^\s\"']+|[\"']", text))
 
 
+def statement_of(line: int, text: str) -> Statement | None:
+    """The statement of a line, or of a part of one; None where no word stands."""
+    words = split_words(text)
+    return Statement(line, words[0].upper(), words[1:], text.strip()) if words else None
+
+
 def joined(words: Sequence[str]) -> str:
     """Words as a text, without quotes around it."""
     return " ".join(words).strip().strip("\"'").strip()
+
+
+Glasses = Mapping[str, Callable[[float], float]]
+"""Name of a glass as ``glass_key`` makes it -> refractive index by wavelength, metres."""
+NO_GLASSES: Glasses = FrozenMap()
+FARTHEST = 1e8
+"""An object beyond this distance is at infinity, metres; programs write it as 1e10 or 1e13 millimetres."""
+D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9
+"""Wavelength at which the index of a glass without a catalogue is stated, and how near to it one has to be, metres."""
+
+
+def glass_key(name: str) -> str:
+    """A glass's name as it is looked for: letters and digits alone, without the maker's name behind ``_``.
+
+    CODE V writes NBK7_SCHOTT for what Zemax and its makers call N-BK7.
+    """
+    head = name.strip("'\"").partition("_")[0] or name
+    return "".join(c for c in head.upper() if c.isalnum())
+
+
+def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, line: int) -> float:
+    """Refractive index of a catalogue's glass that a file names.
+
+    Args:
+        source: the file.
+        glasses: that are known.
+        name: as the file has it.
+        wavelength: metres.
+        line: of the file.
+
+    Raises:
+        InputError: no such glass, or none whose index is known there.
+    """
+    found = glasses.get(glass_key(name))
+    if found is None:
+        allowed = "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
+        raise source.error("unknown glass", line, name, allowed)
+    try:
+        return found(wavelength)
+    except ValueError as error:
+        raise source.error(str(error), line) from None
+
+
+def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:
+    """Refuse a glass without a catalogue at another wavelength (metres) than that of its index."""
+    if abs(wavelength - D_LINE) > _D_WIDTH:
+        problem = f"a {what} glass, whose index is stated at 587.56 nm alone"
+        raise source.error(problem, line, f"{name} at {wavelength * 1e9:.6g} nm", "a catalogue's glass")
+
+
+@dataclass
+class Chain:
+    """Surfaces as a reader meets them, one frame after the other; a reader's own workspace.
+
+    Attributes:
+        source: the file.
+        pose: frame that the next surface stands in.
+        surfaces: so far.
+        stop: number of the aperture stop among them, -1 as long as there is none.
+        index, glass: what lies behind the last surface.
+    """
+
+    source: Source
+    pose: Pose = field(default_factory=Pose)
+    surfaces: list[LensSurface] = field(default_factory=list)
+    stop: int = -1
+    index: float = 1.0
+    glass: str = ""
+
+    def move(self, shift: Sequence[float] = (0.0, 0.0, 0.0), rotation: np.ndarray | None = None) -> None:
+        """Go on in a frame that is shifted by a vector in the present axes and then turned about its own."""
+        self.pose = self.pose @ Pose(np.eye(3) if rotation is None else rotation, np.array(shift, np.float64))
+
+    def meet(
+        self,
+        name: str,
+        shape: Surface,
+        edges: tuple[Aperture | None, tuple[Edge, ...]],
+        behind: tuple[float, str] | None,
+        line: int,
+        stop: bool,
+        last: bool,
+    ) -> None:
+        """Take the next surface, under another name where its own is taken; a plane that does nothing is left out.
+
+        Args:
+            name: of the surface.
+            shape: of it.
+            edges: its clear aperture, and what it blocks.
+            behind: index and glass of what lies behind it; None for a mirror.
+            line: where it begins in the file.
+            stop: whether it is the aperture stop.
+            last: whether it is the image.
+
+        Raises:
+            InputError: it is a second stop.
+        """
+        how = Interaction.REFLECT
+        if behind is not None:
+            how = Interaction.PASS if behind[0] == self.index else Interaction.REFRACT
+            self.index, self.glass = behind
+        if stop:
+            if self.stop >= 0:
+                raise self.source.error("a second stop", line)
+            self.stop = len(self.surfaces)
+        made = LensSurface(name, self.pose, shape, how, self.index, edges[0], line, self.glass, edges[1])
+        if how is Interaction.PASS and not made.every_edge and shape.is_plane and not (stop or last):
+            return
+        names, k = {s.name for s in self.surfaces}, 2
+        while made.name in names:
+            made, k = replace(made, name=f"{name}_{k}"), k + 1
+        self.surfaces.append(made)
+
+    def prescription(self, keyword: str, distance: float, name: str, **said: Any) -> Prescription:
+        """What the file describes.
+
+        Args:
+            keyword: that names the stop in the file.
+            distance: of the object, metres.
+            name: title of the file, empty for none.
+            said: further numbers of the prescription.
+
+        Raises:
+            InputError: the image is the stop.
+        """
+        source = self.source
+        if self.stop < 0:
+            self.stop = 0
+            source.notes.append(Note(0, "", f"no {keyword}: taken to be {self.surfaces[0].name}"))
+        if self.stop == len(self.surfaces) - 1:
+            raise source.error("the image is the stop", self.surfaces[self.stop].line)
+        return Prescription(
+            name or Path(source.file).stem,
+            source.file,
+            tuple(self.surfaces),
+            self.stop,
+            object_distance=distance if abs(distance) < FARTHEST else math.inf,
+            notes=tuple(source.notes),
+            **said,
+        )

@@ -7,35 +7,29 @@ made; with its order flag set it does the reverse: turns about z, y and x, then 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Ellipse, Rectangle
-from optics.geometry.pose import Pose, about_axis
+from optics.geometry.pose import about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.zernike import MAX_NOLL
-from optics.raytrace.assembly import Interaction
-from scenes.lens.prescription import (
-    FARTHEST,
+from scenes.lens.prescription import Prescription, Pupil, clear, even_asphere, polynomial
+from scenes.lens.statements import (
+    MOST_SURFACES,
     NO_GLASSES,
     Chain,
     Glasses,
-    LensSurface,
-    Note,
-    Prescription,
-    Pupil,
-    clear,
-    even_asphere,
-    glass_key,
-    polynomial,
+    Source,
+    Statement,
+    index_of,
+    joined,
+    read_lines,
+    require_d_line,
+    statement_of,
 )
-from scenes.lens.statements import MOST_SURFACES, Source, Statement, joined, read_lines, split_words
 
 UNITS = {"MM": 1e-3, "CM": 1e-2, "IN": 25.4e-3, "INCH": 25.4e-3, "ME": 1.0, "M": 1.0, "METER": 1.0}
-D_LINE = 587.5618e-9
-"""Wavelength at which a model glass's index is stated, metres."""
-_D_WIDTH = 0.1e-9
 
 SHAPES = ("STANDARD", "EVENASPH", "ODDASPHE", "XPOLYNOM", "SZERNSAG", "COORDBRK")
 """Kinds of surfaces that are read."""
@@ -121,18 +115,13 @@ def read_zemax(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
     lines = read_lines(source)
     system = _System(source)
     for number, text in enumerate(lines, start=1):
-        words = split_words(text.rstrip("\x1a"))
-        if not words:
-            continue
-        statement = Statement(number, words[0].upper(), words[1:], text.strip())
-        _take(system, statement)
+        if (statement := statement_of(number, text.rstrip("\x1a"))) is not None:
+            _take(system, statement)
     if not system.surfaces:
         raise source.error("no surface in this file", len(lines), allowed="SURF 0, SURF 1, ... of a Zemax file")
     if len(system.surfaces) < 3:
-        problem = "too few surfaces: the file is cut off or no system"
-        raise source.error(
-            problem, system.surfaces[-1].line, f"{len(system.surfaces)} surfaces", "object, optics and image"
-        )
+        problem, found = "too few surfaces: the file is cut off or no system", f"{len(system.surfaces)} surfaces"
+        raise source.error(problem, system.surfaces[-1].line, found, "object, optics and image")
     return _prescription(system, glasses)
 
 
@@ -162,10 +151,6 @@ def _take(system: _System, s: Statement) -> None:
 
 def _take_system(system: _System, s: Statement) -> None:
     source = system.source
-
-    def numbers(what: str) -> tuple[float, ...]:
-        return tuple(source.finite(s, k, what) for k in range(len(s.words)))
-
     match s.command:
         case "MODE":
             if s.words[:1] != ("SEQ",):
@@ -193,20 +178,20 @@ def _take_system(system: _System, s: Statement) -> None:
             system.field_count = source.whole(s, 2, "the number of fields", 0, 10_000, 1)
             system.wave_count = source.whole(s, 3, "the number of wavelengths", 0, 10_000, 1)
         case "XFLN":
-            system.x, system.field_line = numbers("a field"), s.line
+            system.x, system.field_line = source.numbers(s, "a field"), s.line
         case "YFLN":
-            system.y, system.field_line = numbers("a field"), s.line
+            system.y, system.field_line = source.numbers(s, "a field"), s.line
         case "WAVM":
             number = source.whole(s, 0, "the wavelength's number", 1, 10_000)
             system.waves[number] = _wave(source, s, source.finite(s, 1, "the wavelength"))
         case "WAVL" | "WAVN":
-            for k, value in enumerate(numbers("a wavelength"), start=1):
+            for k, value in enumerate(source.numbers(s, "a wavelength"), start=1):
                 system.waves[k] = _wave(source, s, value)
             system.wave_count = system.wave_count or len(s.words)
         case "PWAV":
             system.primary = source.whole(s, 0, "the primary wavelength's number", 1, 10_000)
         case _:  # vignetting factors: shares by which a field's pupil is compressed
-            if any(v != 0.0 for v in numbers("a vignetting factor")):
+            if any(v != 0.0 for v in source.numbers(s, "a vignetting factor")):
                 source.note(s, "vignetting factors are not carried; beams are as wide as the stop lets them")
 
 
@@ -237,9 +222,8 @@ def _take_surface(system: _System, surface: _Surface, s: Statement) -> None:
         case "CONI":
             surface.conic = source.finite(s, 0, "the conic constant")
         case "PARM":
-            surface.parameters[source.whole(s, 0, "the parameter's number", 0, 250)] = source.finite(
-                s, 1, "the parameter"
-            )
+            number = source.whole(s, 0, "the parameter's number", 0, 250)
+            surface.parameters[number] = source.finite(s, 1, "the parameter")
         case "XDAT":
             surface.extra[source.whole(s, 0, "the number of the datum", 1, 1000)] = source.finite(s, 1, "the datum")
         case "DISZ":
@@ -270,9 +254,7 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
     if not waves:
         raise source.error("no wavelength in this file", 1, allowed="WAVM or WAVL")
     primary = system.waves.get(system.primary, waves[0])
-    chain, index, stop = Chain(), 1.0, -1
-    read, medium = system.surfaces, ""
-    distance = read[0].thickness * scale
+    chain, read = Chain(source), system.surfaces
     if read[0].kind == "COORDBRK" or read[0].glass:
         raise source.error("the object is a coordinate break or stands in glass", read[0].line)
     for k, surface in enumerate(read[1:], start=1):
@@ -282,44 +264,34 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
                 raise source.error("a coordinate break with a glass of its own", surface.glass_line)
             _break(source, chain, surface, scale)
         else:
-            made, index, medium = _made(system, surface, chain.pose, index, medium, primary, glasses, k)
-            idle = made.interaction is Interaction.PASS and not made.every_edge and made.surface.is_plane
-            if surface.stop:
-                if stop >= 0:
-                    raise source.error("a second stop", surface.line)
-                stop = len(chain.surfaces)
-            if not idle or surface.stop or last:
-                chain.add(made)
+            name = surface.name if surface.name.isidentifier() else f"S{k}"
+            shape = _shape(source, surface, scale)
+            try:
+                edges = _edges_of(surface, scale)
+            except ValueError as error:
+                raise source.error(str(error), max(s.line for s, _, _ in surface.edges.values())) from None
+            behind = _behind(source, surface, primary, glasses)
+            chain.meet(name, shape, edges, behind, surface.line, surface.stop, last)
         if not last:
             if not math.isfinite(surface.thickness):
                 raise source.error("an infinite distance behind an optical surface", surface.line)
             chain.move((0.0, 0.0, surface.thickness * scale))
-    if stop < 0:
-        stop = 0
-        source.notes.append(Note(0, "", f"no STOP: taken to be {chain.surfaces[0].name}"))
-    if stop == len(chain.surfaces) - 1:
-        raise source.error("the image is the stop", chain.surfaces[stop].line)
-    fields = _fields(system)
     pupil = system.pupil
     if pupil is not None and pupil.kind == "diameter":
         pupil = Pupil("diameter", pupil.value * scale, pupil.line)
     elif pupil is not None and pupil.kind == "stop":
         radius = next((s.radius for s in read if s.stop), 0.0) * scale
         pupil = Pupil("stop", radius, pupil.line) if radius > 0.0 else None
-    return Prescription(
-        system.name or Path(source.file).stem,
-        source.file,
-        tuple(chain.surfaces),
-        stop,
-        primary,
-        tuple(dict.fromkeys(waves)),
-        fields,
-        ("angles", "object heights", "paraxial image heights", "real image heights", "theodolite angles")[
-            min(system.field_type, 4)
-        ],
-        pupil,
-        distance if abs(distance) < FARTHEST else math.inf,
-        tuple(source.notes),
+    kinds = ("angles", "object heights", "paraxial image heights", "real image heights", "theodolite angles")
+    return chain.prescription(
+        "STOP",
+        read[0].thickness * scale,
+        system.name,
+        wavelength=primary,
+        wavelengths=tuple(dict.fromkeys(waves)),
+        fields=_fields(system),
+        field_kind=kinds[min(system.field_type, 4)],
+        pupil=pupil,
     )
 
 
@@ -346,60 +318,18 @@ def _break(source: Source, chain: Chain, surface: _Surface, scale: float) -> Non
         chain.move(shift)
 
 
-def _made(
-    system: _System,
-    surface: _Surface,
-    pose: Pose,
-    index: float,
-    medium: str,
-    wavelength: float,
-    glasses: Glasses,
-    k: int,
-) -> tuple[LensSurface, float, str]:
-    """A surface with what lies behind it."""
-    source = system.source
-    shape = _shape(source, surface, system.scale)
-    name = surface.name if surface.name.isidentifier() else f"S{k}"
-    try:
-        aperture, blocked = _edges_of(source, surface, system.scale)
-    except ValueError as error:
-        line = max(s.line for s, _, _ in surface.edges.values())
-        raise source.error(str(error), line) from None
-    kind = surface.glass[0].upper() if surface.glass else ""
-    if kind == "MIRROR":
-        made = LensSurface(name, pose, shape, Interaction.REFLECT, index, aperture, surface.line, medium, blocked)
-        return made, index, medium
-    behind, glass = 1.0, ""
-    if kind:
-        behind, glass = _index(source, surface, wavelength, glasses), surface.glass[0]
-    how = Interaction.PASS if behind == index else Interaction.REFRACT
-    return LensSurface(name, pose, shape, how, behind, aperture, surface.line, glass, blocked), behind, glass
-
-
-def _index(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> float:
-    """Of the glass behind a surface at the primary wavelength."""
-    words = surface.glass
-    statement = Statement(surface.glass_line, "GLAS", words, " ".join(words))
+def _behind(source: Source, surface: _Surface, wavelength: float, glasses: Glasses) -> tuple[float, str] | None:
+    """Index at the primary wavelength, and name, of what lies behind a surface; None for a mirror."""
+    words, line = surface.glass, surface.glass_line
+    if not words:
+        return 1.0, ""
+    if words[0].upper() == "MIRROR":
+        return None
     if words[0] == "___BLANK" or (len(words) > 1 and words[1] == "1"):
-        stated = source.finite(statement, 3, "the index")
-        if abs(wavelength - D_LINE) > _D_WIDTH:
-            problem = "a model glass, whose index is stated at 587.56 nm alone"
-            raise source.error(
-                problem, surface.glass_line, f"{words[0]} at {wavelength * 1e9:.6g} nm", "a catalogue's glass"
-            )
-        return stated
-    found = glasses.get(glass_key(words[0]))
-    if found is None:
-        problem, allowed = "unknown glass", "glasses of the twin, and of a catalogue given with --glasses FILE.agf"
-        raise source.error(problem, surface.glass_line, words[0], allowed)
-    return _at(source, found, wavelength, surface.glass_line)
-
-
-def _at(source: Source, glass: Callable[[float], float], wavelength: float, line: int) -> float:
-    try:
-        return glass(wavelength)
-    except ValueError as error:
-        raise source.error(str(error), line) from None
+        stated = source.finite(Statement(line, "GLAS", words, " ".join(words)), 3, "the index")
+        require_d_line(source, "model", words[0], wavelength, line)
+        return stated, words[0]
+    return index_of(source, glasses, words[0], wavelength, line), words[0]
 
 
 def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
@@ -440,7 +370,7 @@ def _shape(source: Source, surface: _Surface, scale: float) -> Surface:
     return shape
 
 
-def _edges_of(source: Source, surface: _Surface, scale: float) -> tuple[Aperture | None, tuple[Edge, ...]]:
+def _edges_of(surface: _Surface, scale: float) -> tuple[Aperture | None, tuple[Edge, ...]]:
     """Clear aperture that the file states, and what it blocks; a semi-diameter alone is a drawing's."""
     cx, cy = surface.centre
     centre = (cx * scale, cy * scale)

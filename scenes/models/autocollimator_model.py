@@ -14,7 +14,6 @@ along its -X, facing the lens; a turn of the mirror by +X moves the spot to larg
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +23,7 @@ from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import Body, RigidTree
 from optics.materials.glass import glass
 from optics.raytrace.assembly import Assembly, Element, Interaction
-
-if TYPE_CHECKING:
-    from scenes.specs.autocollimators import AutocollimatorTestSpec, LensSpec
+from scenes.specs.autocollimators import AutocollimatorTestSpec, LensSpec
 
 BENCH = "bench"
 AXES = ("X", "Y", "Z")
@@ -95,7 +92,7 @@ class Bench:
 
     @property
     def numerical_aperture(self) -> float:
-        """Of the returned beam at the area CCD."""
+        """Numerical aperture of the returned beam at the area CCD."""
         return 0.5 * self.spec.mirrors.aperture / self.focal_length
 
     def frame(self, unit: int) -> np.ndarray:

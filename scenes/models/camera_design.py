@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,10 @@ from scenes.models.camera_sharpness import FocalPlane
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, ImageSpec
 from scenes.specs.load import find_camera, load_camera
 from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.errors import names_text, nearest
+from scenes.yaml.errors import unknown
 from scenes.yaml.spec import validate
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
+from scenes.yaml.yaml_file import read_yaml
 
 _RINGS = 5
 _ACROSS, _ALONG = (0.0, 0.5, 1.0), (-1.0, 0.0, 1.0)
@@ -50,8 +49,7 @@ def resolve_design(path: str | Path) -> CameraDesignSetup:
     known = (*setup.camera.mirrors, IMAGE)
     for name in setup.test.vary:
         if name not in known:
-            allowed, meant = names_text(known), nearest(name, known)
-            raise setup.test.error("no such mirror", ("vary", name), found=name, allowed=allowed, suggestion=meant)
+            raise setup.test.error(unknown("no such mirror", name, known), ("vary", name))
     return setup
 
 
@@ -71,16 +69,10 @@ def beams_of(camera: CameraSpec) -> Beams:
 
 def operands_of(setup: CameraDesignSetup, principal_distance: float, envelope: float) -> Operands:
     """What is asked for, given the start's principal distance and envelope, metres."""
-    largest = None if setup.test.envelope is None else setup.test.envelope * envelope
-    camera = setup.camera
-    return Operands(
-        camera.wavelength,
-        principal_distance,
-        largest,
-        setup.test.clearance,
-        camera.edge_margin,
-        anamorphism=setup.test.anamorphism,
-    )
+    test, camera = setup.test, setup.camera
+    largest = None if test.envelope is None else test.envelope * envelope
+    asked = camera.wavelength, principal_distance, largest, test.clearance, camera.edge_margin
+    return Operands(*asked, anamorphism=test.anamorphism)
 
 
 def variables_of(spec: CameraDesignSpec) -> tuple[Variable, ...]:
@@ -117,19 +109,10 @@ def camera_of(start: CameraSpec, prescription: Prescription, name: str, descript
     return start.model_copy(update=update)
 
 
-def camera_file(camera: CameraSpec, remark: str) -> str:
-    """Text of the camera's YAML file, with remarks at its top."""
-    plain: Mapping[str, object] = camera.plain()
-    head = "".join(f"# {line}\n" for line in remark.splitlines())
-    return head + dump_yaml({k: v for k, v in plain.items() if v not in ("", {})})
-
-
 def with_plane(camera: CameraSpec, plane: FocalPlane) -> CameraSpec:
     """The camera with another image plane; it remembers where it was read."""
     image = ImageSpec.model_construct(z=plane.z, tilt=plane.tilt or None)
-    moved = camera.model_copy(update={"image": image}).with_source(camera.source)
-    assert isinstance(moved, CameraSpec)
-    return moved
+    return camera.model_copy(update={"image": image}).with_source(camera.source)
 
 
 def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
@@ -149,7 +132,7 @@ def file_with_plane(camera: CameraSpec, plane: FocalPlane, name: str) -> str:
     source = camera.source
     if source.prefix or not source.file:
         moved = with_plane(camera, plane).model_copy(update={"name": name})
-        return camera_file(moved, f"The image plane of {camera.name} moved by python -m twin.camera --refocus.")
+        return moved.file_text(f"The image plane of {camera.name} moved by python -m twin.camera --refocus.")
     yaml = YAML(typ="rt", pure=True)
     yaml.preserve_quotes = True
     yaml.width = 140

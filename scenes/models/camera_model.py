@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,14 +27,11 @@ from optics.raytrace.first_order import FirstOrder, first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.specs.camera import CameraSpec
+from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
 from scenes.specs.job import NodeInfo, perturbation_issues
 from scenes.yaml.errors import InputError
-
-if TYPE_CHECKING:
-    from scenes.specs.camera import CameraSpec, MirrorSpec
 
 
 def focal_plane_body(root: str) -> str:
@@ -318,16 +314,8 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
-    return CameraModel(
-        spec,
-        surfaces,
-        apertures,
-        camera_frame,
-        focal_plane,
-        chief,
-        image_direction,
-        image_centre - focal_length * image_direction,
-    )
+    rear_node = image_centre - focal_length * image_direction
+    return CameraModel(spec, surfaces, apertures, camera_frame, focal_plane, chief, image_direction, rear_node)
 
 
 def surface_of(mirror: MirrorSpec) -> Surface:

@@ -34,7 +34,7 @@ FIELDS = tuple((x, y) for x in (-1.0, -0.5, 0.0, 0.5, 1.0) for y in (-1.0, 0.0, 
 """Shares of the half field along the line and along the track, at which a camera is judged and its focus sought."""
 
 _RINGS = 3
-"""Of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
+"""Rings of the quadrature over the stop: exact for squares of wavefronts to fifth order."""
 
 EVEN = 10_000
 """Rays of a beam that edges of surfaces cut, evenly over the stop. What they take is right to 0.1 %, and rms wavefront
@@ -194,7 +194,7 @@ class FieldBeams:
 
     @property
     def share(self) -> np.ndarray:
-        """Of the light that comes through, (N,), or (F, N) where edges stop some."""
+        """Share of each ray in the light that comes through, (N,), or (F, N) where edges stop some."""
         if self.lit is None:
             return self.nodes.share
         share = self.nodes.share * self.lit

@@ -86,15 +86,9 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
 
 def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
     """All pairs of bodies that stand in each other or nearer than ``LEAST_GAP``, as designed; deepest first."""
-    bodies = convex_bodies(instrument)
-    found = []
-    for first, second in _pairs(instrument, bodies):
-        if _between_boxes(bodies[first], bodies[second]) > LEAST_GAP:
-            continue
-        gap = separation(bodies[first], bodies[second])
-        if gap < LEAST_GAP:
-            found.append(Overlap(first, second, -gap))
-    return tuple(sorted(found, key=lambda overlap: -overlap.depth))
+    known = Clearances.of(instrument)
+    found = [(*pair, gap) for pair, gap in zip(known.pairs, known.gaps, strict=True) if gap < LEAST_GAP]
+    return tuple(Overlap(known.paths[i], known.paths[j], -gap) for i, j, gap in sorted(found, key=lambda one: one[2]))
 
 
 def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -140,7 +134,7 @@ class Clearances:
         gaps = []
         for first, second in named:
             gap = _between_boxes(bodies[first], bodies[second])
-            gaps.append(gap if gap > 0.0 else separation(bodies[first], bodies[second]))
+            gaps.append(gap if gap > LEAST_GAP else separation(bodies[first], bodies[second]))
         pairs = np.array([(number[a], number[b]) for a, b in named], int).reshape(-1, 2)
         return cls(paths, corners, poses, pairs, np.array(gaps))
 

@@ -21,7 +21,7 @@ from scenes.specs.course import noll
 from scenes.specs.disturbances import CauseSpec, DisturbancesSpec, TimeLawSpec
 from scenes.specs.job import NodeInfo
 from scenes.specs.resolved import ResolvedJob
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.units import ANGLE, parse_quantity
 
 AXES = "xyz"
@@ -42,7 +42,8 @@ HEAT = ("temperature", "gradient")
 _NEEDS = {"gradient": "temperature"}
 """What a node must allow, where that is not called as the kind is."""
 
-IssueAt = Callable[..., Issue]
+_Where = Callable[[str, KeyPath, Problem], Issue]
+"""Makes an issue of what is wrong at a key of a cause."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Component:
 
     @property
     def name(self) -> str:
-        """As ``correlations`` name it: ``base/forward/M2 shift z``."""
+        """Name of the component, as ``correlations`` have it: ``base/forward/M2 shift z``."""
         return f"{self.body} {self.what}"
 
     @property
@@ -84,7 +85,7 @@ class Component:
 
     @property
     def unit_size(self) -> float:
-        """The same in SI."""
+        """Size of that unit in SI."""
         return UNITS[self.kind][1]
 
 
@@ -151,23 +152,21 @@ def stated_motions(resolved: ResolvedJob, instrument: Instrument) -> StatedMotio
     spec = resolved.disturbances
     if spec is None:
         return None
-    return motions_of_spec(spec, instrument, lambda cause, key: _issue_at(resolved, cause, key))
+    return motions_of_spec(spec, instrument, lambda *wrong: _issue_at(resolved, *wrong))
 
 
-def motions_of_spec(
-    spec: DisturbancesSpec, instrument: Instrument, at: Callable[[str, KeyPath], IssueAt] | None = None
-) -> StatedMotions:
+def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where | None = None) -> StatedMotions:
     """What a disturbances file says of an instrument.
 
     Args:
         spec: the file.
         instrument: on whose bodies.
-        at: (cause, key in it) -> what makes an issue there; by default of the file itself.
+        at: makes an issue of what is wrong at a key of a cause; by default one of the file itself.
 
     Raises:
         InputError: as ``stated_motions``.
     """
-    where = at if at is not None else lambda cause, key: _issue_of(spec, ("causes", cause, *key))
+    where = at or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
     glass = {solid.path for solid in instrument.solids if solid.transparent}
     components: list[Component] = []
     laws: list[TimeLawSpec] = []
@@ -208,8 +207,8 @@ def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalMod
     try:
         thermal.check(warmer)
     except TemperatureError as error:
-        issue = _issue_at(resolved, cause_of[error.origin], ("temperature",))
-        raise InputError(issue(str(error), allowed=error.allowed)) from error
+        wrong = Problem(str(error), allowed=error.allowed)
+        raise InputError(_issue_at(resolved, cause_of[error.origin], ("temperature",), wrong)) from error
 
 
 def state_of(
@@ -280,27 +279,23 @@ def _matches(pattern: str, path: str, cameras: Iterable[str]) -> bool:
     return re.fullmatch("".join(any_of.get(part, re.escape(part)) for part in parts), path) is not None
 
 
-def _issue_of(spec: DisturbancesSpec, key: KeyPath) -> IssueAt:
-    return lambda problem, **more: spec.issue(problem, key, **more)
-
-
-def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath) -> IssueAt:
+def _issue_at(resolved: ResolvedJob, cause: str, key: KeyPath, wrong: Problem) -> Issue:
     """An issue at the line that said it: the job's where it changes the file, or names the bodies to which the file's
     motions are now given.
     """
     changes = resolved.job.disturbances
     own = changes.causes.get(cause) if changes is not None else None
+    at: KeyPath = ("disturbances", "causes", cause)
     if own is not None and (not key or key[0] in own.given):
-        return lambda problem, **more: resolved.job.issue(problem, ("disturbances", "causes", cause, *key), **more)
+        return resolved.job.issue(wrong, (*at, *key))
     if own is not None and "bodies" in own.given:
-        text = f"{key[0]} of {cause}: "
-        at: KeyPath = ("disturbances", "causes", cause, "bodies")
-        return lambda problem, **more: resolved.job.issue(text + problem, at, **more)
+        text = f"{key[0]} of {cause}: {wrong.problem}"
+        return resolved.job.issue(Problem(text, wrong.found, wrong.allowed, wrong.suggestion), (*at, "bodies"))
     assert resolved.disturbances is not None
-    return _issue_of(resolved.disturbances, ("causes", cause, *key))
+    return resolved.disturbances.issue(wrong, ("causes", cause, *key))
 
 
-def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: Callable[[str, KeyPath], IssueAt]) -> list[Issue]:
+def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: _Where) -> list[Issue]:
     """One issue for each pattern of which the instrument has no body, at the first cause that has it."""
     first: dict[str, tuple[str, int]] = {}
     causes: dict[str, list[str]] = {}
@@ -314,8 +309,7 @@ def _strangers(spec: DisturbancesSpec, instrument: Instrument, where: Callable[[
         also = f", nor for {names_text(causes[pattern][1:])}" if causes[pattern][1:] else ""
         text = f"{instrument.spec.name} has no body of this name{also}"
         meant, allowed = _nearest(pattern, instrument.nodes), names_text(sorted(instrument.nodes))
-        issue = where(name, ("bodies", k))
-        out.append(issue(text, found=pattern, allowed=allowed, suggestion=meant))
+        out.append(where(name, ("bodies", k), Problem(text, shown(pattern), allowed, meant)))
     return out
 
 
@@ -334,7 +328,7 @@ def _of_cause(
     bodies: Sequence[str],
     instrument: Instrument,
     glass: set[str],
-    where: Callable[[str, KeyPath], IssueAt],
+    where: _Where,
 ) -> tuple[list[Component], list[Issue]]:
     """The components that a cause gives to bodies, also those of zero sigma; and what is wrong, one issue a key."""
     components: list[Component] = []
@@ -354,12 +348,10 @@ def _of_cause(
     issues = []
     if turned:
         known = tuple(dict.fromkeys((ORIGIN, *instrument.nodes[turned[0]].pivots)))
-        text, meant = f"{_some(turned)} has no such pivot", nearest(str(cause.pivot), known)
-        issue = where(name, ("pivot",))
-        issues.append(issue(text, found=cause.pivot, allowed=names_text(known), suggestion=meant))
+        issues.append(where(name, ("pivot",), unknown(f"{_some(turned)} has no such pivot", cause.pivot, known)))
     for key, paths in refused.items():
         allowed = names_text(sorted(_possible(instrument.nodes[paths[0]], paths[0] in glass))) or "nothing"
-        issues.append(where(name, key)(f"{_some(paths)} does not allow {key[0]}", allowed=allowed))
+        issues.append(where(name, key, Problem(f"{_some(paths)} does not allow {key[0]}", allowed=allowed)))
     return components, issues
 
 
@@ -387,7 +379,7 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
 
 
 def _correlation(
-    name: str, cause: CauseSpec, own: Sequence[Component], where: Callable[[str, KeyPath], IssueAt]
+    name: str, cause: CauseSpec, own: Sequence[Component], where: _Where
 ) -> tuple[np.ndarray, list[Issue]]:
     """Correlation matrix of a cause's components, and what is wrong with it.
 
@@ -403,18 +395,16 @@ def _correlation(
             count = len({c.body for c in own})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
             text = "bodies cannot all move against one another so much"
-            return matrix, [where(name, ("together",))(text, found=cause.together, allowed=allowed)]
+            return matrix, [where(name, ("together",), Problem(text, shown(cause.together), allowed))]
     known = {c.name: k for k, c in enumerate(own)}
     said: dict[tuple[int, int], float] = {}
     for n, group in enumerate(cause.correlations):
         key: KeyPath = ("correlations", n)
-        unknown = [k for k, text in enumerate(group.between) if text not in known]
-        for k in unknown:
-            text, meant = group.between[k], nearest(group.between[k], known)
-            issue = where(name, (*key, "between", k))
-            allowed = names_text(sorted(known))
-            issues.append(issue(f"no component of {name}", found=text, allowed=allowed, suggestion=meant))
-        if unknown:
+        strange = [k for k, text in enumerate(group.between) if text not in known]
+        for k in strange:
+            wrong = unknown(f"no component of {name}", group.between[k], sorted(known))
+            issues.append(where(name, (*key, "between", k), wrong))
+        if strange:
             continue
         at = [known[text] for text in group.between]
         for i, j in combinations(range(len(at)), 2):
@@ -422,7 +412,7 @@ def _correlation(
             before = said.setdefault((min(at[i], at[j]), max(at[i], at[j])), value)
             if before != value:
                 text = f"{group.between[i]} and {group.between[j]} have a correlation already, {before:g}"
-                issues.append(where(name, key)(text, found=value, allowed="one of them"))
+                issues.append(where(name, key, Problem(text, shown(value), "one of them")))
         matrix[np.ix_(at, at)] = np.array(group.table)
     least = _least(matrix)
     if not issues and least < _INDEFINITE:
@@ -430,8 +420,8 @@ def _correlation(
             "these correlations cannot be, alone or with those before them: the matrix is not positive definite, an "
             f"eigenvalue is {least:.3g}"
         )
-        issue = where(name, ("correlations", _first_impossible(cause, known)))
-        issues.append(issue(text, allowed="correlations of real quantities: smaller ones"))
+        wrong = Problem(text, allowed="correlations of real quantities: smaller ones")
+        issues.append(where(name, ("correlations", _first_impossible(cause, known)), wrong))
     return matrix, issues
 
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations, permutations
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -43,12 +42,9 @@ from scenes.models.monitor_chain import (
 from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
-from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel
+from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec
 from scenes.specs.job import NodeInfo
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
-
-if TYPE_CHECKING:
-    from scenes.specs.instrument import InstrumentSpec
+from scenes.yaml.errors import InputError, Issue, unknown
 
 _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light
 
@@ -126,13 +122,8 @@ def _build(
             way = tuple(e.name for e in chain.elements)
             forward = tuple(f"{name}/{m}" for m in model.mirrors)
             sequences[f"{channel.key}/outgoing"] = (*forward[::-1], *way)
-            sequences[f"{channel.key}/monitor"] = (
-                *forward[::-1],
-                *way,
-                *way[-2::-1],
-                *forward,
-                f"{channel.key}/area_ccd",
-            )
+            there, back = (*forward[::-1], *way), (*way[-2::-1], *forward, f"{channel.key}/area_ccd")
+            sequences[f"{channel.key}/monitor"] = (*there, *back)
             chains[channel.key] = chain
         channels += own
     solids = tuple(solid for chain in chains.values() for solid in chain.solids)
@@ -256,13 +247,7 @@ def _baffles(spec: InstrumentSpec, tree: RigidTree) -> tuple[Plate, ...]:
     out: list[Plate] = []
     for name, baffle in spec.baffles.items():
         if baffle.body not in tree.paths:
-            raise spec.error(
-                "no such body",
-                ("baffles", name, "body"),
-                found=baffle.body,
-                allowed=names_text(tree.paths),
-                suggestion=nearest(baffle.body, tree.paths),
-            )
+            raise spec.error(unknown("no such body", baffle.body, tree.paths), ("baffles", name, "body"))
         out += baffle.plates(name)
     return tuple(out)
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from optics.geometry.pose import triple
 from optics.geometry.tree import Motion, State, compose
 from optics.thermal.nodal_deformation import NodalDeformation
-from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import UNITS, StatedMotions
-from scenes.models.heated_bodies import HeatedBody, heated_bodies, with_heat
 from scenes.models.instrument_model import Instrument
+from scenes.models.nodal_bodies import HeatedBody, deformed_face, heated_bodies, with_heat
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, PerturbationSpec

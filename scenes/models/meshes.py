@@ -45,10 +45,7 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     import trimesh
 
     x0, x1, y0, y1 = aperture.bounds
-    s = np.linspace(-1.0, 1.0, cells + 1)
-    u, v = np.meshgrid(s, s)
-    u, v = _onto(aperture, u, v)
-    x, y = 0.5 * (x0 + x1) + 0.5 * (x1 - x0) * u, 0.5 * (y0 + y1) + 0.5 * (y1 - y0) * v
+    x, y, face = _grid(aperture, 0.5 * (x1 - x0), 0.5 * (y1 - y0), cells)
     z = surface.sag(x, y)
     thickness = THICKNESS * max(x1 - x0, y1 - y0)
     flat = (z.max() + thickness) if back > 0 else (z.min() - thickness)
@@ -56,8 +53,6 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     front = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     rear = front.copy()
     rear[:, 2] = flat
-    i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
-    face = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
     up, down = np.arange(cells), np.arange(cells, 0, -1)
     rim = np.concatenate([up, up * n + cells, cells * n + down, down * n])
     after = np.roll(rim, -1)
@@ -67,16 +62,24 @@ def mirror_mesh(surface: Surface, aperture: Aperture, back: float, cells: int = 
     return trimesh.Trimesh(np.concatenate([front, rear]), faces[:, ::-1] if back > 0 else faces, process=False)
 
 
-def _onto(aperture: Aperture, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places of a square grid over [-1, 1]^2 on the outline of an aperture's mesh: a disk ring by ring, or a box."""
+def _grid(aperture: Aperture, half_x: float, half_y: float, cells: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places x, y of a grid about the middle of an aperture, and the triangles between them, (T, 3). The grid has the
+    outline of the aperture's mesh: a disk, ring by ring, or a box.
+    """
+    x0, x1, y0, y1 = aperture.bounds
+    s, n = np.linspace(-1.0, 1.0, cells + 1), cells + 1
+    u, v = np.meshgrid(s, s)
     match aperture:
         case Circle():
             ring, angle = np.maximum(np.abs(u), np.abs(v)), np.arctan2(v, u)
-            return ring * np.cos(angle), ring * np.sin(angle)
+            u, v = ring * np.cos(angle), ring * np.sin(angle)
         case Rectangle() | Ellipse():
-            return u, v
+            pass
         case _:
             assert_never(aperture)
+    i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
+    triangles = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
+    return 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v, triangles
 
 
 def behind(model: CameraModel, mirror: str) -> float:
@@ -128,16 +131,10 @@ def sheet_mesh(surface: Surface, aperture: Aperture) -> tuple[np.ndarray, np.nda
     x0, x1, y0, y1 = aperture.bounds
     half_x, half_y = 0.5 * (x1 - x0), 0.5 * (y1 - y0)
     half_x, half_y = (max((1.0 + MARGIN) * h, h + LEAST_MARGIN) for h in (half_x, half_y))
-    s = np.linspace(-1.0, 1.0, cells + 1)
-    u, v = np.meshgrid(s, s)
-    u, v = _onto(aperture, u, v)
-    x, y = 0.5 * (x0 + x1) + half_x * u, 0.5 * (y0 + y1) + half_y * v
+    x, y, triangles = _grid(aperture, half_x, half_y, cells)
     z = surface.sag(x, y)
     if not np.all(np.isfinite(z)):
         raise UnphysicalError("a surface ends before its clear aperture does")
-    n = cells + 1
-    i = (np.arange(cells)[:, None] * n + np.arange(cells)).ravel()
-    triangles = np.concatenate([np.stack([i, i + 1, i + n + 1], 1), np.stack([i, i + n + 1, i + n], 1)])
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     middles = 0.5 * (vertices[triangles] + vertices[np.roll(triangles, 1, axis=1)])
     apart = np.abs(surface.sag(middles[..., 0], middles[..., 1]) - middles[..., 2])

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -31,12 +30,18 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import LINE_AXIS, REFERENCE, CameraModel
 from scenes.models.instrument_model import MisplacedError, key_of
-from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, PRISM_0, PRISM_180, Channel, prism_of
+from scenes.specs.instrument import (
+    BASE,
+    CENTRAL_KEY,
+    CENTRAL_PRISM,
+    PRISM_0,
+    PRISM_180,
+    Channel,
+    ChannelParts,
+    InstrumentSpec,
+    prism_of,
+)
 from scenes.yaml.errors import KeyPath
-
-if TYPE_CHECKING:
-    from scenes.specs.instrument import ChannelParts, InstrumentSpec
-
 
 _CARRIED = "a field and a pupil_offset whose beam all mirrors of the camera carry"
 _FACET = "a position to which the prisms, with their angle_errors, lead the beam"
@@ -115,7 +120,7 @@ def _leaving(
 def _traced_out(
     model: CameraModel, channels: Sequence[Channel], distance: float, to_base: Pose, backend: Backend
 ) -> list[LeavingBeam]:
-    """As ``_leaving``; an error is about all channels."""
+    """Trace the beams of ``_leaving``; an error is about all channels."""
     frame = model.camera_frame
     reference = Pose(frame.rotation, frame.apply(np.array([0.0, 0.0, distance])))
     bare = model.bare_assembly(apertures=False)
@@ -200,12 +205,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
 
 
 def monitor_chain(
-    spec: InstrumentSpec,
-    channel: Channel,
-    given: ChannelParts,
-    beam: LeavingBeam,
-    centre: np.ndarray,
-    to_base: Pose,
+    spec: InstrumentSpec, channel: Channel, given: ChannelParts, beam: LeavingBeam, centre: np.ndarray, to_base: Pose
 ) -> MonitorChain:
     """Place both prisms and the facet of a channel.
 
@@ -256,11 +256,7 @@ def monitor_chain(
     )
     second = _made(spec, channel, PRISM_0, "shift", small.reflector, mount)
     face = Element(
-        f"{channel.key}/return_face",
-        channel.face_body,
-        plane(),
-        Interaction.REFLECT,
-        Circle(0.5 * channel.aperture),
+        f"{channel.key}/return_face", channel.face_body, plane(), Interaction.REFLECT, Circle(0.5 * channel.aperture)
     )
     facet = Body(channel.face_body, Pose(_facet_axes(up), centre - apex))
     return MonitorChain(

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -19,26 +19,16 @@ from optics.geometry.solid import solid_mesh
 from optics.materials.material import material
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken
+from scenes.specs import instrument as instruments
 from scenes.specs.camera import CameraSpec, MonitorDesignSpec, PrismChoiceSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import (
-    CENTRAL_PRISM,
-    SIDES,
-    ChannelParts,
-    ChannelSpec,
-    InstrumentSpec,
-    MountedCameraSpec,
-    ReturnFaceSpec,
-)
 from scenes.specs.load import read_design
 from scenes.specs.resolved import ExperimentSetup, read_setup
 from scenes.yaml.spec import Paths, validate
-from scenes.yaml.yaml_file import dump_yaml, read_yaml
-
-if TYPE_CHECKING:
-    from scenes.models.instrument_model import Instrument
+from scenes.yaml.yaml_file import read_yaml
 
 RAYS = 2000
 """Rays of an imaging beam by which shares of the pupil are told: to about a thousandth."""
@@ -57,7 +47,7 @@ class MonitorDesignSetup(ExperimentSetup[MonitorDesignSpec]):
         detectors: data sheets of the area CCDs that the design may choose from, by its names for them.
     """
 
-    instrument: InstrumentSpec
+    instrument: instruments.InstrumentSpec
     cameras: Paths[CameraSpec]
     detector: DetectorSpec
     disturbances: Paths[DisturbancesSpec]
@@ -73,15 +63,7 @@ def resolve_monitor_design(path: str | Path) -> MonitorDesignSetup:
     setup = read_setup(MonitorDesignSetup, path)
     if setup is None:
         test = validate(MonitorDesignSpec, read_yaml(path))
-        instrument, cameras, detector, disturbances, detectors = read_design(test)
-        setup = MonitorDesignSetup.model_construct(
-            test=test,
-            instrument=instrument,
-            cameras=FrozenMap(cameras),
-            detector=detector,
-            disturbances=FrozenMap(disturbances),
-            detectors=FrozenMap(detectors),
-        )
+        setup = MonitorDesignSetup.model_construct(test=test, **read_design(test))
     test, start = setup.test, setup.instrument
     if len(start.cameras) != 2:
         raise test.error("a layout is designed for a pair", ("instrument",), found=f"{len(start.cameras)} cameras")
@@ -122,7 +104,7 @@ class Beam:
     area_ccd: str = AS_STARTED
 
     def changed(self, numbers: Mapping[str, float]) -> Beam:
-        """The same with other continuous numbers, by their names."""
+        """Return the beam with other continuous numbers, by their names."""
         values: Mapping[str, Any] = numbers
         return replace(self, **values)
 
@@ -157,7 +139,7 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
     return tuple(beams)
 
 
-def _prisms_of(setup: MonitorDesignSetup, one: ChannelParts) -> str:
+def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
     """Name of the prisms that a channel of the start has."""
     monitor = setup.instrument.monitor
     has = [(prism.material, prism.kind) for prism in (one.prism_180, one.prism_0)]
@@ -168,9 +150,8 @@ def _prisms_of(setup: MonitorDesignSetup, one: ChannelParts) -> str:
         if parts == has:
             return name
     problem = f"the channels of {setup.instrument.name} have prisms that the design does not name"
-    raise setup.test.error(
-        problem, ("prisms",), found=f"{has[0]}, {has[1]}", allowed="these, under a name of one's own"
-    )
+    allowed = "these, under a name of one's own"
+    raise setup.test.error(problem, ("prisms",), found=f"{has[0]}, {has[1]}", allowed=allowed)
 
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:
@@ -186,12 +167,12 @@ def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]
     return np.array([[field, *offset, *spread] for field, offset, spread in places])
 
 
-def _toward(spec: InstrumentSpec, site: MountedCameraSpec) -> float:
+def _toward(spec: instruments.InstrumentSpec, site: instruments.MountedCameraSpec) -> float:
     """+1 where the central prism lies on the camera's +X side, else -1."""
     return 1.0 if spec.central_prism.position[0] > site.position[0] else -1.0
 
 
-def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
+def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.InstrumentSpec:
     """The instrument that has these beams; all else as in the start, but for its name, light, frames, area CCDs and the
     central prism's material.
 
@@ -205,7 +186,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> InstrumentSpec:
     for name, site in start.cameras.items():
         channels = {}
         for n, beam in enumerate(beams):
-            ends = dict(zip(SIDES, (1.0, -1.0), strict=True))
+            ends = dict(zip(instruments.SIDES, (1.0, -1.0), strict=True))
             for side, end in ends.items():
                 offset = (_toward(start, site) * beam.pupil_x, end * beam.pupil_y)
                 channels[channel_name(side, n)] = _channel(setup, beam, end * beam.field, offset)
@@ -237,17 +218,19 @@ def channel_name(side: str, number: int) -> str:
     return side if number == 0 else f"{side}_{number + 1}"
 
 
-def _channel(setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]) -> ChannelSpec:
+def _channel(
+    setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]
+) -> instruments.ChannelSpec:
     monitor = setup.instrument.monitor
     rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
     chosen = (setup.test.prisms or {}).get(beam.prisms)
     kinds = [{} if chosen is None else dict(one) for one in _parts(chosen)]
     large = {"distance": beam.prism_180_distance, "width": beam.width + rim[0], **kinds[0]}
     small = {"distance": beam.prism_0_distance, "shift": beam.shift, "width": beam.width + rim[1], **kinds[1]}
-    return ChannelSpec.model_construct(
+    return instruments.ChannelSpec.model_construct(
         field=field,
         pupil_offset=offset,
-        return_face=ReturnFaceSpec.model_construct(aperture=beam.width),
+        return_face=instruments.ReturnFaceSpec.model_construct(aperture=beam.width),
         spread=(beam.spread_x, beam.spread_y),
         photons_per_frame=None if beam.photons == _light(setup) else beam.photons,
         prism_180=monitor.prism_180.model_copy(update=large),
@@ -315,17 +298,11 @@ def _chosen_ccd(setup: MonitorDesignSetup, start: Beam, rng: np.random.Generator
     return names[int(rng.integers(len(names)))] if names else start.area_ccd
 
 
-def instrument_file(spec: InstrumentSpec, remark: str) -> str:
-    """Text of an instrument's file, with remarks at its top."""
-    head = "".join(f"# {line}\n" for line in remark.splitlines())
-    return head + dump_yaml({k: v for k, v in spec.plain().items() if v not in ("", {})})
-
-
 def prism_mass(instrument: Instrument) -> float:
     """Mass of all prisms and of what stands in their place, kg, without the central prism."""
     placed, total = instrument.assembly.place(), 0.0
     for solid in instrument.solids:
-        if solid.path != CENTRAL_PRISM:
+        if solid.path != instruments.CENTRAL_PRISM:
             total += float(solid_mesh(solid, placed).mesh.volume) * material(solid.material).density
     return total
 

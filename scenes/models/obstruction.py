@@ -8,7 +8,6 @@ in which a body or the edge of a clear aperture takes a part of one is refused.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -16,20 +15,18 @@ from scipy.spatial import ConvexHull
 from optics.geometry.solid import solid_mesh
 from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
+from optics.numerics.quadrature import even_disk
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.system import SystemBatch, assemble, media_along
 from optics.raytrace.trace import make_rays, trace
 from scenes.models.camera_model import line_body
 from scenes.models.clearance import convex_bodies, remedy
-from scenes.models.instrument_model import MisplacedError, key_of
+from scenes.models.instrument_model import Instrument, MisplacedError, key_of
 from scenes.models.monitor_chain import beside
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, PRISM_0, PRISM_180, Channel
 from scenes.yaml.errors import InputError, Issue, KeyPath
-
-if TYPE_CHECKING:
-    from scenes.models.instrument_model import Instrument
 
 RAYS = 400
 """Rays in a beam, spread evenly over its cross-section: shares are good to about half a percent."""
@@ -37,7 +34,6 @@ RAYS = 400
 _TOUCHING = 1e-6  # length inside a body below which a ray only touches it, metres
 _AIM = 1e-6  # how well rays meet their places on a stop or face, metres
 _RINGS, _AROUND = 6, 24
-_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
                 new = Obstruction(path, f"{camera}/imaging", float(np.mean(taken)), used)
                 if (new.beam, path) not in found or found[new.beam, path].share < new.share:
                     found[new.beam, path] = new
-    for beam in monitor_beams(instrument, backend, _disk(1.0)):
+    for beam in monitor_beams(instrument, backend, _disk()):
         for path, planes in solids.items():
             taken = rays_taken(beam.outside(path), planes)
             if taken.any():
@@ -100,11 +96,10 @@ def rays_taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     return np.asarray(np.any((length > _TOUCHING) & ~beside, axis=-1))
 
 
-def _disk(radius: float, rays: int = RAYS) -> np.ndarray:
-    """Points spread evenly over a disk, (rays, 2)."""
-    k = np.arange(rays)
-    r = radius * np.sqrt((k + 0.5) / rays)
-    return np.stack([r * np.cos(_GOLDEN * k), r * np.sin(_GOLDEN * k)], axis=-1)
+def _disk(rays: int = RAYS) -> np.ndarray:
+    """Points spread evenly over the unit disk, (rays, 2)."""
+    nodes = even_disk(rays)
+    return np.stack([nodes.x, nodes.y], axis=-1)
 
 
 def _whole() -> np.ndarray:
@@ -136,7 +131,7 @@ def imaging_segments(instrument: Instrument, backend: Backend, camera: str, rays
     start = np.repeat(points, rays, axis=0)[None]
     chain = assembly.sequences[f"{camera}/image_to_object"]
     position, direction = _aimed(
-        instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(_disk(radius, rays), (3, 1))
+        instrument, backend, camera, f"{camera}/image_to_stop", start, np.tile(radius * _disk(rays), (3, 1))
     )
     systems = assemble(assembly, [chain])
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chain)), world=True)

@@ -16,11 +16,11 @@ import numpy as np
 from optics.geometry.aperture import Rectangle
 from optics.geometry.pose import Pose
 from optics.geometry.tree import AT_REST, PlacedBodies, State
-from optics.materials.finish import BLACK, CoatingTable, Finish
+from optics.materials.finish import CoatingTable, Finish
 from optics.raytrace.assembly import Element, Interaction
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
-from scenes.models.scene_surface import (
+from scenes.models.scenery_parts import (
     Detector,
     Finishes,
     SceneSurface,
@@ -29,7 +29,7 @@ from scenes.models.scene_surface import (
     plate_surfaces,
     solid_surfaces,
 )
-from scenes.specs.baffle import Plate, box
+from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
 from scenes.specs.job_tables import FinishSpec
 from scenes.specs.resolved import ResolvedJob
@@ -229,18 +229,15 @@ def _lit_side(instrument: Instrument, element: Element) -> float:
     for names in instrument.assembly.sequences.values():
         if element.name in names[1:]:
             before = instrument.assembly.elements[names[names.index(element.name, 1) - 1]]
-            return float(np.sign(own.apply(_middle(before, nominal))[2] - _depth(element)))
+            there = own.apply(nominal.pose(before.body).apply(_middle(before)))
+            return float(np.sign(there[2] - _middle(element)[2]))
     return 1.0
 
 
-def _middle(element: Element, placed: PlacedBodies) -> np.ndarray:
+def _middle(element: Element) -> np.ndarray:
+    """Where the middle of an element's clear aperture lies on its surface, in its own frame, (3,), metres."""
     x, y = (0.0, 0.0) if element.aperture is None else element.aperture.centre
-    return np.asarray(placed.pose(element.body).apply(np.array([x, y, float(element.surface.sag(x, y))])))
-
-
-def _depth(element: Element) -> float:
-    x, y = (0.0, 0.0) if element.aperture is None else element.aperture.centre
-    return float(element.surface.sag(x, y))
+    return np.array([x, y, float(element.surface.sag(x, y))])
 
 
 def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
@@ -281,21 +278,3 @@ def _focal_plane(
     board = Pose(np.eye(3), np.array([0.0, 0.0, BOARD]))
     plate = Plate(f"{camera}/board", body, board, Rectangle(reach_x, reach_y), finishes.board)
     return surfaces + plate_surfaces([plate], placed), grids
-
-
-def focal_plane_housing(
-    instrument: Instrument, camera: str, depth: float = 0.03, finish: Finish = BLACK
-) -> tuple[Plate, ...]:
-    """A black box around the detectors of a camera, open to the light.
-
-    Args:
-        instrument: the instrument.
-        camera: which camera.
-        depth: how far its walls stand out before the detectors, metres.
-        finish: of all sides.
-    """
-    reach_x, reach_y = _reach(instrument, camera)
-    bottom = 2.0 * BOARD
-    pose = FACING_THE_LIGHT @ Pose(np.eye(3), np.array([0.0, 0.0, -bottom]))
-    size = (2.0 * reach_x, 2.0 * reach_y, bottom + depth)
-    return box(f"{camera}/housing", f"{BASE}/{camera}/focal_plane", pose, size, finish)

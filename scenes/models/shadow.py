@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING, assert_never
+from typing import assert_never
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -31,18 +31,16 @@ from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, quadrature_within, separate, tiled
 from optics.waves.pupil_stack import products, to_terms
 from scenes.models.clearance import convex_bodies
+from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
-
-if TYPE_CHECKING:
-    from scenes.models.instrument_model import Instrument
 
 RING_SIDES = 48
 """Flat pieces of round plates."""
 
 DEGREE = 6
-"""Of the polynomials for the rays over the stop: mirrors' rays follow them to nanometres."""
+"""Degree of the polynomials for the rays over the stop: mirrors' rays follow them to nanometres."""
 
 _ROOM = 5e-3
 """How near a body has to come to the light between the mirrors, as designed, to be looked at in every state, metres."""

@@ -23,7 +23,7 @@ from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
 from optics.materials.glass import glass
 from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.physical_error import PhysicalError
-from optics.thermal.deformation import Displaced, Displacement, FaceChange, Formula, face_change
+from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
 from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
@@ -71,8 +71,8 @@ class ThermalModel:
         self.reference: float = instrument.spec.temperature
         self._placed = instrument.assembly.place()
         self._bodies = {body.path: body for body in instrument.assembly.tree.bodies}
-        self._solids = {solid.path: solid for solid in instrument.solids}
-        self._mirrors = {
+        self.solids = {solid.path: solid for solid in instrument.solids}
+        self.mirrors = {
             f"{BASE}/{name}/{mirror}": (name, mirror)
             for name, model in instrument.cameras.items()
             for mirror in model.mirrors
@@ -93,9 +93,9 @@ class ThermalModel:
             parts = path.split("/")
             if self._owner(path) not in (None, path):
                 continue
-            if path in self._solids:
-                name = self._solids[path].material
-            elif path in self._mirrors:
+            if path in self.solids:
+                name = self.solids[path].material
+            elif path in self.mirrors:
                 name = named.mirror
             elif "focal_plane" in parts:
                 name = named.board if len(parts) > 3 and parts[3] != "line" else named.focal_plane
@@ -106,11 +106,11 @@ class ThermalModel:
 
     def _owner(self, path: str) -> str | None:
         """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are."""
-        return next((p for p in reversed(list(_upward(path))) if p in self._solids), None)
+        return next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
 
     def _pieces(self, path: str) -> list[Solid]:
         """A solid and those that are pieces of it."""
-        return [solid for piece, solid in self._solids.items() if self._owner(piece) == path]
+        return [solid for piece, solid in self.solids.items() if self._owner(piece) == path]
 
     def fields(self, temperatures: Mapping[str, Temperature]) -> dict[str, Temperature]:
         """Every warmed body's field in its own frame, its own or inherited."""
@@ -139,7 +139,7 @@ class ThermalModel:
                     f"changes from the instrument's {self.reference:.6g} K that stay above 0 K everywhere on the body",
                 )
             self._check_known(path, field, origin)
-            if path in self._solids and self._solids[path].transparent:
+            if path in self.solids and self.solids[path].transparent:
                 try:
                     self._index(path, field)
                 except ValueError as error:
@@ -158,8 +158,8 @@ class ThermalModel:
     def known(self, path: str) -> TemperatureRange:
         """Temperatures at which the data of a body's material may be used: expansion, and index where it is glass."""
         stuff = self.materials[path].known
-        if path in self._solids and self._solids[path].transparent:
-            thermal = glass(self._solids[path].material).thermal
+        if path in self.solids and self.solids[path].transparent:
+            thermal = glass(self.solids[path].material).thermal
             if thermal is not None:
                 low, high = max(stuff.coldest, thermal.known.coldest), min(stuff.hottest, thermal.known.hottest)
                 source = stuff.source if (low, high) == (stuff.coldest, stuff.hottest) else thermal.known.source
@@ -170,20 +170,20 @@ class ThermalModel:
         """Lowest absolute temperature that a field makes on a body, kelvin: at its corners for optics, else at its
         origin.
         """
-        return float(self.reference + field.change + np.min(self._extent(path) @ np.array(field.gradient)))
+        return float(self.reference + field.change + np.min(self.extent(path) @ np.array(field.gradient)))
 
     def hottest(self, path: str, field: Temperature) -> float:
         """Highest, likewise."""
-        return float(self.reference + field.change + np.max(self._extent(path) @ np.array(field.gradient)))
+        return float(self.reference + field.change + np.max(self.extent(path) @ np.array(field.gradient)))
 
-    def _extent(self, path: str) -> np.ndarray:
+    def extent(self, path: str) -> np.ndarray:
         """Points of a body between which its temperature lies, (P, 3), metres; kept, since a series asks often."""
         if path not in self._extents:
-            if path in self._solids:
+            if path in self.solids:
                 own = self._placed.pose(path).inverse()
                 meshes = ((p.path, solid_mesh(p, self._placed).mesh.vertices) for p in self._pieces(path))
                 points = np.concatenate([own.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
-            elif path in self._mirrors:
+            elif path in self.mirrors:
                 points = self._mirror_outline(path)
             else:
                 points = np.zeros((1, 3))
@@ -218,11 +218,11 @@ class ThermalModel:
         gradient = np.array(field.gradient)
         own = Motion(pivot=pivot, stretch=stuff.expansion * field.at(about))
         bent = bool(np.any(gradient)) and stuff.expansion != 0.0
-        if path in self._solids and self._solids[path].transparent:
+        if path in self.solids and self.solids[path].transparent:
             change, slope = self._index(path, field)
             own = Motion(pivot=pivot, stretch=own.stretch, index=change, index_gradient=slope)
         out: dict[str, Motion] = {path: own}
-        if path in self._solids or path in self._mirrors:
+        if path in self.solids or path in self.mirrors:
             # the tree's stretch carries what stands on a body and does not enlarge it; faces and footprints are its own
             out.update({face: Motion(stretch=own.stretch) for face in self._bodies if face.startswith(f"{path}/")})
             if not bent:
@@ -241,7 +241,7 @@ class ThermalModel:
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
         """Change of index at a solid's origin, and its gradient, 1/m."""
-        kind, wavelength = glass(self._solids[path].material), self.instrument.spec.monitor.wavelength
+        kind, wavelength = glass(self.solids[path].material), self.instrument.spec.monitor.wavelength
         if field.change == 0.0 and not any(field.gradient):
             return 0.0, (0.0, 0.0, 0.0)
         here = self.reference + field.change
@@ -252,26 +252,15 @@ class ThermalModel:
     def _response(self, path: str, progress: Callable[[str], None]) -> Response:
         if path not in self._responses:
             progress(path)
-            solve = self._solid_response if path in self._solids else self._mirror_response
-            self._responses[path] = solve(path)
+            changes = [self.changes(path, moved) for moved in self.unit_displacements(path)]
+            self._responses[path] = {
+                face: (changes[0][face], changes[1][face], changes[2][face]) for face in changes[0]
+            }
         return self._responses[path]
-
-    @property
-    def solids(self) -> Mapping[str, Solid]:
-        """Path -> glass body or block."""
-        return self._solids
-
-    def is_mirror(self, path: str) -> bool:
-        """Whether a body is a camera's mirror."""
-        return path in self._mirrors
 
     def surface(self, face: str) -> Surface:
         """Nominal shape of the optical face of a body."""
         return next(e.surface for e in self.instrument.assembly.elements.values() if e.body == face)
-
-    def extent(self, path: str) -> np.ndarray:
-        """Points of a body between which its temperature lies, (P, 3), metres, in its frame."""
-        return self._extent(path)
 
     def face_radii(self, path: str) -> dict[str, float]:
         """Body of an optical face of a mirror or a solid -> radius of the disk of its figure's terms, metres."""
@@ -281,16 +270,16 @@ class ThermalModel:
         """Largest optical path that a temperature of ``rest`` kelvin beside a linear field may be worth in a body's
         glass, metres: there and back along its longest side; 0 for what is not glass.
         """
-        if path not in self._solids or not self._solids[path].transparent:
+        if path not in self.solids or not self.solids[path].transparent:
             return 0.0
         here = self.reference + field.change
-        slope = glass(self._solids[path].material).dn_dt(self.instrument.spec.monitor.wavelength, here)
-        return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self._extent(path), axis=0)))
+        slope = glass(self.solids[path].material).dn_dt(self.instrument.spec.monitor.wavelength, here)
+        return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self.extent(path), axis=0)))
 
     def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:
         """Body of an optical face -> its aperture and its nominal place in the frame of a mirror or a solid."""
-        if path in self._mirrors:
-            camera, name = self._mirrors[path]
+        if path in self.mirrors:
+            camera, name = self.mirrors[path]
             return {path: (self.instrument.cameras[camera].apertures[name], Pose())}
         return {
             element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
@@ -309,8 +298,8 @@ class ThermalModel:
         Returns:
             None for a body that has none: one without a shape, or of several pieces.
         """
-        if path in self._mirrors:
-            camera, name = self._mirrors[path]
+        if path in self.mirrors:
+            camera, name = self.mirrors[path]
             model = self.instrument.cameras[camera]
             surface, aperture = model.surfaces[name], model.apertures[name]
             side = behind(model, name)
@@ -323,9 +312,9 @@ class ThermalModel:
             support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
             mesh = mirror_mesh(surface, aperture, thickness, side, cells)
             return ElasticBody(mesh, self.materials[path]), Kinematic(support)
-        if path not in self._solids or len(self._pieces(path)) > 1:
+        if path not in self.solids or len(self._pieces(path)) > 1:
             return None
-        corners = solid_mesh(self._solids[path], self._placed).mesh.vertices
+        corners = solid_mesh(self.solids[path], self._placed).mesh.vertices
         low, high = corners.min(axis=0), corners.max(axis=0)
         middle, half = corners.mean(axis=0), 0.5 * (high - low)
         # three points around the middle, 120 deg apart in the plane of the two longest sides
@@ -334,39 +323,23 @@ class ThermalModel:
         support = middle + _within(corners, middle, arms) * arms
         return ElasticBody(polyhedron_mesh(corners, spacing), self.materials[path]), Kinematic(support)
 
-    def _solid_response(self, path: str) -> Response:
-        held = self.elastic(path)
-        if held is None:
-            return self._face_changes(path, [self._free(path, axis) for axis in range(3)])
-        return self._face_changes(path, self._unit_gradients(path, *held))
-
-    def _mirror_response(self, path: str) -> Response:
-        return self._face_changes(path, self.mirror_displacements(path))
-
-    def mirror_displacements(self, path: str) -> Sequence[Displacement]:
-        """Displacements of a mirror's material, in its frame, by a gradient of 1 K/m along x, y and z of it, the
-        temperature being zero at its middle.
+    def unit_displacements(self, path: str) -> Sequence[Displaced]:
+        """Displacements of the material of a mirror or a solid, in its frame, by a gradient of 1 K/m along x, y and z
+        of it, the temperature being zero at its middle.
 
         Args:
-            path: of the mirror.
+            path: of the body.
         """
         held = self.elastic(path)
-        assert held is not None
-        return self._unit_gradients(path, *held)
-
-    def _unit_gradients(self, path: str, elastic: ElasticBody, support: Kinematic) -> Sequence[Displacement]:
-        about = self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0))
-        return elastic.solve_many([_unit_load(a, np.array(about)) for a in range(3)], support)
+        if held is None:
+            return [self._free(path, axis) for axis in range(3)]
+        about = np.array(self._bodies[path].pivots.get("centre", (0.0, 0.0, 0.0)))
+        return held[0].solve_many([_unit_load(axis, about) for axis in range(3)], held[1])
 
     def _free(self, path: str, axis: int) -> Formula:
         """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""
         about = self._bodies[path].pivots[_mount(self._bodies[path])]
         return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
-
-    def _face_changes(self, path: str, solved: Sequence[Displaced]) -> Response:
-        """What displacements by unit gradients along x, y, z do to a body's faces."""
-        changes = [self.changes(path, displaced) for displaced in solved]
-        return {face: (changes[0][face], changes[1][face], changes[2][face]) for face in changes[0]}
 
     def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
         """What a displacement of a mirror's or a solid's material does to its optical faces.
@@ -382,7 +355,7 @@ class ThermalModel:
         }
 
     def _mirror_outline(self, path: str) -> np.ndarray:
-        camera, name = self._mirrors[path]
+        camera, name = self.mirrors[path]
         model = self.instrument.cameras[camera]
         xy = model.apertures[name].outline()
         return np.column_stack([xy, model.surfaces[name].sag(xy[:, 0], xy[:, 1])])

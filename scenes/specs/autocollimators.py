@@ -11,13 +11,12 @@ from pydantic import Field, model_validator
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import AreaCcdSpec, Frames, GlassName, ReticleSpec
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Length, PositiveLength, Quantity, Wavelength
-from scenes.yaml.spec import Name, Number, Spec, Text, Whole
+from scenes.yaml.quantity import AngleSigma, Length, PositiveLength, Quantity, Wavelength
+from scenes.yaml.spec import Number, Spec, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 HalfAngle = Annotated[float, Quantity(ANGLE, above_zero=True, largest="44 deg")]
 Step = Annotated[float, Quantity(ANGLE, above_zero=True, largest="1 deg")]
-AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
 ScaleSigma = Annotated[float, Quantity(SCALE, smallest="0 ppm", largest="1 percent")]
 SMALLEST_WINDOW, LARGEST_WINDOW = 48, 512
 
@@ -156,7 +155,7 @@ class BenchErrorsSpec(Spec):
     mirror_mount: AngleSigma
 
 
-class AutocollimatorTestSpec(Spec):
+class AutocollimatorTestSpec(TitledSpec):
     """The test with two autocollimators.
 
     Attributes:
@@ -168,8 +167,6 @@ class AutocollimatorTestSpec(Spec):
         errors: of the bench.
     """
 
-    name: Name
-    description: Text = ""
     autocollimator: AutocollimatorSpec
     mirrors: MirrorsSpec
     programme: ProgrammeSpec

@@ -17,7 +17,7 @@ from optics.materials.finish import BLACK, Finish
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
-from scenes.yaml.spec import Spec
+from scenes.yaml.spec import Spec, one_given
 from scenes.yaml.units import ANGLE, LENGTH
 
 TUBE_SIDES = 24
@@ -42,60 +42,46 @@ class Plate:
     finish: Finish = BLACK
 
 
-def box(
-    name: str,
-    body: str,
-    pose: Pose,
-    size: tuple[float, float, float],
-    finish: Finish = BLACK,
-    open_top: bool = True,
-) -> tuple[Plate, ...]:
-    """A box whose bottom's middle is the pose's origin and whose walls rise along +z.
+def box(name: str, body: str, pose: Pose, size: tuple[float, float, float]) -> tuple[Plate, ...]:
+    """A box, open at +z, whose bottom's middle is the pose's origin and whose walls rise along +z.
 
     Args:
         name: of the part.
         body: path of the body that carries it.
         pose: in that body's frame.
         size: along x, y, z, metres.
-        finish: of all sides.
-        open_top: whether the side at +z is left open.
     """
     x, y, z = (0.5 * s for s in size)
 
     def wall(axis: int, angle: float, place: tuple[float, float, float], half: tuple[float, float]) -> Plate:
         inner = Pose(about_axis(axis, angle), np.array(place))
-        return Plate(name, body, pose @ inner, Rectangle(*half), finish)
+        return Plate(name, body, pose @ inner, Rectangle(*half))
 
     quarter = 0.5 * np.pi
-    plates = [
+    return (
         wall(0, 0.0, (0.0, 0.0, 0.0), (x, y)),
         wall(1, quarter, (-x, 0.0, z), (z, y)),
         wall(1, -quarter, (x, 0.0, z), (z, y)),
         wall(0, -quarter, (0.0, -y, z), (x, z)),
         wall(0, quarter, (0.0, y, z), (x, z)),
-    ]
-    if not open_top:
-        plates.append(wall(0, 0.0, (0.0, 0.0, 2.0 * z), (x, y)))
-    return tuple(plates)
+    )
 
 
-def tube(
-    name: str, body: str, pose: Pose, radius: float, length: float, finish: Finish = BLACK, sides: int = TUBE_SIDES
-) -> tuple[Plate, ...]:
+def tube(name: str, body: str, pose: Pose, radius: float, length: float) -> tuple[Plate, ...]:
     """A tube along +z from the pose's origin, open at both ends, of flat sides that touch the circle of ``radius``."""
-    half = radius * float(np.tan(np.pi / sides))
+    half = radius * float(np.tan(np.pi / TUBE_SIDES))
     plates = []
-    for k in range(sides):
-        turn = about_axis(2, 2.0 * np.pi * k / sides)
+    for k in range(TUBE_SIDES):
+        turn = about_axis(2, 2.0 * np.pi * k / TUBE_SIDES)
         # the plate's z points to the axis, its x along the tube
         inner = Pose(turn @ about_axis(1, -0.5 * np.pi), turn @ np.array([radius, 0.0, 0.5 * length]))
-        plates.append(Plate(name, body, pose @ inner, Rectangle(0.5 * length, half), finish))
+        plates.append(Plate(name, body, pose @ inner, Rectangle(0.5 * length, half)))
     return tuple(plates)
 
 
-def ring(name: str, body: str, pose: Pose, inner: float, outer: float, finish: Finish = BLACK) -> tuple[Plate, ...]:
+def ring(name: str, body: str, pose: Pose, inner: float, outer: float) -> tuple[Plate, ...]:
     """A flat stop with a round hole; radii in metres."""
-    return (Plate(name, body, pose, Circle(outer, inner=inner), finish),)
+    return (Plate(name, body, pose, Circle(outer, inner=inner)),)
 
 
 Size = Annotated[float, Quantity(LENGTH, above_zero=True, largest="10 m")]
@@ -138,9 +124,8 @@ class BaffleSpec(Spec):
                 allowed = f"for a {self.shape}: {', '.join(_NEEDS[self.shape])}"
                 raise Problem(f"a {self.shape} {what} {name}", "it" if given else "nothing", allowed, within=(name,))
         if self.shape == "ring" and not self.hole < self.diameter:  # type: ignore[operator]
-            raise Problem(
-                "the hole is not smaller than the ring", f"{self.hole:g} m", "a smaller hole", within=("hole",)
-            )
+            problem = "the hole is not smaller than the ring"
+            raise Problem(problem, f"{self.hole:g} m", "a smaller hole", within=("hole",))
         return self
 
     def plates(self, name: str) -> tuple[Plate, ...]:
@@ -202,9 +187,7 @@ class SurfaceEdgeSpec(Spec):
 
     @model_validator(mode="after")
     def _one_shape_with_its_sizes(self) -> SurfaceEdgeSpec:
-        if (self.clear is None) == (self.blocks is None):
-            found = "neither" if self.clear is None else "both"
-            raise Problem("an edge is clear or blocks", found, "clear: SHAPE, or blocks: SHAPE")
+        one_given(self, ("clear", "blocks"), "an edge is clear or blocks", "clear: SHAPE, or blocks: SHAPE")
         needed, possible = SIZES[self.shape]
         places = () if self.shape == "polygon" else ("centre",)
         for name in ("centre", "radius", "inner", "half", "width", "turn", "corners"):
@@ -220,7 +203,7 @@ class SurfaceEdgeSpec(Spec):
 
     @property
     def shape(self) -> str:
-        """Its kind of shape."""
+        """The kind of shape."""
         return self.clear or self.blocks or ""
 
     def to_edge(self) -> Edge:

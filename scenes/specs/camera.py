@@ -10,26 +10,25 @@ from pydantic import Field, model_validator
 from optics.geometry.sag_terms import SagTerm
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
+from scenes.specs import instrument as instruments
 from scenes.specs.baffle import SurfaceEdgeSpec
 from scenes.specs.detector import PixelPitch
-from scenes.specs.instrument import (
-    AreaCcdChoiceSpec,
-    Frames,
-    GlassName,
-    MadeOf,
-    Photons,
-    check_made,
-    reflector_kinds,
+from scenes.yaml.errors import Problem, unknown
+from scenes.yaml.quantity import (
+    AsphereTerms,
+    Length,
+    PositiveLength,
+    Quantity,
+    Radius,
+    SagTerms,
+    Vector,
+    Vector2,
+    Wavelength,
 )
-from scenes.yaml.errors import Problem, names_text, nearest, shown
-from scenes.yaml.quantity import AsphereTerms, Length, PositiveLength, Quantity, Radius, Vector, Vector2, Wavelength
-from scenes.yaml.sag_terms import SagTerms
-from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
-from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, TIME, format_quantity
+from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, TitledSpec, Whole
+from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, format_quantity
 
 Spectrum = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
-RateError = Annotated[float, Quantity(SCALE, largest="50 percent")]
-Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
 
 
@@ -47,9 +46,9 @@ class TdiSpec(Spec):
 
     stages: Annotated[Whole, Field(ge=1, le=4096)] = 1
     phases: Annotated[Whole, Field(ge=1, le=8)] = 1
-    line_time: Exposure = 3.5e-4
+    line_time: instruments.Exposure = 3.5e-4
     open_share: Annotated[Number, Field(gt=0.0, le=1.0)] = 1.0
-    rate_error: RateError = 0.0
+    rate_error: Annotated[float, Quantity(SCALE, largest="50 percent")] = 0.0
 
 
 class BandSpec(Spec):
@@ -83,7 +82,9 @@ class BandSpec(Spec):
 
     @property
     def exposure(self) -> float:
-        """Of all stages, over which dark current is collected, seconds; the data sheet gives it for all stages."""
+        """Exposure of all stages, over which dark current is collected, seconds; the data sheet gives it for all
+        stages.
+        """
         return self.tdi.stages * self.tdi.line_time
 
     @property
@@ -92,9 +93,7 @@ class BandSpec(Spec):
         return 0.5 / self.pitch
 
 
-LengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
-FieldRange = Annotated[tuple[float, float], Vector(Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)]
-PhotonRange = tuple[Photons, Photons]
+PhotonRange = tuple[instruments.Photons, instruments.Photons]
 
 
 class BeamRangesSpec(Spec):
@@ -115,15 +114,15 @@ class BeamRangesSpec(Spec):
         photons: of its spot, per frame; spots that would fill their pixels to the brim are refused.
     """
 
-    pupil_x: LengthRange | None = None
-    pupil_y: LengthRange | None = None
-    width: LengthRange | None = None
-    field: FieldRange | None = None
-    prism_180_distance: LengthRange | None = None
-    prism_0_distance: LengthRange | None = None
-    shift: LengthRange | None = None
-    spread_x: LengthRange | None = None
-    spread_y: LengthRange | None = None
+    pupil_x: Vector2 | None = None
+    pupil_y: Vector2 | None = None
+    width: Vector2 | None = None
+    field: Annotated[tuple[float, float], Vector(Quantity(ANGLE, above_zero=True, largest="45 deg"), 2)] | None = None
+    prism_180_distance: Vector2 | None = None
+    prism_0_distance: Vector2 | None = None
+    shift: Vector2 | None = None
+    spread_x: Vector2 | None = None
+    spread_y: Vector2 | None = None
     photons: PhotonRange | None = None
 
     @model_validator(mode="after")
@@ -143,12 +142,12 @@ class TransferChoiceSpec(Spec):
         kind: by its name among the reflectors; the prism when nothing is said.
     """
 
-    material: MadeOf
-    kind: Annotated[str, reflector_kinds(returns=True)] | None = None
+    material: instruments.MadeOf
+    kind: Annotated[str, instruments.reflector_kinds(returns=True)] | None = None
 
     @model_validator(mode="after")
     def _made_of_what_it_may(self) -> TransferChoiceSpec:
-        check_made(self.material, REFLECTORS[self.kind or "lateral_transfer"])
+        instruments.check_made(self.material, REFLECTORS[self.kind or "lateral_transfer"])
         return self
 
 
@@ -160,12 +159,12 @@ class ShiftChoiceSpec(Spec):
         kind: by its name among the reflectors; the rhomboid when nothing is said.
     """
 
-    material: MadeOf
-    kind: Annotated[str, reflector_kinds(returns=False)] | None = None
+    material: instruments.MadeOf
+    kind: Annotated[str, instruments.reflector_kinds(returns=False)] | None = None
 
     @model_validator(mode="after")
     def _made_of_what_it_may(self) -> ShiftChoiceSpec:
-        check_made(self.material, REFLECTORS[self.kind or "rhomboid"])
+        instruments.check_made(self.material, REFLECTORS[self.kind or "rhomboid"])
         return self
 
 
@@ -276,17 +275,14 @@ class MonitorDesignSpec(Spec):
     beams: Annotated[Whole, Field(ge=1, le=6)]
     vary: BeamRangesSpec
     prisms: Annotated[Named[PrismChoiceSpec], Field(min_length=1)] | None = None
-    area_ccds: Annotated[Named[AreaCcdChoiceSpec], Field(min_length=1)] | None = None
-    central_material: GlassName | None = None
-    photons_per_frame: Photons | None = None
-    frames: Frames | None = None
+    area_ccds: Annotated[Named[instruments.AreaCcdChoiceSpec], Field(min_length=1)] | None = None
+    central_material: instruments.GlassName | None = None
+    photons_per_frame: instruments.Photons | None = None
+    frames: instruments.Frames | None = None
     goal: MonitorGoalSpec
     limits: MonitorLimitsSpec = MonitorLimitsSpec()
     search: MonitorSearchSpec = MonitorSearchSpec()
     seed: Seed = 0
-
-
-FieldAngle = Annotated[float, Quantity(ANGLE, largest="45 deg")]
 
 
 Turn = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="180 deg"), 3)]
@@ -364,7 +360,7 @@ class LineSpec(Spec):
     pitch: PixelPitch
 
 
-class CameraSpec(Spec):
+class CameraSpec(TitledSpec):
     """An off-axis mirror camera.
 
     Attributes:
@@ -383,11 +379,9 @@ class CameraSpec(Spec):
         edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
     """
 
-    name: Name
-    description: Text = ""
     focal_length: PositiveLength
     entrance_pupil: PositiveLength
-    field_bias: FieldAngle
+    field_bias: instruments.FieldPlace
     field: FieldSpec
     wavelength: Wavelength
     stop: Name
@@ -400,14 +394,7 @@ class CameraSpec(Spec):
     @model_validator(mode="after")
     def _stop_is_a_mirror(self) -> CameraSpec:
         if self.stop not in self.mirrors:
-            names = names_text(self.mirrors)
-            raise Problem(
-                "the stop is not one of the mirrors",
-                shown(self.stop),
-                names,
-                nearest(self.stop, self.mirrors),
-                ("stop",),
-            )
+            raise unknown("the stop is not one of the mirrors", self.stop, self.mirrors, ("stop",))
         return self
 
     @model_validator(mode="after")

@@ -11,10 +11,10 @@ from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
 from scenes.specs.job import FigureTerm, PlainPerturbationSpec
-from scenes.specs.turntable import DataFile, TableAngle, TurntableFiles
+from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Angle, PositiveLength, Quantity, Vector, Vector3
-from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.quantity import Angle, AngleSigma, AngleSigmas, LengthSigma, PositiveLength, Quantity, Vector, Vector3
+from scenes.yaml.spec import Name, Number, Paths, Reference, Seed, Spec, Text, TitledSpec, Whole, one_given
 from scenes.yaml.units import ANGLE, LENGTH, SCALE, format_quantity
 
 
@@ -54,20 +54,13 @@ class CameraUnderTestSpec(Spec):
     def _cold(self) -> "CameraUnderTestSpec":
         for path, what in self.as_built.items():
             if "temperature" in what.uses():
-                raise Problem(
-                    "temperatures are not modelled in the laboratory",
-                    "temperature",
-                    "rotate, shift, scale or figure",
-                    within=("as_built", path, "temperature"),
-                )
+                problem, within = "temperatures are not modelled in the laboratory", ("as_built", path, "temperature")
+                raise Problem(problem, "temperature", "rotate, shift, scale or figure", within=within)
         return self
 
 
 EdgeAngle = Annotated[float, Quantity(ANGLE, smallest="2 deg", largest="15 deg")]
 Tilt = Annotated[float, Quantity(ANGLE, largest="30 deg")]
-AngleSigma = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
-AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, smallest="0 arcsec", largest="1 deg"))]
-LengthSigma = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="5 mm")]
 LengthSigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 um", largest="5 mm"))]
 Light = Annotated[float, Quantity(SCALE, smallest="0.1 percent", largest="150 percent")]
 Share = Annotated[Number, Field(ge=-1.0, le=1.0)]
@@ -253,7 +246,7 @@ class DistortionFiles(Spec):
             point to point and the same in all sets, radians.
     """
 
-    spots: DataFile
+    spots: Reference
     zero: TableAngle
     line: LineSpec | None = None
     reversed: bool = False
@@ -262,13 +255,12 @@ class DistortionFiles(Spec):
 
     @model_validator(mode="after")
     def _one_source_of_sigmas(self) -> "DistortionFiles":
-        if (self.turntable is None) is (self.angle_sigma is None):
-            found = "neither" if self.turntable is None else "both"
-            raise Problem("how good the angles are is told in one way", found, "turntable: or angle_sigma:")
+        problem = "how good the angles are is told in one way"
+        one_given(self, ("turntable", "angle_sigma"), problem, "turntable: or angle_sigma:")
         return self
 
 
-class MeasuredDistortionSpec(Spec):
+class MeasuredDistortionSpec(TitledSpec):
     """The distortion test on measured angles and spots.
 
     Attributes:
@@ -279,8 +271,6 @@ class MeasuredDistortionSpec(Spec):
         seed: of nothing; the fits of the turntable that compete here draw nothing.
     """
 
-    name: Name
-    description: Text = ""
     focal_length: PositiveLength
     measured: DistortionFiles
     seed: Seed = 1
@@ -320,9 +310,6 @@ class LevelSpec(Spec):
     sigma: AngleSigma
 
 
-Noises = Annotated[dict[Name, NoiseSpec], AfterValidator(FrozenMap)]
-
-
 class FocusFiles(Spec):
     """A through-focus series of many places.
 
@@ -338,30 +325,27 @@ class FocusFiles(Spec):
         level: of the line; without it the turn about Z' is left as it is.
     """
 
-    mtf: DataFile | None = None
-    images: DataFile | None = None
+    mtf: Reference | None = None
+    images: Reference | None = None
     moved: Literal["image", "target", "focal_plane"]
     per_shift: Annotated[Number, Field(gt=0.0, le=1e6)] | None = None
     frequency: Annotated[Number, Field(ge=0.01, le=0.75)] = 0.5
-    noise: Noises = Field(default_factory=FrozenMap)
+    noise: Annotated[dict[Name, NoiseSpec], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     level: LevelSpec | None = None
 
     @model_validator(mode="after")
     def _one_table(self) -> "FocusFiles":
-        if (self.mtf is None) is (self.images is None):
-            raise Problem("one table is needed", "neither" if self.mtf is None else "both", "mtf: or images:")
+        one_given(self, ("mtf", "images"), "one table is needed", "mtf: or images:")
         if self.noise and self.images is None:
-            raise Problem(
-                "sigmas of MTF values stand in their table", "noise", "images: in place of mtf:", None, ("noise",)
-            )
+            problem = "sigmas of MTF values stand in their table"
+            raise Problem(problem, "noise", "images: in place of mtf:", within=("noise",))
         if self.per_shift is not None and self.moved != "target":
-            raise Problem(
-                "only a target's move is another than the image's", allowed="moved: target", within=("per_shift",)
-            )
+            problem = "only a target's move is another than the image's"
+            raise Problem(problem, allowed="moved: target", within=("per_shift",))
         return self
 
 
-class MeasuredFocusSpec(Spec):
+class MeasuredFocusSpec(TitledSpec):
     """A focal-plane alignment from a measured through-focus series.
 
     Attributes:
@@ -376,8 +360,6 @@ class MeasuredFocusSpec(Spec):
         seed: of nothing; nothing is drawn.
     """
 
-    name: Name
-    description: Text = ""
     measured: FocusFiles
     mount: MountSpec
     shims: tuple[PositiveLength, ...] | None = None

@@ -1,9 +1,10 @@
-"""A course: temperatures and motions that change with time, as a job's file gives them in a table."""
+"""A course: temperatures and motions that change with time, as a job's file or a CSV table of its own gives them."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
@@ -11,25 +12,21 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.heat import Temperature
-from scenes.yaml.errors import KeyPath, Problem, shown
+from scenes.yaml import units
+from scenes.yaml.csv_table import rows_of
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Paths, Reference, Spec
-from scenes.yaml.units import (
-    ANGLE,
-    LENGTH,
-    MOMENT,
-    SCALE,
-    TEMPERATURE_DIFFERENCE,
-    TEMPERATURE_GRADIENT,
-    format_quantity,
-)
+from scenes.yaml.spec import Name, Paths, Reference, Spec, validate
+from scenes.yaml.yaml_file import LARGEST_BYTES, YamlFile
 
-TemperatureChange = Annotated[float, Quantity(TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
+TemperatureChange = Annotated[float, Quantity(units.TEMPERATURE_DIFFERENCE, largest="1000 K", unsigned="100 K")]
 """Kelvin. Nothing in an instrument at work becomes 100 K warmer; 250 K without a sign is an absolute temperature."""
-TemperatureGradient = Annotated[tuple[float, float, float], Vector(Quantity(TEMPERATURE_GRADIENT, largest="1000 K/m"))]
-Rotation = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
-Shift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 mm"))]
-ScaleChange = Annotated[float, Quantity(SCALE, largest="1 percent")]
+TemperatureGradient = Annotated[
+    tuple[float, float, float], Vector(Quantity(units.TEMPERATURE_GRADIENT, largest="1000 K/m"))
+]
+Rotation = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE, largest="5 deg"))]
+Shift = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, largest="100 mm"))]
+ScaleChange = Annotated[float, Quantity(units.SCALE, largest="1 percent")]
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 
@@ -51,7 +48,7 @@ def _is_term(term: str) -> str:
 
 
 Term = Annotated[str, AfterValidator(_is_term), WithJsonSchema({"type": "string", "pattern": f"^{_TERM.pattern}$"})]
-Moment = Annotated[float, Quantity(MOMENT, largest="100000 h")]
+Moment = Annotated[float, Quantity(units.MOMENT, largest="100000 h")]
 
 NO_MOTION: tuple[float, float, float] = (0.0, 0.0, 0.0)
 DEFAULT_PIVOT = "origin"
@@ -59,9 +56,14 @@ FEWEST, MOST = 2, 1000
 """Numbers of times that a course may have."""
 
 
-def _ascending(times: tuple[float, ...]) -> tuple[float, ...]:
+def _some_times(times: tuple[float, ...]) -> tuple[float, ...]:
     if not FEWEST <= len(times) <= MOST:
         raise Problem("not the number of times of a course", f"{len(times)} of them", f"{FEWEST} to {MOST} times")
+    return times
+
+
+def ascending(times: tuple[float, ...]) -> tuple[float, ...]:
+    """The times, seconds. Problem where one is not after the one before it."""
     for k, (before, after) in enumerate(pairwise(times), 1):
         if not after > before:
             raise Problem("the times do not ascend", moment(after), f"a time after {moment(before)}", within=(k,))
@@ -70,7 +72,13 @@ def _ascending(times: tuple[float, ...]) -> tuple[float, ...]:
 
 def moment(time: float) -> str:
     """A time of a course as its file would write it: "12 min" for 720 s."""
-    return format_quantity(time, MOMENT)
+    return units.format_quantity(time, units.MOMENT)
+
+
+def no_such_time(time: float, times: Sequence[float], allowed: str) -> Problem:
+    """What is wrong with a time, seconds, that is none of a course's."""
+    near = min(times, key=lambda one: abs(one - time))
+    return Problem("not one of the course's times", moment(time), allowed, moment(near))
 
 
 class TemperatureCourse(Spec):
@@ -145,7 +153,7 @@ class CourseSpec(Spec):
             the last one by default.
     """
 
-    times: Annotated[tuple[Moment, ...], AfterValidator(_ascending)] = ()
+    times: Annotated[tuple[Moment, ...], AfterValidator(_some_times), AfterValidator(ascending)] = ()
     temperature: Paths[TemperatureCourse] = Field(default_factory=FrozenMap)
     motion: Paths[MotionCourse] = Field(default_factory=FrozenMap)
     table: Reference | None = None
@@ -165,10 +173,7 @@ class CourseSpec(Spec):
         for path, moves in self.motion.items():
             self._one_for_each_time(("motion", path), moves.given)
         if self.detail is not None and self.detail not in self.times:
-            near = min(self.times, key=lambda time: abs(time - (self.detail or 0.0)))
-            raise Problem(
-                "not one of the course's times", moment(self.detail), "one of times", moment(near), ("detail",)
-            )
+            raise no_such_time(self.detail, self.times, "one of times").below("detail")
         return self
 
     def _only_a_table(self) -> "CourseSpec":
@@ -213,3 +218,124 @@ class CourseSpec(Spec):
         """Where in the course the temperature of a node at time number ``k`` stands."""
         name = "change" if self.temperature[path].change is not None else "gradient"
         return ("temperature", path, name, k)
+
+
+TIME = "time"
+AXES = ("x", "y", "z")
+VECTORS = {"rotate": units.ANGLE, "shift": units.LENGTH, "gradient": units.TEMPERATURE_GRADIENT}
+"""What has a column for each axis; axes without one are zero."""
+NUMBERS = {"scale": units.SCALE, "temperature": units.TEMPERATURE_DIFFERENCE}
+HEAT = {"temperature": "change", "gradient": "gradient"}
+"""Name in a head -> key under ``temperature``; the others stand under ``motion``."""
+HEADS = "'time [min]', 'NODE shift z [um]', 'NODE rotate x [arcsec]', 'NODE scale [ppm]', 'NODE temperature [K]' or "
+HEADS += "'NODE gradient x [mK/m]'"
+
+_HEAD = re.compile(r"(?:(?P<node>\S+) +)?(?P<what>[a-z]+)(?: +(?P<axis>[a-z]))? *\[(?P<unit>[^\[\]]+)\]")
+
+
+@dataclass(frozen=True)
+class _Column:
+    """What a column holds.
+
+    Attributes:
+        what: TIME, or a name of VECTORS or NUMBERS.
+        node: its path, empty for the time.
+        axis: 0 to 2 of a vector.
+        unit: of its numbers.
+    """
+
+    what: str
+    node: str
+    axis: int
+    unit: str
+
+    @property
+    def place(self) -> KeyPath:
+        """In the course, without the number of the time."""
+        if self.what == TIME:
+            return ("times",)
+        return ("temperature", self.node, HEAT[self.what]) if self.what in HEAT else ("motion", self.node, self.what)
+
+
+def read_course(path: Path, named: CourseSpec) -> CourseSpec:
+    """The course that a table holds, with the detail and the pivots of the course that names it.
+
+    Args:
+        path: of a CSV file with a row for each time, whose heads name node, quantity, axis and unit.
+        named: the course that names it.
+
+    Raises:
+        InputError: the table cannot be read, with its line.
+    """
+    file, rows = str(path), rows_of(path, LARGEST_BYTES)
+    if len(rows) < 2:
+        line = rows[0][0] if rows else 1
+        raise InputError(Issue("a table has a row of heads and a row for each time", file, line, allowed=HEADS))
+    (head_line, heads), body = rows[0], rows[1:]
+    columns = [_column(head, file, head_line) for head in heads]
+    places = [(*column.place, column.axis) for column in columns]
+    twice = next((head for k, head in enumerate(heads) if places[k] in places[:k]), None)
+    if twice is not None:
+        raise InputError(Issue("another column holds the same", file, head_line, (twice.strip(),)))
+    if TIME not in [column.what for column in columns]:
+        text, found = "no column has the times", names_text(heads)
+        raise InputError(Issue(text, file, head_line, found=found, allowed="time [min]"))
+    data: dict[str, Any] = {"times": [None] * len(body), "temperature": {}, "motion": {}}
+    lines: dict[KeyPath, int] = {(): head_line, ("temperature",): head_line, ("motion",): head_line}
+    for k, (line, cells) in enumerate(body):
+        if len(cells) != len(columns):
+            text = f"{len(cells)} cells under {len(columns)} heads"
+            raise InputError(Issue(text, file, line, allowed="as many cells as heads, with commas between them"))
+        for column, cell in zip(columns, cells, strict=True):
+            _put(data, lines, column, k, f"{cell.strip()} {column.unit}", (line, len(body)))
+            lines.setdefault(column.place[:2], head_line)
+    for node, moves in named.motion.items():
+        if node not in data["motion"]:
+            allowed = names_text(data["motion"]) or "nothing"
+            wrong = unknown("the table does not move this node", node, data["motion"], allowed=allowed)
+            raise named.error(wrong, ("motion", node))
+        data["motion"][node]["pivot"] = moves.pivot
+    if named.detail is not None:
+        data["detail"] = named.plain()["detail"]
+    return validate(CourseSpec, YamlFile(file, {key: value for key, value in data.items() if value}, lines))
+
+
+def _column(head: str, file: str, line: int) -> _Column:
+    """InputError for a head that says nothing known."""
+    match = _HEAD.fullmatch(head.strip())
+    if match is None:
+        raise InputError(Issue("not the head of a column", file, line, found=shown(head.strip()), allowed=HEADS))
+    what, node, axis = match["what"], match["node"] or "", match["axis"]
+    known = (*VECTORS, *NUMBERS) if node else (TIME,)
+    if what not in known:
+        raise InputError(unknown("no such quantity", what, known).at(file, line, (head.strip(),)))
+    if (axis in AXES) is not (what in VECTORS):
+        allowed = "an axis: x, y or z" if what in VECTORS else "no axis"
+        raise InputError(Issue(f"a column of {what} has {allowed}", file, line, (head.strip(),), allowed=HEADS))
+    kind: units.Kind = units.MOMENT if what == TIME else (VECTORS | NUMBERS)[what]
+    try:
+        units.parse_quantity(f"0 {match['unit'].strip()}", kind)
+    except Problem as problem:
+        problem.allowed = names_text(kind.units)
+        raise InputError(problem.at(file, line, (head.strip(),))) from None
+    return _Column(what, node, AXES.index(axis) if axis else 0, match["unit"].strip())
+
+
+def _put(
+    data: dict[str, Any], lines: dict[KeyPath, int], column: _Column, k: int, text: str, where: tuple[int, int]
+) -> None:
+    """Put a cell at its place in the plain data of a course."""
+    line, count = where
+    if column.what == TIME:
+        data["times"][k] = text
+        lines["times", k] = line
+        return
+    section, node, name = (str(part) for part in column.place)
+    values = data[section].setdefault(node, {}).setdefault(name, [None] * count)
+    if column.what in VECTORS:
+        values[k] = values[k] or ["0 " + VECTORS[column.what].si] * len(AXES)
+        values[k][column.axis] = text
+        lines[section, node, name, k, column.axis] = line
+    else:
+        values[k] = text
+    lines[section, node, name, k] = line

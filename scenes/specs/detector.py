@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from scenes.yaml.errors import KeyPath, Problem, names_text
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Named, Number, Spec, Text, Whole
+from scenes.yaml.spec import Named, Number, Spec, TitledSpec, Whole
 from scenes.yaml.units import LENGTH, TIME, format_quantity
 
 LEAST_SIDE = 24
@@ -21,7 +21,7 @@ LEAST_STEPS = 1.0
 """Grey values between the dark and a full well at least."""
 
 
-class DetectorSpec(Spec):
+class DetectorSpec(TitledSpec):
     """Plain numbers in the units of EMVA 1288; e stands for electrons and DN for digital numbers (grey values).
 
     Attributes:
@@ -39,8 +39,6 @@ class DetectorSpec(Spec):
         noise: beyond the model of EMVA 1288, name -> its number, electrons rms; None for nothing.
     """
 
-    name: Name
-    description: Text = ""
     quantum_efficiency: Annotated[Number, Field(gt=0.0, le=1.0)]
     system_gain_dn_per_e: Annotated[Number, Field(gt=0.0, le=1e4)]
     dark_noise_e: Annotated[Number, Field(ge=0.0, le=1e5)]

@@ -11,25 +11,16 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import Term, moment
-from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml import units
+from scenes.yaml.errors import Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text
-from scenes.yaml.units import (
-    ANGLE,
-    LENGTH,
-    MOMENT,
-    PER_LENGTH,
-    SCALE,
-    TEMPERATURE_DIFFERENCE,
-    TEMPERATURE_GRADIENT,
-    Kind,
-)
+from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, TitledSpec, short_for
 
 NONE = "none"
 """`disturbances: none`: nothing is stated, and sigmas are those of the noise alone."""
 
 
-def _spread(kind: Kind, largest: str) -> Quantity:
+def _spread(kind: units.Kind, largest: str) -> Quantity:
     """A standard deviation."""
     return Quantity(kind, smallest=f"0 {kind.units[0]}", largest=largest)
 
@@ -41,15 +32,16 @@ def _something(value: Any) -> Any:
 
 
 STATED = BeforeValidator(_something)
-"""Of a key that may be left out, not empty: an empty standard deviation is a forgotten one."""
-ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(LENGTH, "10 mm"), alike=True)]
-RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(ANGLE, "1 deg"), alike=True)]
-GradientSigma = Annotated[tuple[float, float, float], Vector(_spread(TEMPERATURE_GRADIENT, "1000 K/m"), alike=True)]
-IndexSigma = Annotated[tuple[float, float, float], Vector(_spread(PER_LENGTH, "1e-2 1/m"), alike=True)]
-ScaleSigma = Annotated[float, _spread(SCALE, "1 percent")]
-FigureSigma = Annotated[float, _spread(LENGTH, "100 um")]
-ChangeSigma = Annotated[float, _spread(TEMPERATURE_DIFFERENCE, "100 K")]
-Span = Annotated[float, Quantity(MOMENT, above_zero=True, largest="1000000 h")]
+"""Validator of a key that may be left out, and not be empty: an empty standard deviation is a forgotten one."""
+ShiftSigma = Annotated[tuple[float, float, float], Vector(_spread(units.LENGTH, "10 mm"), alike=True)]
+RotateSigma = Annotated[tuple[float, float, float], Vector(_spread(units.ANGLE, "1 deg"), alike=True)]
+GradientSigma = Annotated[
+    tuple[float, float, float], Vector(_spread(units.TEMPERATURE_GRADIENT, "1000 K/m"), alike=True)
+]
+IndexSigma = Annotated[tuple[float, float, float], Vector(_spread(units.PER_LENGTH, "1e-2 1/m"), alike=True)]
+ScaleSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
+FigureSigma = Annotated[float, _spread(units.LENGTH, "100 um")]
+Span = Annotated[float, Quantity(units.MOMENT, above_zero=True, largest="1000000 h")]
 Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
 
 
@@ -61,7 +53,7 @@ class TemperatureSigmaSpec(Spec):
         gradient: of each component of its gradient in the body's own frame, K/m.
     """
 
-    change: ChangeSigma = 0.0
+    change: Annotated[float, _spread(units.TEMPERATURE_DIFFERENCE, "100 K")] = 0.0
     gradient: GradientSigma = (0.0, 0.0, 0.0)
 
 
@@ -99,25 +91,13 @@ class TimeLawSpec(Spec):
         return ", ".join(filter(None, parts)) or "nothing"
 
 
-def _law(value: Any) -> Any:
-    return {"kind": value} if isinstance(value, str) else value
-
-
-def _some_paths(value: Any) -> Any:
-    return [value] if isinstance(value, str) else value
-
-
 BodyPattern = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 BodyPatterns = Annotated[
-    tuple[BodyPattern, ...],
-    Field(min_length=1),
-    BeforeValidator(_some_paths, json_schema_input_type=BodyPattern | tuple[BodyPattern, ...]),
+    tuple[BodyPattern, ...], Field(min_length=1), short_for(None, str, schema=BodyPattern | tuple[BodyPattern, ...])
 ]
 Reason = Annotated[Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
-TimeLaw = Annotated[
-    TimeLawSpec, BeforeValidator(_law, json_schema_input_type=Literal["white", "constant"] | TimeLawSpec)
-]
+TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant"] | TimeLawSpec)]
 MOVES = ("shift", "rotate", "scale", "figure", "temperature", "index_gradient")
 """Keys of a cause that hold standard deviations."""
 
@@ -150,9 +130,8 @@ class CorrelationSpec(Spec):
             raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=("matrix",))
         for i, row in enumerate(rows):
             if row[i] != 1.0:
-                raise Problem(
-                    "a correlation matrix has ones on its diagonal", f"{row[i]:g}", "1", within=("matrix", i, i)
-                )
+                problem = "a correlation matrix has ones on its diagonal"
+                raise Problem(problem, f"{row[i]:g}", "1", within=("matrix", i, i))
             for j in range(i):
                 if row[j] != rows[j][i]:
                     found = f"{row[j]:g} and {rows[j][i]:g}"
@@ -245,7 +224,7 @@ class CauseChangeSpec(_CauseWords):
         return cause.model_copy(update=update)
 
 
-class DisturbancesSpec(Spec):
+class DisturbancesSpec(TitledSpec):
     """What is expected to change between the nominal measurement and a later one.
 
     Attributes:
@@ -255,13 +234,11 @@ class DisturbancesSpec(Spec):
         causes: by name.
     """
 
-    name: Name
-    description: Text = ""
     sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
     causes: Annotated[Named[CauseSpec], Field(min_length=1)]
 
     def changed(self, changes: "JobDisturbancesSpec") -> "DisturbancesSpec":
-        """The same with what a job says instead.
+        """Return the statement with a job's changes made.
 
         Raises:
             InputError: it leaves out a cause that is not there, or adds one that is not complete.
@@ -269,9 +246,7 @@ class DisturbancesSpec(Spec):
         causes = dict(self.causes)
         for k, name in enumerate(changes.without):
             if name not in causes:
-                problem, meant = f"no such cause in {self.name}", nearest(name, self.causes)
-                allowed = names_text(self.causes)
-                raise changes.error(problem, ("without", k), found=name, allowed=allowed, suggestion=meant)
+                raise changes.error(unknown(f"no such cause in {self.name}", name, self.causes), ("without", k))
             del causes[name]
         for name, change in changes.causes.items():
             if name in causes:
@@ -279,10 +254,10 @@ class DisturbancesSpec(Spec):
                 continue
             missing = [key for key in ("bodies", "reason") if key not in change.given]
             if missing or not any(key in change.given for key in MOVES):
-                problem, meant = f"no such cause in {self.name}", nearest(name, self.causes)
                 new = f"a new one with bodies, a reason and one of {names_text(MOVES)}"
                 allowed = f"a change of {names_text(self.causes)}; or {new}"
-                raise changes.error(problem, ("causes", name), found=name, allowed=allowed, suggestion=meant)
+                wrong = unknown(f"no such cause in {self.name}", name, self.causes, allowed=allowed)
+                raise changes.error(wrong, ("causes", name))
             # of checked parts: to validate them again would ask for quantities as text
             causes[name] = CauseSpec.model_construct(**change.given)
         if not causes:
@@ -316,11 +291,5 @@ class JobDisturbancesSpec(Spec):
         return self
 
 
-def _named(value: Any) -> Any:
-    """`disturbances: orbit` names a file."""
-    return {"file": value} if isinstance(value, str) else value
-
-
-JobDisturbances = Annotated[
-    JobDisturbancesSpec, BeforeValidator(_named, json_schema_input_type=Reference | JobDisturbancesSpec)
-]
+JobDisturbances = Annotated[JobDisturbancesSpec, short_for("file", str, schema=Reference | JobDisturbancesSpec)]
+"""With its keys, or the file's name alone: `disturbances: orbit`."""

@@ -14,7 +14,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch
-from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.errors import KeyPath, unknown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
     Catalogued,
@@ -26,8 +26,10 @@ from scenes.yaml.spec import (
     Reference,
     Spec,
     Text,
+    TitledSpec,
     Whole,
     name_in,
+    one_given,
 )
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
@@ -133,21 +135,19 @@ def reflector_kinds(returns: bool) -> OneOf:
 
 def _check_faces(errors: Mapping[str, tuple[float, float]], reflector: Reflector) -> None:
     """Refuse angle errors of faces that a reflector does not have."""
-    known = reflector.faces
     for name in errors:
-        if name not in known:
-            within = ("angle_errors", name)
-            raise Problem("no such face", shown(name), names_text(known), nearest(name, known), within)
+        if name not in reflector.faces:
+            raise unknown("no such face", name, reflector.faces, ("angle_errors", name))
 
 
 def check_made(made_of: str, reflector: Reflector) -> None:
     """Refuse what a reflector cannot be made of."""
-    if made_of not in (GLASSES if reflector.transparent else MATERIALS):
-        names = GLASSES if reflector.transparent else MATERIALS
+    names = GLASSES if reflector.transparent else MATERIALS
+    if made_of not in names:
         what = "no such glass" if reflector.transparent else "no such material"
         if made_of in MATERIALS:
             what += ": light goes through this kind; of other materials are the kinds without glass"
-        raise Problem(what, shown(made_of), names_text(names), nearest(made_of, names), ("material",))
+        raise unknown(what, made_of, names, ("material",))
 
 
 class Prism180Spec(Spec):
@@ -242,7 +242,6 @@ class CentralPrismSpec(Spec):
 MaterialName = Annotated[str, Field(strict=True), name_in("material", MATERIALS, material)]
 Exposure = Annotated[float, Quantity(TIME, above_zero=True, largest="100 s")]
 LookAngle = Annotated[float, Quantity(ANGLE, largest="90 deg")]
-MonitorField = Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
 FieldPlace = Annotated[float, Quantity(ANGLE, largest="45 deg")]
 Photons = Annotated[Number, Field(gt=0.0, le=1e12)]
 MOST_FRAMES = 10_000
@@ -367,14 +366,13 @@ class MountedCameraSpec(Spec):
 
     @model_validator(mode="after")
     def _one_of_both(self) -> MountedCameraSpec:
-        if (self.pupil_offset is None) == (self.channels is None):
-            found = "both" if self.channels else "neither"
-            raise Problem("which channels does its monitor have?", found, "one of pupil_offset and channels")
+        allowed = "one of pupil_offset and channels"
+        one_given(self, ("pupil_offset", "channels"), "which channels does its monitor have?", allowed)
         return self
 
     @property
     def mirrored(self) -> MountedCameraSpec:
-        """The same with every beam through the opposite part of the pupil."""
+        """The camera with every beam through the opposite part of the pupil."""
         if self.channels is None:
             assert self.pupil_offset is not None
             x, y = self.pupil_offset
@@ -420,7 +418,7 @@ class MonitorSpec(Spec):
     """
 
     wavelength: Wavelength
-    field: MonitorField
+    field: Annotated[float, Quantity(ANGLE, above_zero=True, largest="45 deg")]
     reticle: ReticleSpec
     area_ccd: AreaCcdSpec
     prism_180: Prism180Spec
@@ -434,7 +432,7 @@ class MonitorSpec(Spec):
         return {PRISM_180: self.prism_180, PRISM_0: self.prism_0}
 
 
-class InstrumentSpec(Spec):
+class InstrumentSpec(TitledSpec):
     """Cameras on a common base, each with its monitor.
 
     Attributes:
@@ -451,8 +449,6 @@ class InstrumentSpec(Spec):
             one's own.
     """
 
-    name: Name
-    description: Text = ""
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
     central_prism: CentralPrismSpec
     monitor: MonitorSpec

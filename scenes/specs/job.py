@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -10,30 +11,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
-from scenes.specs.course import (
-    DEFAULT_PIVOT,
-    NO_MOTION,
-    CourseSpec,
-    Rotation,
-    ScaleChange,
-    Shift,
-    Term,
-)
+from scenes.specs import job_tables
+from scenes.specs.course import DEFAULT_PIVOT, NO_MOTION, CourseSpec, Rotation, ScaleChange, Shift, Term, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
-from scenes.specs.job_tables import (
-    Deformation,
-    FinishesSpec,
-    PlainTemperature,
-    TableTemperature,
-    TableTemperatureSpec,
-    TemperatureSpec,
-    checked,
-    checked_finishes,
-)
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
+from scenes.yaml.spec import Flag, Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, SCALE
 
 
@@ -87,7 +71,7 @@ class PlainPerturbationSpec(Spec):
     pivot: Name = DEFAULT_PIVOT
     figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
-    temperature: PlainTemperature = TemperatureSpec()
+    temperature: job_tables.PlainTemperature = job_tables.TemperatureSpec()
 
     def uses(self) -> tuple[str, ...]:
         """Which of rotate, shift, figure, scale and temperature do something."""
@@ -115,8 +99,8 @@ class PerturbationSpec(PlainPerturbationSpec):
         deformation: the table of displaced nodes, or a mesh; None for none.
     """
 
-    temperature: TableTemperature = TableTemperatureSpec()
-    deformation: Deformation | None = None
+    temperature: job_tables.TableTemperature = job_tables.TableTemperatureSpec()
+    deformation: job_tables.Deformation | None = None
 
     @classmethod
     def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
@@ -124,7 +108,10 @@ class PerturbationSpec(PlainPerturbationSpec):
         return FrozenMap(
             {
                 path: cls.model_construct(
-                    **{**dict(what), "temperature": TableTemperatureSpec.model_construct(**dict(what.temperature))}
+                    **{
+                        **dict(what),
+                        "temperature": job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
+                    }
                 )
                 for path, what in perturb.items()
             }
@@ -151,7 +138,7 @@ class StraySpec(Spec):
     """
 
     paths: Annotated[Whole, Field(ge=10_000, le=1_000_000_000)] = 1_000_000
-    finishes: FinishesSpec | None = None
+    finishes: job_tables.FinishesSpec | None = None
 
 
 def _switch(value: Any) -> Any:
@@ -178,7 +165,7 @@ class RenderSpec(Spec):
     )
     targets: TargetsSpec | None = None
     stray: Annotated[StraySpec | None, BeforeValidator(_switch)] = None
-    quality: Annotated[bool, Field(strict=True)] = False
+    quality: Flag = False
     obstruction: Literal["traced", "ignore"] = "traced"
     frames: Frames | None = None
     seed: Seed = 1
@@ -223,7 +210,7 @@ def pivot_problem(
         own = perturb.get(path)
         if own is not None and (any(own.rotate) or own.scale) and own.pivot != moves.pivot:
             text = "another pivot than under perturb, to which the course is added"
-            return Problem(text, moves.pivot, own.pivot, within=(*within, "motion", path, "pivot"))
+            return Problem(text, shown(moves.pivot), own.pivot, within=(*within, "motion", path, "pivot"))
     return None
 
 
@@ -278,25 +265,38 @@ class JobSpec(Spec):
         return out
 
 
+def _with_course(job: JobSpec) -> JobSpec:
+    """The job with the times, temperatures and motions of its course's table, which is then no longer named."""
+    if job.course is None or job.course.table is None:
+        return job
+    path = job.course.file_at(("table",), job.course.table, Path(job.source.file).parent, "a CSV file")
+    course = read_course(path, job.course)
+    if problem := pivot_problem(job.perturb, course):
+        raise job.course.error(problem)
+    return job.model_copy(update={"course": course})
+
+
 def with_tables(job: JobSpec) -> JobSpec:
-    """The job with the full paths and checksums of its tables: of nodes that deform or warm its bodies, of finishes.
+    """The job with the contents of its course's table, and the full paths and checksums of its other tables: of nodes
+    that deform or warm its bodies, of finishes.
 
     Raises:
         InputError: a table that cannot be read or is not the one of the checksum.
     """
+    job = _with_course(job)
     changed = {}
     for path, what in job.perturb.items():
         update: dict[str, Any] = {}
         if what.deformation is not None:
-            update["deformation"] = checked(job, ("perturb", path, "deformation"), what.deformation)
+            update["deformation"] = job_tables.checked(job, ("perturb", path, "deformation"), what.deformation)
         if what.temperature.table is not None:
-            update["temperature"] = checked(job, ("perturb", path, "temperature"), what.temperature)
+            update["temperature"] = job_tables.checked(job, ("perturb", path, "temperature"), what.temperature)
         if update:
             changed[path] = what.model_copy(update=update)
     whole: dict[str, Any] = {"perturb": FrozenMap({**job.perturb, **changed})} if changed else {}
     stray = job.render.stray
     if stray is not None and stray.finishes is not None:
-        finishes = checked_finishes(job, ("render", "stray", "finishes"), stray.finishes)
+        finishes = job_tables.checked_finishes(job, ("render", "stray", "finishes"), stray.finishes)
         whole["render"] = job.render.model_copy(update={"stray": stray.model_copy(update={"finishes": finishes})})
     return job.model_copy(update=whole) if whole else job
 
@@ -312,6 +312,11 @@ class NodeInfo:
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
     allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
+
+    @property
+    def known_pivots(self) -> tuple[str, ...]:
+        """Names of its pivots and of the one that every body has."""
+        return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
 
 
 def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
@@ -372,17 +377,14 @@ def perturbation_issues(
         # nodes are displaced where a surface has a figure
         if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(_not_allowed(owner, info, action, (*key, action)))
-    if what.pivot != DEFAULT_PIVOT and what.pivot not in info.pivots:
-        known = (*info.pivots, *(() if DEFAULT_PIVOT in info.pivots else (DEFAULT_PIVOT,)))
-        meant = nearest(what.pivot, known)
-        text = "this node has no such pivot"
-        issues.append(owner.issue(text, (*key, "pivot"), found=what.pivot, allowed=names_text(known), suggestion=meant))
+    if what.pivot not in info.known_pivots:
+        wrong = unknown("this node has no such pivot", what.pivot, info.known_pivots)
+        issues.append(owner.issue(wrong, (*key, "pivot")))
     return issues
 
 
 def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
-    meant = nearest(path, nodes)
-    return owner.issue("no such node", key, found=path, allowed=names_text(sorted(nodes)), suggestion=meant)
+    return owner.issue(unknown("no such node", path, sorted(nodes)), key)
 
 
 def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:

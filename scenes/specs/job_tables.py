@@ -13,26 +13,18 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import TERMS
 from scenes.specs.course import NO_MOTION, TemperatureChange, TemperatureGradient
-from scenes.yaml.errors import KeyPath, Problem, names_text, nearest
+from scenes.yaml import node_table
+from scenes.yaml.errors import KeyPath, Problem, names_text, nearest, shown
 from scenes.yaml.finish_files import ENDING, read_bsdf, read_coating
-from scenes.yaml.input_file import digest_of, is_file, unusable
-from scenes.yaml.node_table import (
-    DECKS_NEED,
-    HEAT_DECKS_NEED,
-    INPUT_DECKS,
-    MESHES,
-    TABLES,
-    read_nodes,
-    read_temperatures,
-)
+from scenes.yaml.input_file import digest_of
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Reference, Spec, Text, Whole
+from scenes.yaml.spec import Reference, Spec, Text, Whole, short_for
 from scenes.yaml.units import SCALE
 
 Checksum = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 MeshUnit = Literal["m", "mm", "um"]
 HEAT_KEYS = ("table", "frame", "values", "unit", "field", "sha256")
-"""Of a temperature: those that say which table and how it is read."""
+"""Keys of a temperature that say which table and how it is read."""
 
 
 class TemperatureSpec(Spec):
@@ -93,21 +85,21 @@ class TableTemperatureSpec(TemperatureSpec):
         return self
 
 
-def _uniform(value: Any) -> Any:
-    """`temperature: 2 K` means a uniform change."""
-    return {"change": value} if isinstance(value, str | int | float) else value
-
-
-def _uniform_or_table(value: Any) -> Any:
-    """`temperature: 2 K` means a uniform change, `temperature: m1.csv` a table."""
-    if isinstance(value, str) and Path(value).suffix.lower() in (*TABLES, *MESHES, *INPUT_DECKS):
+def _table(value: Any) -> Any:
+    """`temperature: m1.csv` names a table."""
+    if isinstance(value, str) and Path(value).suffix.lower() in (
+        *node_table.TABLES,
+        *node_table.MESHES,
+        *node_table.INPUT_DECKS,
+    ):
         return {"table": value}
-    return _uniform(value)
+    return value
 
 
-PlainTemperature = Annotated[TemperatureSpec, BeforeValidator(_uniform)]
+_uniform = short_for("change", str, int, float)
+PlainTemperature = Annotated[TemperatureSpec, _uniform]
 """With its keys, or the uniform change alone."""
-TableTemperature = Annotated[TableTemperatureSpec, BeforeValidator(_uniform_or_table)]
+TableTemperature = Annotated[TableTemperatureSpec, _uniform, BeforeValidator(_table)]
 """With its keys, or the uniform change or the table's name alone."""
 
 
@@ -132,19 +124,14 @@ class DeformationSpec(Spec):
     sha256: Checksum | None = None
 
 
-def _named(value: Any) -> Any:
-    """`deformation: m1.csv` or `bsdf: m1.bsdf` names the table alone."""
-    return {"table": value} if isinstance(value, str) else value
-
-
-Deformation = Annotated[DeformationSpec, BeforeValidator(_named)]
+Deformation = Annotated[DeformationSpec, short_for("table", str)]
 """With its keys, or the table's name alone."""
 
 TableSpec = TypeVar("TableSpec", DeformationSpec, TableTemperatureSpec)
 
 
 def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
-    """The same with the table's full path and checksum, when it can be read.
+    """Fill in the table's full path and checksum, when it can be read.
 
     Args:
         owner: the specification that names it, which knows its file.
@@ -156,22 +143,19 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
     """
     heat = isinstance(spec, TableTemperatureSpec)
     assert spec.table is not None
-    path = (Path(owner.source.file).parent / spec.table).absolute()
-    place = (*key, "table")
-    if not is_file(path):
-        kinds = names_text((*TABLES, *MESHES))
-        raise owner.error(unusable(path), place, allowed=f"a file ({kinds}), relative to this one")
+    place, known = (*key, "table"), (*node_table.TABLES, *node_table.MESHES)
+    path = owner.file_at(place, spec.table, Path(owner.source.file).parent, f"a file ({names_text(known)})")
     ending = path.suffix.lower()
-    if ending in INPUT_DECKS:
+    if ending in node_table.INPUT_DECKS:
         text = f"a {ending} file has no {'temperatures' if heat else 'displacements'} that can be read here"
-        raise owner.error(text, place, found=spec.table, allowed=HEAT_DECKS_NEED if heat else DECKS_NEED)
-    if ending not in (*TABLES, *MESHES):
-        meant = nearest(ending, (*TABLES, *MESHES))
+        raise owner.error(
+            text, place, found=spec.table, allowed=node_table.HEAT_DECKS_NEED if heat else node_table.DECKS_NEED
+        )
+    if ending not in known:
         text = "neither a table nor a mesh that is known"
-        allowed = names_text((*TABLES, *MESHES))
-        raise owner.error(text, place, found=spec.table, allowed=allowed, suggestion=meant)
+        raise owner.error(Problem(text, shown(spec.table), names_text(known), nearest(ending, known)), place)
     of_meshes = ("unit", "field", "values") if heat else ("unit", "field")
-    if ending in TABLES:
+    if ending in node_table.TABLES:
         wrong = next((name for name in of_meshes if getattr(spec, name) is not None), None)
         if wrong is not None:
             text = f"a table has its units in its heads and no {wrong} beside them"
@@ -182,9 +166,9 @@ def checked(owner: Spec, key: KeyPath, spec: TableSpec) -> TableSpec:
         text = "a mesh's file does not say whether its temperatures are changes or absolute"
         raise owner.error(text, place, found=spec.table, allowed="values: change, K or degC beside it")
     if isinstance(spec, TableTemperatureSpec):
-        read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
+        node_table.read_temperatures(path, spec.unit, spec.field, spec.values, spec.sha256)
     else:
-        read_nodes(path, spec.unit, spec.field, spec.sha256)
+        node_table.read_nodes(path, spec.unit, spec.field, spec.sha256)
     return spec.model_copy(update={"table": str(path), "sha256": digest_of(path)})
 
 
@@ -203,7 +187,7 @@ class FinishTableSpec(Spec):
     sha256: Checksum | None = None
 
 
-FinishTable = Annotated[FinishTableSpec, BeforeValidator(_named)]
+FinishTable = Annotated[FinishTableSpec, short_for("table", str)]
 
 
 class FinishSpec(Spec):
@@ -235,8 +219,10 @@ def _by_ending(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     ending = Path(value).suffix.lower()
-    if ending not in (ENDING, *TABLES):
-        allowed = f"the name of a BSDF ({ENDING}) or of a coating ({names_text(TABLES)}), or keys bsdf, coating"
+    if ending not in (ENDING, *node_table.TABLES):
+        allowed = (
+            f"the name of a BSDF ({ENDING}) or of a coating ({names_text(node_table.TABLES)}), or keys bsdf, coating"
+        )
         raise Problem("not a table of a finish", value, allowed)
     return {"bsdf" if ending == ENDING else "coating": value}
 
@@ -293,7 +279,7 @@ class FinishesSpec(Spec):
         return {(kind, what): table for kind, what, table in both if table is not None}
 
     def with_tables(self, tables: Mapping[tuple[str, str], FinishTableSpec]) -> "FinishesSpec":
-        """The same with other tables, kind and what is measured -> table."""
+        """Return the finishes with other tables, kind and what is measured -> table."""
         changed = dict(self.given)
         for (kind, what), table in tables.items():
             changed[kind] = changed[kind].model_copy(update={what: table})
@@ -301,7 +287,7 @@ class FinishesSpec(Spec):
 
 
 def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesSpec:
-    """The same with the tables' full paths and checksums, when they can be read.
+    """Fill in the tables' full paths and checksums, when they can be read.
 
     Args:
         owner: the specification that names them, which knows its file.
@@ -314,11 +300,9 @@ def checked_finishes(owner: Spec, key: KeyPath, spec: FinishesSpec) -> FinishesS
     out = {}
     for (kind, what), table in spec.tables.items():
         place = (*key, kind, what)
-        path = (Path(owner.source.file).parent / table.table).absolute()
-        if not is_file(path):
-            raise owner.error(unusable(path), place, allowed="a file, relative to this one")
+        path = owner.file_at(place, table.table, Path(owner.source.file).parent, "a file")
         ending = path.suffix.lower()
-        right = (ENDING,) if what == "bsdf" else TABLES
+        right = (ENDING,) if what == "bsdf" else node_table.TABLES
         if ending not in right:
             text = f"not the ending of a {what}'s table"
             raise owner.error(text, place, found=table.table, allowed=names_text(right))

@@ -5,18 +5,17 @@ scenes/lab (experiments on the ground) and scenes/orbit (in flight); a file's na
 """
 
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
-from scenes.specs.camera_tests import CameraUnderTestSpec, DistortionTestSpec
-from scenes.specs.course_table import with_table
+from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.specs.turntable import TurntableTestSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
+from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import read_yaml
@@ -32,7 +31,7 @@ LAB, BUDGETS, ORBIT, PAYLOADS, DISTURBANCES = "lab", "budgets", "orbit", "payloa
 
 def _folder(name: str) -> Path:
     """Where the files of one kind stand."""
-    return (SCENES if name in (LAB, ORBIT) else LIBRARY) / name
+    return (SCENES if name in (LAB, ORBIT, "examples") else LIBRARY) / name
 
 
 def library_names(folder: str) -> tuple[str, ...]:
@@ -47,7 +46,7 @@ def load_job(path: str | Path) -> JobSpec:
         InputError: the file cannot be read or is not a valid job, or there is no such instrument; one issue for each
             fault.
     """
-    job = with_tables(with_table(validate(JobSpec, read_yaml(path))))
+    job = with_tables(validate(JobSpec, read_yaml(path)))
     instrument_path(job)
     return job
 
@@ -61,30 +60,30 @@ def instrument_path(job: JobSpec) -> Path:
     return find_named(INSTRUMENTS, job.instrument, job, ("instrument",))
 
 
-def load_error_budget(name_or_path: str | Path, relative_to: str | Path | None = None) -> ErrorBudgetSpec:
+def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
     """Read an error budget; arguments and errors as `load_instrument`."""
-    return load_named(ErrorBudgetSpec, BUDGETS, name_or_path, relative_to)
+    return load_named(ErrorBudgetSpec, BUDGETS, name_or_path)
 
 
-def load_instrument(name_or_path: str | Path, relative_to: str | Path | None = None) -> InstrumentSpec:
+def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
     """Read an instrument. The cameras and the detector it names are looked for, not read.
 
     Args:
-        name_or_path: a name in the library, or a path (anything with a slash or ending in .yaml or .yml).
-        relative_to: folder that a relative path starts from, the current one by default.
+        name_or_path: a name in the library, or a path from the current folder (anything with a slash or ending in
+            .yaml or .yml).
 
     Raises:
         InputError: as `load_job`.
     """
-    instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path, relative_to)
+    instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path)
     paths_of_cameras(instrument)
     path_of_detector(instrument)
     return instrument
 
 
-def load_disturbances(name_or_path: str | Path, relative_to: str | Path | None = None) -> DisturbancesSpec:
+def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
     """Read a disturbances file; arguments and errors as `load_instrument`."""
-    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path, relative_to)
+    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path)
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
@@ -108,18 +107,15 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
     return stated if asked is None else stated.changed(asked)
 
 
-def read_design(
-    design: MonitorDesignSpec,
-) -> tuple[InstrumentSpec, dict[str, CameraSpec], DetectorSpec, dict[str, DisturbancesSpec], dict[str, DetectorSpec]]:
+def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
     """What a search for a layout refers to: the instrument to start from, its cameras by the name that it gives them,
-    its area CCD, disturbances by their names in the design, and data sheets of the area CCDs that it may choose.
+    detector (its area CCD), disturbances by their names in the design, and detectors, data sheets of the area CCDs that
+    it may choose.
 
     Raises:
         InputError: a file is not there or not valid, or nothing is stated to move.
     """
     start = load_instrument(find_named(INSTRUMENTS, design.instrument, design, ("instrument",)))
-    files = paths_of_cameras(start)
-    cameras = {site.camera: load_camera(files[name]) for name, site in start.cameras.items()}
     owner: Spec = design
     references = design.disturbances
     if references is None:
@@ -135,7 +131,13 @@ def read_design(
         name: load_detector(find_named(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
         for name, one in (design.area_ccds or {}).items()
     }
-    return start, cameras, load_detector(path_of_detector(start)), stated, sheets
+    return {
+        "instrument": start,
+        "cameras": load_cameras(start),
+        "detector": load_detector(path_of_detector(start)),
+        "disturbances": FrozenMap(stated),
+        "detectors": FrozenMap(sheets),
+    }
 
 
 def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
@@ -146,56 +148,38 @@ def paths_of_cameras(instrument: InstrumentSpec) -> dict[str, Path]:
     }
 
 
+def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
+    """The prescriptions of an instrument's cameras, by the names that its file gives them. Raises InputError."""
+    files = paths_of_cameras(instrument)
+    return FrozenMap({mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()})
+
+
 def path_of_detector(instrument: InstrumentSpec) -> Path:
     """The file of the area CCD's data sheet. Raises InputError if there is none."""
     return find_named(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
 
 
-def find_detector(name_or_path: str, named_by: Spec, key: KeyPath) -> Path:
-    """The file of a data sheet that another file names. Raises InputError, at that file's key, if there is none."""
-    return find_named(DETECTORS, name_or_path, named_by, key)
-
-
-def load_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> CameraSpec:
+def load_camera(name_or_path: str | Path) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    return load_named(CameraSpec, CAMERAS, name_or_path, relative_to)
+    return load_named(CameraSpec, CAMERAS, name_or_path)
 
 
-def load_detector(name_or_path: str | Path, relative_to: str | Path | None = None) -> DetectorSpec:
+def load_detector(name_or_path: str | Path) -> DetectorSpec:
     """Read a detector's data sheet; arguments and errors as `load_instrument`."""
-    return load_named(DetectorSpec, DETECTORS, name_or_path, relative_to)
+    return load_named(DetectorSpec, DETECTORS, name_or_path)
 
 
-def load_autocollimator_test(
-    name_or_path: str | Path = "principle_experiment", relative_to: str | Path | None = None
-) -> AutocollimatorSetup:
+def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") -> AutocollimatorSetup:
     """Read a test with two autocollimators and the data sheet of their CCDs; arguments, errors as `load_instrument`."""
-    spec = load_named(AutocollimatorTestSpec, LAB, name_or_path, relative_to)
+    spec = load_named(AutocollimatorTestSpec, LAB, name_or_path)
     reference = spec.autocollimator.area_ccd.detector
     detector = find_named(DETECTORS, reference, spec, ("autocollimator", "area_ccd", "detector"))
     return AutocollimatorSetup(spec, load_detector(detector))
 
 
-def load_turntable_test(
-    name_or_path: str | Path = "turntable", relative_to: str | Path | None = None
-) -> TurntableTestSpec:
-    """Read a turntable test; arguments and errors as `load_instrument`."""
-    return load_named(TurntableTestSpec, LAB, name_or_path, relative_to)
-
-
-def load_lab_test(model: type[SpecType], name_or_path: str | Path, relative_to: str | Path | None = None) -> SpecType:
-    """Read a laboratory test of that sort; arguments and errors as `load_instrument`."""
-    return load_named(model, LAB, name_or_path, relative_to)
-
-
 def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
     """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
     return find_named(CAMERAS, test.camera, test, ("camera",))
-
-
-def find_turntable_test(test: DistortionTestSpec) -> Path:
-    """The file of the distortion test's turntable. Raises InputError if there is none."""
-    return find_named(LAB, test.turntable, test, ("turntable",))
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
@@ -206,25 +190,20 @@ def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:
     }
 
 
-def load_named(
-    model: type[SpecType], folder: str, name_or_path: str | Path, relative_to: str | Path | None
-) -> SpecType:
+def load_named(model: type[SpecType], folder: str, name_or_path: str | Path) -> SpecType:
     """Read a file of one folder of the library, or a user's own of that kind.
 
     Args:
         model: what its kind of files may say.
         folder: of the library, for a name.
         name_or_path: as of `load_instrument`.
-        relative_to: likewise.
 
     Raises:
         InputError: as `load_instrument`.
     """
-    path = place_of(folder, name_or_path, Path(relative_to) if relative_to is not None else Path())
+    path = place_of(folder, name_or_path, Path())
     if path is None:
-        name, allowed = str(name_or_path), _names_and_paths(folder)
-        meant = nearest(name, library_names(folder))
-        raise InputError(Issue(f"no such name in {folder}", found=shown(name), allowed=allowed, suggestion=meant))
+        raise InputError(_no_such_name(folder, str(name_or_path)).at(""))
     return validate(model, read_yaml(path))
 
 
@@ -233,24 +212,32 @@ def _names_and_paths(folder: str) -> str:
     return f"{names_text(names)}, or the path of a .yaml file"
 
 
+def _no_such_name(folder: str, name: str) -> Problem:
+    return unknown(f"no such name in {folder}", name, library_names(folder), allowed=_names_and_paths(folder))
+
+
 def find_named(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
     """The file that a specification refers to, or an InputError at the line of the reference."""
     file = owner.source.file
     path = place_of(folder, reference, Path(file).parent if file else Path())
     if path is None:
-        meant = nearest(reference, library_names(folder))
-        problem, allowed = f"no such name in {folder}", _names_and_paths(folder)
-        raise owner.error(problem, key, found=reference, allowed=allowed, suggestion=meant)
+        raise owner.error(_no_such_name(folder, reference), key)
     if not is_file(path):
         meant = nearest(path.stem, library_names(folder))
         raise owner.error(unusable(path), key, allowed=_names_and_paths(folder), suggestion=meant)
     return path
 
 
+def is_path(name_or_path: str | Path) -> bool:
+    """Whether a reference is a path, and not a name in the library."""
+    text = str(name_or_path)
+    return isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml"))
+
+
 def place_of(folder: str, name_or_path: str | Path, base: Path) -> Path | None:
     """Where a reference leads: a library file that exists, a path that may not, or None for an unknown name."""
     text = str(name_or_path)
-    if isinstance(name_or_path, Path) or "/" in text or text.endswith((".yaml", ".yml")):
+    if is_path(name_or_path):
         return base / text
     path = _folder(folder) / f"{text}.yaml"
     return path if text in library_names(folder) else None

@@ -128,9 +128,9 @@ PROCEDURES: dict[str, Procedure] = {
         "focus",
         setup="scenes.specs.resolved:FocusSetup",
         resolve="scenes.specs.resolved:resolve_focus_test",
-        run="twin.laboratory.measured_focus:run_focus_test",
+        run="twin.laboratory.focus_run:run_focus",
         numbers="twin.laboratory.focus_numbers:focus_numbers",
-        report="twin.laboratory.focus_measured_report:any_focus_report",
+        report="twin.laboratory.focus_report:focus_report",
         export="twin.laboratory.export:export_focus",
         files=(
             FileKind("focus_test", "scenes.specs.camera_tests:FocusTestSpec", "a focus test"),
@@ -180,15 +180,13 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.resolved:TurntableSetup",
         resolve="scenes.specs.resolved:resolve_turntable_test",
         run="twin.laboratory.turntable_run:run_turntable_test",
-        numbers="twin.laboratory.turntable_numbers:turntable_numbers",
+        numbers="twin.laboratory.turntable_numbers:TURNTABLE",
         report="twin.laboratory.turntable_report:turntable_report",
         export="twin.laboratory.export:export_turntable",
         files=(
             FileKind("turntable_test", "scenes.specs.turntable:TurntableTestSpec", "a turntable test"),
             FileKind(
-                "measured_turntable",
-                "scenes.specs.turntable:MeasuredTurntableSpec",
-                "a turntable test on measurements",
+                "measured_turntable", "scenes.specs.turntable:MeasuredTurntableSpec", "a turntable test on measurements"
             ),
         ),
         varied=True,
@@ -205,7 +203,7 @@ PROCEDURES: dict[str, Procedure] = {
         run="twin.orbit.angle.measured_angle:run_angle_test",
         numbers="twin.orbit.angle.angle_numbers:angle_numbers",
         report="twin.orbit.angle.angle_report:angle_report",
-        export="twin.orbit.angle.angle_export:angle_exported",
+        export="twin.orbit.angle.measured_angle:angle_exported",
         files=(
             FileKind("orbit_angle", "scenes.specs.orbit.angle:OrbitAngleSpec", "a test of intersection angles"),
             FileKind(
@@ -266,14 +264,12 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.orbit_data_setup:CheckSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_check",
         run="twin.orbit.conventions.check_run:run_check",
-        numbers="twin.orbit.conventions.check_numbers:check_numbers",
+        numbers="twin.orbit.conventions.check_numbers:CHECK",
         report="twin.orbit.conventions.check_report:check_report",
-        export="twin.orbit.conventions.check_export:exported",
+        export="twin.orbit.conventions.check_run:exported",
         files=(
             FileKind(
-                "orbit_check",
-                "scenes.specs.measured.orbit_data:OrbitCheckSpec",
-                "a check of the conventions of a pass",
+                "orbit_check", "scenes.specs.measured.orbit_data:OrbitCheckSpec", "a check of the conventions of a pass"
             ),
         ),
         judged=False,
@@ -296,14 +292,12 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.measured.orbit_data_setup:MatchSetup",
         resolve="scenes.specs.measured.orbit_data_setup:resolve_match",
         run="twin.orbit.matching.match_run:run_match",
-        numbers="twin.orbit.matching.match_numbers:match_numbers",
+        numbers="twin.orbit.matching.match_run:MATCH",
         report="twin.orbit.matching.match_report:match_report",
-        export="twin.orbit.matching.match_numbers:exported",
+        export="twin.orbit.matching.match_run:exported",
         files=(
             FileKind(
-                "orbit_match",
-                "scenes.specs.measured.orbit_data:OrbitMatchSpec",
-                "points to be measured in line images",
+                "orbit_match", "scenes.specs.measured.orbit_data:OrbitMatchSpec", "points to be measured in line images"
             ),
         ),
         judged=False,
@@ -344,7 +338,7 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.specs.orbit.setup:SimulateSetup",
         resolve="scenes.specs.orbit.setup:resolve_simulate",
         run="twin.orbit.images.simulate_run:run_simulation",
-        numbers="twin.orbit.images.simulate_numbers:simulate_numbers",
+        numbers="twin.orbit.images.simulate_numbers:SIMULATE",
         report="twin.orbit.images.simulate_report:simulation_report",
         export="twin.orbit.calibration.calibration_export:simulation_exported",
         files=(
@@ -370,20 +364,32 @@ PROCEDURES: dict[str, Procedure] = {
         setup="scenes.models.camera_design:CameraDesignSetup",
         resolve="scenes.models.camera_design:resolve_design",
         run="twin.design.design_run:run_design",
-        numbers="twin.design.design_run:design_numbers",
+        numbers="twin.design.design_run:DESIGN",
         report="twin.design.design_report:design_report",
         files=(FileKind("camera_design", "scenes.specs.camera:CameraDesignSpec", "an optimisation of a camera"),),
         judged=False,
+        about="""
+    Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
+    the field is made least, with the focal length, the envelope, the anamorphism and free beams as constraints.
+    It is done from several starts (``starts:``), and said whether they agree.
+
+    Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
+
+    The run folder gets the new camera's file in artefacts/,
+    design.json, config.yaml and a report.
+
+    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
+    """,
     ),
     "design monitor": Procedure(
         "layouts",
         setup="scenes.models.monitor_layout:MonitorDesignSetup",
         resolve="scenes.models.monitor_layout:resolve_monitor_design",
         run="twin.design.monitor_design:run_monitor_design",
-        numbers="twin.design.monitor_design:monitor_design_numbers",
+        numbers="twin.design.monitor_design:LAYOUTS",
         report="twin.design.monitor_report:monitor_design_report",
         files=(FileKind("monitor_design", "scenes.specs.camera:MonitorDesignSpec", "a search for a monitor's layout"),),
         judged=False,
     ),
 }
-"""As the command is called after ``twin.`` -> the test. A test is its own modules and one entry here."""
+"""Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

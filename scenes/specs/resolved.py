@@ -9,34 +9,16 @@ from typing import Annotated, Any, Generic, Self, TypeVar, cast
 from pydantic import Field
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, TargetsSpec, with_tables
-from scenes.specs.load import (
-    CAMERAS,
-    INSTRUMENTS,
-    find_camera,
-    find_disturbances,
-    find_turntable_test,
-    instrument_path,
-    library_names,
-    load_band_detectors,
-    load_camera,
-    load_detector,
-    load_disturbances,
-    load_instrument,
-    load_job,
-    load_lab_test,
-    load_turntable_test,
-    path_of_detector,
-    paths_of_cameras,
-)
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest, shown
-from scenes.yaml.input_file import is_file, unusable
+from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, unknown
+from scenes.yaml.input_file import is_file
 from scenes.yaml.spec import Name, Paths, Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
@@ -77,7 +59,7 @@ class ResolvedJob(Spec):
         return targets if targets.frames else targets.model_copy(update={"frames": self.frames})
 
     def with_render(self, frames: int, seed: int) -> ResolvedJob:
-        """The same with this number of frames and this seed, for values that a command overrides."""
+        """Return the job with another number of frames and another seed, for values that a command overrides."""
         render = self.job.render.model_copy(update={"frames": frames, "seed": seed})
         return self.model_copy(update={"job": self.job.model_copy(update={"render": render})})
 
@@ -95,18 +77,16 @@ def resolve(path: str | Path) -> ResolvedJob:
     yaml = read_yaml(path)
     if isinstance(yaml.data, dict) and "job" in yaml.data:
         return _complete(validate(ResolvedJob, yaml))
-    return resolve_job(load_job(path))
+    return resolve_job(load.load_job(path))
 
 
 def resolve_job(job: JobSpec) -> ResolvedJob:
     """A job with all it refers to. Raises InputError as `resolve`."""
-    return _with_instrument(job, load_instrument(instrument_path(job)))
+    return _with_instrument(job, load.load_instrument(load.instrument_path(job)))
 
 
 def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
-    files = paths_of_cameras(instrument)
-    cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
-    detector = load_detector(path_of_detector(instrument))
+    cameras = load.load_cameras(instrument)
     line_detectors = None
     if job.render.target_images:
         line_detectors = FrozenMap({name: _line_detector(camera) for name, camera in cameras.items()})
@@ -114,10 +94,10 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
     return ResolvedJob.model_construct(
         job=job,
         instrument=instrument,
-        cameras=FrozenMap(cameras),
-        detector=detector,
+        cameras=cameras,
+        detector=load.load_detector(load.path_of_detector(instrument)),
         line_detectors=line_detectors,
-        disturbances=find_disturbances(job, instrument),
+        disturbances=load.find_disturbances(job, instrument),
     )
 
 
@@ -129,7 +109,7 @@ def resolve_budget(budget: ErrorBudgetSpec) -> ResolvedJob:
     """
     named = {"file": budget.disturbances}
     job = JobSpec.model_validate({"instrument": budget.instrument, "disturbances": named}).with_source(budget.source)
-    resolved = resolve_job(cast(JobSpec, job))
+    resolved = resolve_job(job)
     if resolved.disturbances is None:
         text = "an error budget is one of disturbances"
         raise budget.error(text, ("disturbances",), found=budget.disturbances, allowed="the name of a file of them")
@@ -147,16 +127,16 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
         InputError: as `resolve`; there is no such instrument or no such disturbances file.
     """
     text = str(file)
-    named = "/" not in text and not text.endswith((".yaml", ".yml")) and not Path(text).is_file()
+    named = not load.is_path(text) and not Path(text).is_file()
     if named or "monitor" in _keys(file):
-        instrument = load_instrument(text if named else Path(text))
+        instrument = load.load_instrument(text if named else Path(text))
         job = JobSpec.model_validate({"instrument": text})
         resolved = _with_instrument(job, instrument)
     else:
         resolved = resolve(file)
     if disturbances is None:
         return resolved
-    return resolved.model_copy(update={"disturbances": load_disturbances(disturbances)})
+    return resolved.model_copy(update={"disturbances": load.load_disturbances(disturbances)})
 
 
 def _keys(file: str | Path) -> tuple[str, ...]:
@@ -178,11 +158,11 @@ def target_band(camera: CameraSpec) -> str:
 
 def _line_detector(camera: CameraSpec) -> DetectorSpec:
     """Data sheet of the line CCD that images the targets."""
-    return load_band_detectors(camera)[camera.bands[target_band(camera)].detector]
+    return load.load_band_detectors(camera)[camera.bands[target_band(camera)].detector]
 
 
 def _complete(resolved: ResolvedJob) -> ResolvedJob:
-    """Check that every camera of the instrument is there, and let the job know where it was read."""
+    """Check that every camera of the instrument is there, and read the job's tables."""
     for mounted in resolved.instrument.cameras.values():
         if mounted.camera not in resolved.cameras:
             raise resolved.error(f"camera {mounted.camera!r} of the instrument is missing", ("cameras",))
@@ -190,14 +170,7 @@ def _complete(resolved: ResolvedJob) -> ResolvedJob:
             text = f"images of targets need the data sheet of the line CCD of camera {mounted.camera!r}"
             allowed = "a config.yaml of a run with targets, or the job's own file"
             raise resolved.error(text, ("line_detectors",), allowed=allowed)
-    source = resolved.source
-    job = cast(JobSpec, resolved.job.with_source(Source(source.file, source.lines, ("job",))))
-    changed: dict[str, Spec] = {"job": with_tables(job)}
-    if resolved.disturbances is not None:
-        changed["disturbances"] = resolved.disturbances.with_source(
-            Source(source.file, source.lines, ("disturbances",))
-        )
-    return resolved.model_copy(update=changed)
+    return resolved.model_copy(update={"job": with_tables(resolved.job)})
 
 
 class ExperimentSetup(Spec, Generic[TestType]):
@@ -210,7 +183,7 @@ class ExperimentSetup(Spec, Generic[TestType]):
     test: TestType
 
     def with_seed(self, seed: int) -> Self:
-        """The same with another seed, for one that a command overrides."""
+        """Return the set-up with another seed, for one that a command overrides."""
         return self.model_copy(update={"test": self.test.model_copy(update={"seed": seed})})
 
     def to_yaml(self) -> str:
@@ -224,15 +197,12 @@ def read_setup(model: type[SetupType], path: str | Path) -> SetupType | None:
     Raises:
         InputError: the file cannot be read, or is a config.yaml that is not valid.
     """
-    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
+    if not load.is_path(path):
         return None
     yaml = read_yaml(path)
     if not (isinstance(yaml.data, dict) and "test" in yaml.data):
         return None
-    setup = validate(model, yaml)
-    # the test knows where it was read, so that what is found wrong later is told by its line
-    test = setup.test.with_source(Source(setup.source.file, setup.source.lines, ("test",)))
-    return setup.model_copy(update={"test": test})
+    return validate(model, yaml)
 
 
 MEASURED = "measured"
@@ -294,10 +264,10 @@ def resolve_focus(path: str | Path) -> FocusSetup:
         _require_plane(again.test, again.camera)
         _require_detectors(again, again.camera, again.detectors)
         return again
-    test = load_lab_test(FocusTestSpec, path)
-    camera = load_camera(find_camera(test))
+    test = load.load_named(FocusTestSpec, load.LAB, path)
+    camera = load.load_camera(load.find_camera(test))
     _require_plane(test, camera)
-    return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load_band_detectors(camera)))
+    return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera)))
 
 
 def resolve_distortion(path: str | Path) -> DistortionSetup:
@@ -310,12 +280,14 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
         _require_bands(again.test, again.camera, again.test.band)
         _require_detectors(again, again.camera, again.detectors)
         return again
-    test = load_lab_test(DistortionTestSpec, path)
-    camera = load_camera(find_camera(test))
+    test = load.load_named(DistortionTestSpec, load.LAB, path)
+    camera = load.load_camera(load.find_camera(test))
     _require_bands(test, camera, test.band)
-    turntable = load_turntable_test(find_turntable_test(test))
+    turntable = load.load_named(
+        TurntableTestSpec, load.LAB, load.find_named(load.LAB, test.turntable, test, ("turntable",))
+    )
     return DistortionSetup.model_construct(
-        test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load_band_detectors(camera))
+        test=test, turntable=turntable, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera))
     )
 
 
@@ -327,28 +299,45 @@ def resolve_turntable(path: str | Path) -> TurntableSetup:
     """
     if (again := read_setup(TurntableSetup, path)) is not None:
         return again
-    return TurntableSetup.model_construct(test=load_turntable_test(path))
+    return TurntableSetup.model_construct(test=load.load_named(TurntableTestSpec, load.LAB, path))
 
 
 def resolve_focus_test(path: str | Path) -> FocusSetup | MeasuredFocusSetup:
-    """As `resolve_focus`, for a simulated bench or, with `measured:` in the file, for measurements."""
-    if is_measured(path):
-        return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path)
-    return resolve_focus(path)
+    """Read a focal-plane alignment as `resolve_focus`, for a simulated bench or, with `measured:` in the file, for
+    measurements.
+    """
+    return _measured(MeasuredFocusSetup, MeasuredFocusSpec, path) if is_measured(path) else resolve_focus(path)
 
 
 def resolve_distortion_test(path: str | Path) -> DistortionSetup | MeasuredDistortionSetup:
-    """As `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for measurements."""
-    if is_measured(path):
-        return _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
-    return resolve_distortion(path)
+    """Read a distortion test as `resolve_distortion`, for a simulated bench or, with `measured:` in the file, for
+    measurements.
+    """
+    return (
+        _measured(MeasuredDistortionSetup, MeasuredDistortionSpec, path)
+        if is_measured(path)
+        else resolve_distortion(path)
+    )
 
 
 def resolve_turntable_test(path: str | Path) -> TurntableSetup | MeasuredTurntableSetup:
-    """As `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for measurements."""
-    if is_measured(path):
-        return _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path)
-    return resolve_turntable(path)
+    """Read a turntable test as `resolve_turntable`, for a simulated bench or, with `measured:` in the file, for
+    measurements.
+    """
+    return (
+        _measured(MeasuredTurntableSetup, MeasuredTurntableSpec, path) if is_measured(path) else resolve_turntable(path)
+    )
+
+
+def test_keys(path: str | Path) -> Mapping[str, Any]:
+    """What a test's file, or the test in a run's config.yaml, holds at its top; nothing for a name in the library.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    data = read_yaml(path).data if load.is_path(path) else {}
+    inner = data.get("test", data) if isinstance(data, dict) else {}
+    return inner if isinstance(inner, dict) else {}
 
 
 def is_measured(path: str | Path) -> bool:
@@ -357,45 +346,27 @@ def is_measured(path: str | Path) -> bool:
     Raises:
         InputError: it cannot be read.
     """
-    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
-        return False
-    data = read_yaml(path).data
-    inner = data.get("test", data) if isinstance(data, dict) else None
-    return isinstance(inner, dict) and MEASURED in inner
+    return MEASURED in test_keys(path)
 
 
 def _measured(setup: type[MeasuredSetup], model: type[Spec], path: str | Path) -> MeasuredSetup:
     """The test with the paths of its data made absolute, so that a run's config.yaml finds them from anywhere."""
     again = read_setup(setup, path)
-    test: Spec = load_lab_test(model, path) if again is None else again.test
-    folder = Path(test.source.file).parent.absolute()
-    measured = getattr(test, MEASURED)
-    changed = {MEASURED: _absolute(measured, folder)}
-    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update=changed)))
+    test: Spec = load.load_named(model, load.LAB, path) if again is None else again.test
+    measured = _absolute(getattr(test, MEASURED), Path(test.source.file).parent.absolute())
+    return cast(MeasuredSetup, setup.model_construct(test=test.model_copy(update={MEASURED: measured})))
 
 
 def _absolute(files: Spec, folder: Path) -> Spec:
-    """The same section with every path absolute."""
+    """Make every path of a section absolute."""
     changed: dict[str, Any] = {}
     for name in type(files).model_fields:
         value = getattr(files, name)
         if isinstance(value, TurntableFiles):
             changed[name] = _absolute(value, folder)
         elif name in DATA_FILES and value is not None:
-            changed[name] = str(_found(files, name, folder / value))
+            changed[name] = str(files.file_at((name,), value, folder, "a CSV file"))
     return files.model_copy(update=changed)
-
-
-def _found(files: Spec, name: str, path: Path) -> Path:
-    """The path, if there is such a file."""
-    if is_file(path):
-        return path
-    try:
-        beside = [str(other.relative_to(path.parent)) for other in path.parent.iterdir() if other.suffix == path.suffix]
-    except OSError:
-        beside = []
-    meant = nearest(path.name, beside)
-    raise files.error(unusable(path), (name,), allowed="a CSV file, relative to this file", suggestion=meant)
 
 
 def _require_plane(test: Spec, camera: CameraSpec) -> None:
@@ -421,9 +392,7 @@ def _require_bands(test: Spec, camera: CameraSpec, band: str | None = None) -> N
             f"the camera {camera.name} has no line CCDs", ("camera",), allowed="a camera with `bands:` in its file"
         )
     if band is not None and band not in camera.bands:
-        names = tuple(camera.bands)
-        meant = nearest(band, names)
-        raise test.error("no such band", ("band",), found=band, allowed=names_text(names), suggestion=meant)
+        raise test.error(unknown("no such band", band, camera.bands), ("band",))
 
 
 ALLOWED = "the file of a camera or of an instrument, or the config.yaml of a run with one"
@@ -470,26 +439,25 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         InputError: the file cannot be read or is not valid, holds no camera, or several and ``name`` none of them.
     """
     text = str(file)
-    if "/" not in text and not text.endswith((".yaml", ".yml")) and not is_file(Path(text)):
+    if not load.is_path(text) and not is_file(Path(text)):
         return _of_library(text, name)
     yaml = read_yaml(file)
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
-        return _alone(load_camera(Path(text)), text, name)
+        return _alone(load.load_camera(Path(text)), text, name)
     if "cameras" in data and "monitor" in data:
-        return _mounted(load_instrument(Path(text)), text, name)
+        return _mounted(load.load_instrument(Path(text)), text, name)
     return _of_run(yaml, name)
 
 
 def _of_library(text: str, name: str | None) -> CameraSetup:
-    cameras, instruments = library_names(CAMERAS), library_names(INSTRUMENTS)
+    cameras, instruments = load.library_names(load.CAMERAS), load.library_names(load.INSTRUMENTS)
     if text in cameras:
-        return _alone(load_camera(text), text, name)
+        return _alone(load.load_camera(text), text, name)
     if text in instruments:
-        return _mounted(load_instrument(text), text, name)
+        return _mounted(load.load_instrument(text), text, name)
     allowed = f"{names_text(cameras)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
-    meant = nearest(text, (*cameras, *instruments))
-    raise InputError(Issue("no such camera or instrument", found=shown(text), allowed=allowed, suggestion=meant))
+    raise InputError(unknown("no such camera or instrument", text, (*cameras, *instruments), allowed=allowed).at(""))
 
 
 def _alone(camera: CameraSpec, file: str, name: str | None) -> CameraSetup:
@@ -499,15 +467,9 @@ def _alone(camera: CameraSpec, file: str, name: str | None) -> CameraSetup:
 
 
 def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraSetup:
-    chosen = _chosen(tuple(instrument.cameras), file, name)
-    files = paths_of_cameras(instrument)
-    cameras = {mounted.camera: load_camera(files[own]) for own, mounted in instrument.cameras.items()}
-    return CameraSetup.model_construct(
-        camera=cameras[instrument.cameras[chosen].camera],
-        mounted=chosen,
-        instrument=instrument,
-        cameras=FrozenMap(cameras),
-    )
+    chosen, cameras = _chosen(tuple(instrument.cameras), file, name), load.load_cameras(instrument)
+    camera = cameras[instrument.cameras[chosen].camera]
+    return CameraSetup.model_construct(camera=camera, mounted=chosen, instrument=instrument, cameras=cameras)
 
 
 def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
@@ -533,9 +495,7 @@ def _read(yaml: YamlFile, data: Mapping[str, Any], way: KeyPath) -> CameraSpec:
     """A camera that stands at ``way`` in a file."""
     lines = {key[len(way) :]: line for key, line in yaml.lines.items() if key[: len(way)] == way}
     camera = validate(CameraSpec, YamlFile(yaml.file, data, lines))
-    placed = camera.with_source(Source(yaml.file, yaml.lines, way))
-    assert isinstance(placed, CameraSpec)
-    return placed
+    return camera.with_source(Source(yaml.file, yaml.lines, way))
 
 
 def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
@@ -545,6 +505,5 @@ def _chosen(names: tuple[str, ...], file: str, name: str | None) -> str:
             return names[0]
         raise InputError(Issue("which of its cameras is meant is not said", file, allowed=f"--camera {names[0]} ..."))
     if name not in names:
-        allowed, meant = names_text(names), nearest(name, names)
-        raise InputError(Issue("no such camera", file, found=shown(name), allowed=allowed, suggestion=meant))
+        raise InputError(unknown("no such camera", name, names).at(file))
     return name

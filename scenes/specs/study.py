@@ -3,17 +3,27 @@
 from __future__ import annotations
 
 import re
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.procedures import studied
-from scenes.yaml.errors import KeyPath, Problem, key_text, names_text, nearest, shown
-from scenes.yaml.spec import Name, Named, NothingIsEmpty, Number, OneOf, Reference, Seed, Spec, Text, Whole
+from scenes.specs.samplers import GRID, SAMPLERS
+from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
+from scenes.yaml.spec import (
+    Flag,
+    Name,
+    Named,
+    NothingIsEmpty,
+    Number,
+    OneOf,
+    Reference,
+    Seed,
+    Spec,
+    Text,
+    TitledSpec,
+    Whole,
+)
 from scenes.yaml.units import split_quantity, unit_ratio
 
 Scalar = (
@@ -66,7 +76,7 @@ class TableSpec(Spec):
         values: what stands there; a study's config.yaml holds them, so that it needs no other file.
     """
 
-    file: Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
+    file: Reference
     column: Text
     values: tuple[Scalar, ...] | None = None
 
@@ -187,9 +197,8 @@ class FactorSpec(Spec):
             raise Problem("not numbers", shown(list(self.scalars())), "quantities or numbers", within=(self.kind,))
         if self.kind in ("normal", "truncated"):
             if not numbers.values[1] > 0.0:
-                raise Problem(
-                    "a standard deviation is greater than zero", allowed="another sigma", within=(self.kind, "sigma")
-                )
+                problem = "a standard deviation is greater than zero"
+                raise Problem(problem, allowed="another sigma", within=(self.kind, "sigma"))
         if self.kind != "normal":
             low, high = numbers.values[-2:]
             if not low < high:
@@ -235,9 +244,8 @@ class Numbers(tuple[float, ...]):
         numbers = []
         for scalar, part in zip(scalars, parts, strict=True):
             if part is None:
-                raise Problem(
-                    "not a quantity among quantities", shown(scalar), f"a number with {first}", within=(kind,)
-                )
+                allowed = f"a number with {first}"
+                raise Problem("not a quantity among quantities", shown(scalar), allowed, within=(kind,))
             number, unit = part
             try:
                 # dividing keeps 300 mm / (1000 mm/m) at 0.3 where a product would not
@@ -247,80 +255,6 @@ class Numbers(tuple[float, ...]):
         out = cls(numbers)
         out.numeric, out.unit, out.whole = True, first, False
         return out
-
-
-GRID = "grid"
-"""The kind that draws nothing: every combination."""
-
-
-@dataclass(frozen=True)
-class Sampler:
-    """How a design spreads its runs.
-
-    Attributes:
-        title: for readers.
-        points: number of runs, number of independent factors, generator of all that is drawn -> points of the unit
-            cube, (runs, factors) in [0, 1]. A factor takes the value at which its distribution function is the point's
-            coordinate.
-        even: whether the points lie more evenly than independent ones, so that means are known better than by
-            sigma/sqrt(n).
-    """
-
-    title: str
-    points: Callable[[int, int, np.random.Generator], np.ndarray]
-    even: bool = False
-
-
-SMALLEST = 2.0**-53
-"""Draws lie in [SMALLEST, 1 - SMALLEST], where normal quantiles are finite (8.2 sigma)."""
-
-
-def _latin_hypercube(runs: int, factors: int, generator: np.random.Generator) -> np.ndarray:
-    # takes a second to import, and a worker does not need it
-    from scipy.stats import qmc
-
-    return np.asarray(qmc.LatinHypercube(factors, rng=generator).random(runs))
-
-
-def _sobol(runs: int, factors: int, generator: np.random.Generator) -> np.ndarray:
-    from scipy.stats import qmc
-
-    with warnings.catch_warnings():
-        # the user chose the number of runs; the points are those of the sequence all the same
-        warnings.filterwarnings("ignore", message="The balance properties")
-        return np.asarray(qmc.Sobol(factors, scramble=True, rng=generator).random(runs))
-
-
-def _monte_carlo(runs: int, factors: int, generator: np.random.Generator) -> np.ndarray:
-    return generator.random((runs, factors))
-
-
-SAMPLERS: dict[str, Sampler] = {
-    "latin_hypercube": Sampler("Latin hypercube", _latin_hypercube, even=True),
-    "sobol": Sampler("scrambled Sobol sequence", _sobol, even=True),
-    "monte_carlo": Sampler("Monte Carlo", _monte_carlo),
-}
-"""Kind of a design that draws -> its sampler. A new one is added here, and its name can be written in a study."""
-
-
-def unit_cube(kind: str, runs: int, factors: int, seed: int) -> np.ndarray:
-    """Points of a design in the open unit cube, (runs, factors).
-
-    Args:
-        kind: one of SAMPLERS.
-        runs: number of points.
-        factors: number of coordinates.
-        seed: of what is drawn.
-
-    Raises:
-        KeyError: no such kind.
-        ValueError: the sampler gave no points of that cube.
-    """
-    generator = np.random.default_rng(np.random.SeedSequence(seed))
-    cube = np.asarray(SAMPLERS[kind].points(runs, factors, generator), np.float64)
-    if cube.shape != (runs, factors) or not np.all((cube >= 0.0) & (cube <= 1.0)):
-        raise ValueError(f"the sampler {kind} must give points {(runs, factors)} in [0, 1], gave {cube.shape}")
-    return np.clip(cube, SMALLEST, 1.0 - SMALLEST)
 
 
 class DesignSpec(Spec):
@@ -452,7 +386,7 @@ class ThresholdSpec(Spec):
     response: Name
     at_most: Number | None = None
     at_least: Number | None = None
-    magnitude: Annotated[bool, Field(strict=True)] = False
+    magnitude: Flag = False
 
     @model_validator(mode="after")
     def _asks_something(self) -> ThresholdSpec:
@@ -491,7 +425,7 @@ class StudyReportSpec(Spec):
     histograms: tuple[Name, ...] | None = None
     scatter: tuple[tuple[Name, Name], ...] = ()
     pareto: tuple[ParetoSpec, ...] = ()
-    sobol: Annotated[bool, Field(strict=True)] = False
+    sobol: Flag = False
     thresholds: Named[ThresholdSpec] = Field(default_factory=dict, validate_default=True)
 
     def names(self) -> list[tuple[KeyPath, str, bool]]:
@@ -505,7 +439,7 @@ class StudyReportSpec(Spec):
         return out + [(("thresholds", key, "response"), t.response, True) for key, t in self.thresholds.items()]
 
 
-class StudySpec(Spec):
+class StudySpec(TitledSpec):
     """A design trade study.
 
     Attributes:
@@ -520,8 +454,6 @@ class StudySpec(Spec):
         report: what the report shows.
     """
 
-    name: Name
-    description: Text = ""
     base: BaseSpec
     factors: Annotated[Named[FactorSpec], Field(min_length=1)]
     design: Annotated[DesignSpec, NothingIsEmpty] = DesignSpec()
@@ -550,8 +482,7 @@ class StudySpec(Spec):
             among = tuple(self.responses) if response else names
             if name not in among:
                 what = "no such response" if response else "no such factor or response"
-                within = ("report", *key)
-                raise Problem(what, name, names_text(among), nearest(name, among), within=within)
+                raise unknown(what, name, among, ("report", *key))
         return self
 
     def _check_design(self, name: str, factor: FactorSpec) -> None:

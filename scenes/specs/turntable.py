@@ -11,16 +11,13 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Number, Seed, Spec, Text, Whole
+from scenes.yaml.quantity import AngleSigma, Quantity
+from scenes.yaml.spec import Number, Reference, Seed, Spec, TitledSpec, Whole
 from scenes.yaml.units import ANGLE, format_quantity
 
-ErrorSize = Annotated[float, Quantity(ANGLE, smallest="0 arcsec", largest="1 deg")]
 TableAngle = Annotated[float, Quantity(ANGLE, largest="360 deg")]
 Step = Annotated[float, Quantity(ANGLE, above_zero=True, largest="30 deg")]
 MOST_LINES = 10_000_000
-DataFile = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
-"""Path of a file of measurements, relative to the file that names it."""
 
 
 class GraduationSpec(Spec):
@@ -32,7 +29,7 @@ class GraduationSpec(Spec):
         slope: the amplitude of harmonic k falls as k^-slope.
     """
 
-    rms: ErrorSize
+    rms: AngleSigma
     first: Annotated[Whole, Field(ge=1, le=10_000)] = 3
     last: Annotated[Whole, Field(ge=1, le=10_000)]
     slope: Annotated[Number, Field(ge=0.0, le=4.0)]
@@ -55,7 +52,7 @@ class SubdivisionSpec(Spec):
         harmonics: of the signal that carry it, equal in the mean.
     """
 
-    rms: ErrorSize
+    rms: AngleSigma
     lines: Annotated[Whole, Field(ge=100, le=MOST_LINES)]
     harmonics: Annotated[tuple[Annotated[Whole, Field(ge=1, le=64)], ...], Field(min_length=1, max_length=16)] = (
         1,
@@ -65,7 +62,7 @@ class SubdivisionSpec(Spec):
 
     @property
     def period(self) -> float:
-        """Of the signal, radians."""
+        """Period of the signal, radians."""
         return 2.0 * math.pi / self.lines
 
 
@@ -81,11 +78,11 @@ class DividingErrorSpec(Spec):
         repeatability: standard deviation of one reading, radians.
     """
 
-    axis: ErrorSize
-    eccentricity: ErrorSize
+    axis: AngleSigma
+    eccentricity: AngleSigma
     graduation: GraduationSpec
     subdivision: SubdivisionSpec
-    repeatability: ErrorSize
+    repeatability: AngleSigma
 
 
 class ReferenceSpec(Spec):
@@ -99,9 +96,9 @@ class ReferenceSpec(Spec):
         gross_probability: of one in a comparison.
     """
 
-    calibration: ErrorSize
-    noise: ErrorSize
-    gross_error: ErrorSize
+    calibration: AngleSigma
+    noise: AngleSigma
+    gross_error: AngleSigma
     gross_probability: Annotated[Number, Field(ge=0.0, le=0.2)]
 
 
@@ -115,7 +112,7 @@ class HeldOutSpec(Spec):
     """
 
     repeats: Annotated[Whole, Field(ge=2, le=1000)]
-    spread: ErrorSize
+    spread: AngleSigma
 
 
 class CalibrationPlanSpec(Spec):
@@ -170,7 +167,7 @@ class CalibrationPlanSpec(Spec):
         return self
 
 
-class TurntableTestSpec(Spec):
+class TurntableTestSpec(TitledSpec):
     """The turntable test.
 
     Attributes:
@@ -183,8 +180,6 @@ class TurntableTestSpec(Spec):
         seed: of everything that is drawn.
     """
 
-    name: Name
-    description: Text = ""
     dividing_error: DividingErrorSpec
     reference: ReferenceSpec
     calibration: CalibrationPlanSpec
@@ -217,13 +212,13 @@ class TurntableFiles(Spec):
         folds: of the cross-validation.
     """
 
-    comparisons: DataFile
-    held_out: DataFile | None = None
-    reference: ErrorSize
+    comparisons: Reference
+    held_out: Reference | None = None
+    reference: AngleSigma
     folds: Annotated[Whole, Field(ge=2, le=1000)] = 10
 
 
-class MeasuredTurntableSpec(Spec):
+class MeasuredTurntableSpec(TitledSpec):
     """The turntable test on measured readings.
 
     Attributes:
@@ -233,7 +228,5 @@ class MeasuredTurntableSpec(Spec):
         seed: of the network's starts.
     """
 
-    name: Name
-    description: Text = ""
     measured: TurntableFiles
     seed: Seed = 1

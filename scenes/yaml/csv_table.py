@@ -200,6 +200,21 @@ def _rows(file: str, text: str) -> Iterator[tuple[list[int], list[list[str]]]]:
         yield lines, rows
 
 
+def rows_of(path: str | Path, most: int) -> list[tuple[int, list[str]]]:
+    """Line, counted from 1, and cells of every row of a small table; empty lines and those that begin with # are left
+    out.
+
+    Args:
+        path: of the file, as for ``read_table``.
+        most: bytes that it may have.
+
+    Raises:
+        InputError: it cannot be read, or is no table.
+    """
+    pieces = _rows(str(path), table_text(path, most=most))
+    return [row for lines, rows in pieces for row in zip(lines, rows, strict=True)]
+
+
 def _heads(
     file: str, line: int, heads: Sequence[str], columns: Sequence[Column], allowed: str
 ) -> list[tuple[Column, int, _Scale]]:

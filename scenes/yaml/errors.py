@@ -2,6 +2,8 @@
 what was meant.
 """
 
+from __future__ import annotations
+
 import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -57,47 +59,21 @@ class Issue:
 class InputError(Exception):
     """An input that cannot be used: one or more issues, one a line in the message. Commands end with exit code 2 on it.
 
-    The attributes of the first issue can be read from the error itself.
+    Attributes:
+        issues: all of them.
+        file, line, key, found, allowed, suggestion: of the first one.
     """
 
     def __init__(self, *issues: Issue) -> None:
         if not issues:
             raise ValueError("an InputError needs at least one issue")
         super().__init__(*issues)
-        self.issues = issues
+        self.issues, first = issues, issues[0]
+        self.file, self.line, self.key = first.file, first.line, first.key
+        self.found, self.allowed, self.suggestion = first.found, first.allowed, first.suggestion
 
     def __str__(self) -> str:
         return "\n".join(str(issue) for issue in self.issues)
-
-    @property
-    def file(self) -> str:
-        """Path as the user gave it, "" if the input did not come from a file."""
-        return self.issues[0].file
-
-    @property
-    def line(self) -> int | None:
-        """Line counted from 1, None if unknown."""
-        return self.issues[0].line
-
-    @property
-    def key(self) -> KeyPath:
-        """Where in the file."""
-        return self.issues[0].key
-
-    @property
-    def found(self) -> str | None:
-        """What stands there."""
-        return self.issues[0].found
-
-    @property
-    def allowed(self) -> str | None:
-        """What may stand there."""
-        return self.issues[0].allowed
-
-    @property
-    def suggestion(self) -> str | None:
-        """The nearest valid name."""
-        return self.issues[0].suggestion
 
 
 class Problem(ValueError):
@@ -122,6 +98,30 @@ class Problem(ValueError):
 
     def __str__(self) -> str:
         return self.problem
+
+    def below(self, *key: str | int) -> Problem:
+        """Tell the problem at a key within the value."""
+        return Problem(self.problem, self.found, self.allowed, self.suggestion, (*key, *self.within))
+
+    def at(self, file: str, line: int | None = None, key: KeyPath = ()) -> Issue:
+        """The fault of the file in which the value stands."""
+        return Issue(self.problem, file, line, (*key, *self.within), self.found, self.allowed, self.suggestion)
+
+
+def unknown(
+    problem: str, name: object, known: Iterable[str], within: KeyPath = (), allowed: str | None = None
+) -> Problem:
+    """A name that is none of the known ones, with these and the nearest of them, for the caller to raise.
+
+    Args:
+        problem: what is wrong, "no such line".
+        name: as it was found.
+        known: names that may stand there.
+        within: where in the value it stands.
+        allowed: what may stand there, where the names alone do not say it.
+    """
+    names = tuple(known)
+    return Problem(problem, shown(name), allowed or names_text(names), nearest(str(name), names), within)
 
 
 def nearest(name: str, names: Iterable[str]) -> str | None:

@@ -320,7 +320,7 @@ def read_coating(path: str | Path) -> MeasuredCoating:
 
 
 def _mean(table: Table, name: str) -> np.ndarray | None:
-    """Of unpolarised light: the column itself, or the mean of those for s and p; None where there is neither."""
+    """Shares of unpolarised light: the column itself, or the mean of those for s and p; None where there is neither."""
     s, p = f"{name}s", f"{name}p"
     if name in table:
         both = next((other for other in (s, p) if other in table), None)

@@ -27,7 +27,8 @@ def read_bytes(path: str | Path, what: str, most: int, ends: Sequence[str]) -> b
     # A device or a pipe could be endless or block.
     wrong = no_file(Path(path))
     if wrong == MISSING:
-        raise InputError(Issue(wrong, file, suggestion=_file_beside(Path(path), ends)))
+        meant = file_beside(Path(path), ends)
+        raise InputError(Issue(wrong, file, suggestion=meant and str(Path(path).with_name(meant))))
     if wrong is not None:
         raise InputError(Issue(wrong, file, allowed=what))
     try:
@@ -104,7 +105,9 @@ def no_file(path: Path) -> str | None:
 
 
 def unusable(path: Path) -> str:
-    """The same with the path, for a message at the key of the file that names it; of a path that is not a file's."""
+    """Why a path is not that of a regular file, with the path, for a message at the key of the file that names it; of a
+    path that is not a file's.
+    """
     wrong = no_file(path) or MISSING
     return f"{wrong}: {path}" if wrong == MISSING else f"{path} {wrong}"
 
@@ -115,11 +118,15 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _file_beside(path: Path, ends: Sequence[str]) -> str | None:
-    """The file with one of these ends in the same folder that was probably meant."""
+def file_beside(path: Path, ends: Sequence[str] = ()) -> str | None:
+    """Name of the file in the same folder that was probably meant; None where none comes near.
+
+    Args:
+        path: of a file that is not there.
+        ends: of names that may have been meant; by default any.
+    """
     try:
-        names = [place.name for place in path.parent.iterdir() if place.suffix in ends]
+        names = sorted(place.name for place in path.parent.iterdir() if not ends or place.suffix in ends)
     except (OSError, ValueError):
         return None
-    meant = nearest(path.name, names)
-    return None if meant is None else str(path.parent / meant)
+    return nearest(path.name, names)

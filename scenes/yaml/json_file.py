@@ -11,7 +11,7 @@ from scenes.yaml.yaml_file import DEEPEST
 LARGEST_JSON = 500_000_000
 """Bytes of a file; a study of a million runs and twenty responses has a hundredth of it."""
 MOST_DIGITS = 300
-"""Of a whole number, so that it is a finite floating-point number, too."""
+"""Most digits of a whole number, so that it is a finite floating-point number, too."""
 
 
 def read_json(path: str | Path) -> Any:

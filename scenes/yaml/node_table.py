@@ -24,7 +24,7 @@ COLUMNS = (
     *(Column(name, LENGTH, least=-FARTHEST, most=FARTHEST) for name in (*PLACES, *MOVES)),
     Column("node", text=True, needed=False),
 )
-"""Of a table; the nodes' own numbers say nothing here."""
+"""Columns of a table of displacements; the nodes' own numbers say nothing here."""
 ABSOLUTE, CHANGE = "T", "dT"
 HOTTEST = 2000.0
 """Kelvin: no node is hotter, and none changes by more."""
@@ -34,7 +34,7 @@ HEAT_COLUMNS = (
     Column(CHANGE, TEMPERATURE_DIFFERENCE, needed=False, least=-HOTTEST, most=HOTTEST),
     COLUMNS[-1],
 )
-"""Of a table of temperatures: absolute ones, or changes from the instrument's."""
+"""Columns of a table of temperatures: absolute ones, or changes from the instrument's."""
 LONGEST_READING, LONGEST_PER_BYTE = 10.0, 2e-6
 """Seconds for a mesh, and for each of its bytes: ten times what whole files take."""
 READINGS = ("change", "K", "degC")

@@ -12,23 +12,13 @@ from functools import cached_property
 from typing import Annotated, Any
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
+from optics.geometry.sag_terms import SAG_TERMS, SagTerm
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.errors import Problem, shown
-from scenes.yaml.units import (
-    ANGLE,
-    LENGTH,
-    SCALE,
-    TEMPERATURE,
-    TIME,
-    Kind,
-    format_quantity,
-    parse_quantity,
-    pattern,
-    power_of_length,
-    split_row,
-)
+from scenes.yaml import units
+from scenes.yaml.errors import KeyPath, Problem, names_text, shown, unknown
 
 
 @dataclass(frozen=True)
@@ -43,7 +33,7 @@ class Quantity:
         unsigned: of a difference: a larger one is written with its sign, since without it is hardly meant as one.
     """
 
-    kind: Kind
+    kind: units.Kind
     largest: str | None = None
     smallest: str | None = None
     above_zero: bool = False
@@ -69,11 +59,11 @@ class Quantity:
         Raises:
             Problem: not a quantity of this kind, or outside the limits.
         """
-        value = parse_quantity(text, self.kind)
+        value = units.parse_quantity(text, self.kind)
         outside = (
             (self.above_zero and not value > 0.0)
-            or (self.smallest is not None and value < parse_quantity(self.smallest, self.kind))
-            or (self.largest is not None and math.fabs(value) > parse_quantity(self.largest, self.kind))
+            or (self.smallest is not None and value < units.parse_quantity(self.smallest, self.kind))
+            or (self.largest is not None and math.fabs(value) > units.parse_quantity(self.largest, self.kind))
         )
         if outside:
             raise Problem("outside the limits", shown(text), self.limits)
@@ -83,11 +73,11 @@ class Quantity:
         return value
 
     def _lacks_sign(self, value: float) -> bool:
-        return self.unsigned is not None and value > parse_quantity(self.unsigned, self.kind)
+        return self.unsigned is not None and value > units.parse_quantity(self.unsigned, self.kind)
 
     def format(self, value: float) -> str:
         """Text with unit that `parse` reads back to exactly this value."""
-        return ("+" if self._lacks_sign(value) else "") + format_quantity(value, self.kind)
+        return ("+" if self._lacks_sign(value) else "") + units.format_quantity(value, self.kind)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(
@@ -98,7 +88,7 @@ class Quantity:
         limits = f"; {self.limits}" if self.limits else ""
         return {
             "type": "string",
-            "pattern": pattern(self.kind),
+            "pattern": units.pattern(self.kind),
             "description": f"{self.kind.allowed}{limits}",
             "examples": [self.kind.example],
         }
@@ -127,12 +117,16 @@ class Vector:
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         item = self.of.__get_pydantic_json_schema__(schema, handler)
         listed = {"type": "array", "items": item, "minItems": self.length, "maxItems": self.length}
-        text = {"type": "string", "pattern": pattern(self.of.kind, self.length), "description": item["description"]}
+        text = {
+            "type": "string",
+            "pattern": units.pattern(self.of.kind, self.length),
+            "description": item["description"],
+        }
         return {"anyOf": [listed, text, *([item] if self.alike else [])]}
 
     def _check_length(self, value: object) -> object:
         if isinstance(value, str):
-            row = split_row(value, self.length)
+            row = units.split_row(value, self.length)
             if row is None and self.alike:
                 self.of.parse(value)  # what is wrong with it is said once
                 row = [value] * self.length
@@ -169,19 +163,25 @@ class Terms:
         return {"type": "object", "properties": items, "additionalProperties": False}
 
 
-Angle = Annotated[float, Quantity(ANGLE)]
+Angle = Annotated[float, Quantity(units.ANGLE)]
 """Radians."""
-Length = Annotated[float, Quantity(LENGTH, largest="1000 km")]
+Length = Annotated[float, Quantity(units.LENGTH, largest="1000 km")]
 """Metres."""
-PositiveLength = Annotated[float, Quantity(LENGTH, above_zero=True, largest="1000 m")]
+PositiveLength = Annotated[float, Quantity(units.LENGTH, above_zero=True, largest="1000 m")]
 """Metres, greater than zero."""
-Wavelength = Annotated[float, Quantity(LENGTH, smallest="100 nm", largest="100 um")]
+Wavelength = Annotated[float, Quantity(units.LENGTH, smallest="100 nm", largest="100 um")]
 """Metres."""
-Scale = Annotated[float, Quantity(SCALE)]
+AngleSigma = Annotated[float, Quantity(units.ANGLE, smallest="0 arcsec", largest="1 deg")]
+"""A standard deviation, radians."""
+AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE, smallest="0 arcsec", largest="1 deg"))]
+"""Standard deviations about three axes, radians."""
+LengthSigma = Annotated[float, Quantity(units.LENGTH, smallest="0 um", largest="5 mm")]
+"""A standard deviation, metres."""
+Scale = Annotated[float, Quantity(units.SCALE)]
 """A relative change, dimensionless: 1e-6 for 1 ppm."""
-Time = Annotated[float, Quantity(TIME)]
+Time = Annotated[float, Quantity(units.TIME)]
 """Seconds."""
-Temperature = Annotated[float, Quantity(TEMPERATURE, smallest="0 K")]
+Temperature = Annotated[float, Quantity(units.TEMPERATURE, smallest="0 K")]
 """Kelvin, absolute."""
 
 
@@ -203,16 +203,82 @@ class RadiusQuantity(Quantity):
 
 
 FLAT = "flat"
-Radius = Annotated[float, RadiusQuantity(LENGTH, largest="1000 km")]
-"""Of curvature, metres; infinite for a plane."""
+Radius = Annotated[float, RadiusQuantity(units.LENGTH, largest="1000 km")]
+"""A radius of curvature, metres; infinite for a plane."""
 AsphereTerms = Annotated[
-    Mapping[str, float],
-    Terms({f"A{n}": Quantity(power_of_length(1 - n)) for n in range(4, 22, 2)}),
+    Mapping[str, float], Terms({f"A{n}": Quantity(units.power_of_length(1 - n)) for n in range(4, 22, 2)})
 ]
 """Terms of an even asphere's sag A4 r^4 + A6 r^6 + ... + A20 r^20, 1/m^3, 1/m^5, ...; those that are not written are
 not there.
 """
-Vector2 = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="100 m"), 2)]
+Vector2 = Annotated[tuple[float, float], Vector(Quantity(units.LENGTH, largest="100 m"), 2)]
 """Two lengths, metres."""
-Vector3 = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="100 m"), 3)]
+Vector3 = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, largest="100 m"), 3)]
 """Three lengths, metres."""
+
+
+class SagTerms:
+    """Annotation of a mapping from names of ``SAG_TERMS`` to their numbers, those that are registered when the file is
+    read; in the model the terms themselves.
+    """
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Read by ``_read``, written as it was read."""
+        as_text = core_schema.plain_serializer_function_ser_schema(self._written, when_used="json-unless-none")
+        return core_schema.no_info_plain_validator_function(self._read, serialization=as_text)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """The kinds at this moment with their numbers."""
+
+        def value(power: int) -> JsonSchemaValue:
+            if not power:
+                return {"type": "number"}
+            return Quantity(units.power_of_length(power)).__get_pydantic_json_schema__(schema, handler)
+
+        kinds = {name: {key: value(power) for key, power in kind.POWERS.items()} for name, kind in SAG_TERMS.items()}
+        terms = {
+            name: {"type": "object", "properties": keys, "additionalProperties": False} for name, keys in kinds.items()
+        }
+        return {"type": "object", "properties": terms, "additionalProperties": False}
+
+    def _read(self, value: object) -> FrozenMap[str, SagTerm]:
+        terms = {}
+        for name, given in _mapping(value, SAG_TERMS, "no such term of a sag").items():
+            kind = SAG_TERMS[name]
+            units = kind.POWERS
+            numbers = _mapping(given, units, "unknown key", (name,))
+            terms[name] = kind(**{key: _number(numbers[key], units[key], (name, key)) for key in numbers})
+        return FrozenMap(terms)
+
+    def _written(self, terms: Mapping[str, SagTerm]) -> dict[str, dict[str, object]]:
+        return {
+            name: {
+                key: units.format_quantity(number, units.power_of_length(power)) if power else number
+                for key, power in term.POWERS.items()
+                if (number := getattr(term, key)) != 0.0
+            }
+            for name, term in terms.items()
+        }
+
+
+def _mapping(value: object, names: Mapping[str, Any], problem: str, within: KeyPath = ()) -> dict[str, Any]:
+    """A mapping with no other keys than these."""
+    if not isinstance(value, Mapping):
+        raise Problem("not a mapping", shown(value), f"a mapping with keys {names_text(names)}", within=within)
+    for name in value:
+        if name not in names:
+            raise unknown(problem, name, names, (*within, name))
+    return dict(value)
+
+
+def _number(value: object, power: int, within: KeyPath) -> float:
+    """A quantity in metres to a power, or a plain number."""
+    try:
+        if power:
+            return units.parse_quantity(value, units.power_of_length(power))
+    except Problem as problem:
+        problem.within = within
+        raise
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise Problem("not a number", shown(value), "a plain number, without a unit", within=within)
+    return float(value)

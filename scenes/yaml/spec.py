@@ -6,12 +6,14 @@ model.
 
 from __future__ import annotations
 
+import os
 import types
 import typing
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as data_field
-from typing import Annotated, Any, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Self, TypedDict, TypeVar, Unpack
 
 from pydantic import (
     AfterValidator,
@@ -25,12 +27,13 @@ from pydantic import (
     ValidationError,
 )
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, ErrorDetails, core_schema
+from pydantic_core import CoreSchema, ErrorDetails, PydanticUndefined, core_schema
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
+from scenes.yaml.input_file import file_beside, is_file, unusable
 from scenes.yaml.quantity import Terms
-from scenes.yaml.yaml_file import YamlFile
+from scenes.yaml.yaml_file import YamlFile, dump_yaml
 
 Value = TypeVar("Value")
 
@@ -42,6 +45,8 @@ Name = Annotated[str, StringConstraints(strict=True, pattern=r"^[A-Za-z][A-Za-z0
 """A name: letters, digits, _ and -, beginning with a letter."""
 Text = Annotated[str, Field(strict=True, max_length=2000)]
 """Free text."""
+Flag = Annotated[bool, Field(strict=True)]
+"""True or false, and no number or word."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,7 @@ def name_in(what: str, catalogue: Mapping[str, Any], look_up: Callable[[str], An
         try:
             return str(look_up(name).name)
         except KeyError:
-            raise Problem(f"no such {what}", shown(name), names_text(catalogue), nearest(name, catalogue)) from None
+            raise unknown(f"no such {what}", name, catalogue) from None
 
     return Catalogued(check, catalogue)
 
@@ -95,7 +100,7 @@ class OneOf:
     def _known(self, value: Any) -> str:
         names = tuple(self.names())
         if not isinstance(value, str) or value not in names:
-            raise Problem("not one of the choices", shown(value), names_text(names), nearest(str(value), names))
+            raise unknown("not one of the choices", value, names)
         return value
 
 
@@ -109,7 +114,7 @@ def _freeze(value: Mapping[str, Value]) -> FrozenMap[str, Value]:
 
 
 Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1)]
-"""Of every random number."""
+"""Seed of every random number."""
 Reference = Annotated[str, Field(strict=True, min_length=1, max_length=1000)]
 """Name of a file in the library (`gf7`), or path of a file of one's own, relative to the file that names it."""
 
@@ -147,6 +152,14 @@ class Source:
         return next((self.lines[full[:n]] for n in range(len(full), -1, -1) if full[:n] in self.lines), None)
 
 
+class _Told(TypedDict, total=False):
+    """What a message says beside what is wrong."""
+
+    found: object
+    allowed: str | None
+    suggestion: str | None
+
+
 class Spec(BaseModel):
     """Base of all specifications: immutable, and unknown keys are errors."""
 
@@ -159,43 +172,120 @@ class Spec(BaseModel):
         """Where it was read; defaults and what was made in other ways do not know."""
         return self._source
 
-    def with_source(self, source: Source) -> Spec:
-        """The same, remembering that it was read there."""
+    def with_source(self, source: Source) -> Self:
+        """Return the specification with another place where it was read."""
         copy = self.model_copy()
         copy._source = source
         return copy
 
-    def issue(
-        self,
-        problem: str,
-        key: KeyPath = (),
-        *,
-        found: object = None,
-        allowed: str | None = None,
-        suggestion: str | None = None,
-    ) -> Issue:
-        """Something wrong with what stands at `key` of this specification, with the file and line it was read from."""
-        source = self._source
-        text = None if found is None else shown(found)
-        return Issue(problem, source.file, source.line(key), (*source.prefix, *key), text, allowed, suggestion)
+    def issue(self, problem: str | Problem, key: KeyPath = (), **told: Unpack[_Told]) -> Issue:
+        """Something wrong with what stands at `key`, with the file and line it was read from.
 
-    def error(
-        self,
-        problem: str,
-        key: KeyPath = (),
-        *,
-        found: object = None,
-        allowed: str | None = None,
-        suggestion: str | None = None,
-    ) -> InputError:
+        Args:
+            problem: what is wrong; or a Problem, which says all but the key.
+            key: in this specification.
+            told: found (what stands there), allowed (what may stand there) and suggestion (the nearest valid name).
+        """
+        if not isinstance(problem, Problem):
+            found = told.get("found")
+            text = None if found is None else shown(found)
+            problem = Problem(problem, text, told.get("allowed"), told.get("suggestion"))
+        source = self._source
+        return problem.at(source.file, source.line((*key, *problem.within)), (*source.prefix, *key))
+
+    def error(self, problem: str | Problem, key: KeyPath = (), **told: Unpack[_Told]) -> InputError:
         """An `InputError` with one `issue`, for the caller to raise."""
-        return InputError(self.issue(problem, key, found=found, allowed=allowed, suggestion=suggestion))
+        return InputError(self.issue(problem, key, **told))
+
+    def file_at(self, key: KeyPath, value: str, folder: Path, what: str) -> Path:
+        """The absolute path of a file that a specification names.
+
+        Args:
+            key: that names it.
+            value: its path, as it is written there.
+            folder: that relative paths start from.
+            what: the file should be, for messages.
+
+        Raises:
+            InputError: there is none.
+        """
+        path = folder / value
+        if is_file(path):
+            return path.absolute()
+        meant = file_beside(path)
+        suggestion = None if meant is None else os.path.join(os.path.dirname(value), meant)
+        raise self.error(unusable(path), key, allowed=f"{what}, relative to this file", suggestion=suggestion)
 
     def plain(self) -> dict[str, Any]:
         """Plain data, ready for YAML: quantities as text with units that reads back to the same bits, nothing that is
         None.
         """
         return self.model_dump(mode="json", exclude_none=True)
+
+
+class TitledSpec(Spec):
+    """Base of the files that have a name of their own.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+    """
+
+    name: Name
+    description: Text = ""
+
+    def file_text(self, remark: str) -> str:
+        """Text of a file that says this, with remarks at its top; keys without a value are left out."""
+        head = "".join(f"# {line}\n" for line in remark.splitlines())
+        return head + dump_yaml({key: value for key, value in self.plain().items() if value not in ("", {})})
+
+
+def one_given(spec: Spec, names: Sequence[str], problem: str, allowed: str | None = None, within: KeyPath = ()) -> None:
+    """Refuse a specification that has none or several of the keys of which it needs one.
+
+    Args:
+        spec: that was read.
+        names: of the keys.
+        problem: what is wrong then.
+        allowed: what may be written.
+        within: the key at which that is told.
+
+    Raises:
+        Problem: not one of them is given.
+    """
+    given = [name for name in names if getattr(spec, name) is not None]
+    if len(given) != 1:
+        words = ("neither", "both") if len(names) == 2 else ("none of them", " and ".join(given))
+        raise Problem(problem, words[bool(given)], allowed, within=within)
+
+
+def not_empty(problem: str, allowed: str) -> AfterValidator:
+    """Validator that refuses a list or a mapping without entries."""
+
+    def check(value: Any) -> Any:
+        if not value:
+            raise Problem(problem, f"an empty {'mapping' if isinstance(value, Mapping) else 'list'}", allowed)
+        return value
+
+    return AfterValidator(check)
+
+
+def short_for(key: str | None, *types: type, schema: Any = PydanticUndefined) -> BeforeValidator:
+    """Validator of what may be written short: a value of one of the types stands for ``{key: value}``, or for a list
+    that holds it if the key is None.
+
+    Args:
+        key: which the value stands for.
+        types: of a value that is short for it.
+        schema: what editors are told that may be written; by default the long form.
+    """
+
+    def widen(value: Any) -> Any:
+        if not isinstance(value, types):
+            return value
+        return [value] if key is None else {key: value}
+
+    return BeforeValidator(widen, json_schema_input_type=schema)
 
 
 SpecType = TypeVar("SpecType", bound=Spec)
@@ -213,7 +303,7 @@ def validate(model: type[SpecType], yaml: YamlFile) -> SpecType:
     except ValidationError as error:
         issues = [_issue(model, detail, source) for detail in error.errors(include_url=False)]
         raise InputError(*sorted(issues, key=lambda issue: issue.line or 0)) from None
-    spec = typing.cast(SpecType, spec.with_source(source))
+    spec = spec.with_source(source)
     _tell_parts(spec, source)
     return spec
 
@@ -233,6 +323,25 @@ def _tell_parts(value: Any, source: Source) -> None:
             part._source = own
         if isinstance(part, Spec | Mapping | tuple | list):
             _tell_parts(part, own)
+
+
+_NOT_A_NAME = ("not a name", "letters, digits, _ and -, beginning with a letter")
+_SAID = {
+    **dict.fromkeys(("int_type", "int_from_float"), ("not a whole number", "a whole number")),
+    "float_type": ("not a number", "a plain number, without a unit"),
+    "finite_number": ("not a finite number", "a plain number, without a unit"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), ("neither true nor false", "true or false")),
+    "string_type": ("not text", "text"),
+    "string_pattern_mismatch": _NOT_A_NAME,
+    **dict.fromkeys(("tuple_type", "list_type"), ("not a list", "a list: [...]")),
+}
+"""Pydantic's kind of an error -> what is wrong, and what is allowed, where its own words do not say it."""
+_LIMITS = {
+    "greater_than": ("gt", "greater than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
 
 
 def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
@@ -265,37 +374,15 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         problem, allowed = "not one of the choices", names_text(names)
         suggestion = nearest(str(value), [str(name) for name in names])
     elif of_key:
-        problem, allowed = "not a name", "letters, digits, _ and -, beginning with a letter"
-    elif kind.startswith(("greater_than", "less_than")):
-        problem, allowed = "outside the limits", _limit(kind, context)
-    elif kind in ("int_type", "int_from_float"):
-        problem, allowed = "not a whole number", "a whole number"
-    elif kind == "float_type":
-        problem, allowed = "not a number", "a plain number, without a unit"
-    elif kind == "finite_number":
-        problem, allowed = "not a finite number", "a plain number, without a unit"
-    elif kind in ("bool_type", "bool_parsing"):
-        problem, allowed = "neither true nor false", "true or false"
-    elif kind == "string_type":
-        problem, allowed = "not text", "text"
-    elif kind == "string_pattern_mismatch":
-        problem, allowed = "not a name", "letters, digits, _ and -, beginning with a letter"
-    elif kind in ("tuple_type", "list_type"):
-        problem, allowed = "not a list", "a list: [...]"
+        problem, allowed = _NOT_A_NAME
+    elif kind in _LIMITS:
+        name, text = _LIMITS[kind]
+        problem, allowed = "outside the limits", f"{text} {context[name]:g}"
+    elif kind in _SAID:
+        problem, allowed = _SAID[kind]
     elif kind in ("too_short", "too_long"):
         problem, found = problem[0].lower() + problem[1:], None
     return Issue(problem, source.file, source.line(key), (*source.prefix, *key), found, allowed, suggestion)
-
-
-def _limit(kind: str, context: dict[str, Any]) -> str:
-    words = {
-        "greater_than": ("gt", "greater than"),
-        "greater_than_equal": ("ge", "at least"),
-        "less_than": ("lt", "less than"),
-        "less_than_equal": ("le", "at most"),
-    }
-    name, text = words[kind]
-    return f"{text} {context[name]:g}"
 
 
 def _fields(model: type[Spec], key: KeyPath) -> list[str]:

@@ -17,7 +17,7 @@ from scenes.yaml.errors import printable
 
 FAILURE = 1
 PIPE_CLOSED = 128 + signal.SIGPIPE
-"""As a shell tells of a program that the signal has ended."""
+"""Exit code with which a shell tells of a program that the signal has ended."""
 
 
 def print_error(errors: Console, text: str) -> None:

@@ -287,7 +287,7 @@ def _to_si(number: str, unit: str, kind: Kind) -> float:
 
 
 def _look_up_checked(unit: str, kind: Kind) -> tuple[Decimal, str]:
-    """As `_look_up`, but a unit that is unknown or measures something else raises Problem."""
+    """Look a unit up as `_look_up` does; a unit that is unknown or measures something else raises Problem."""
     found = _look_up(unit)
     if found is None:
         raise _unknown(unit, kind)

@@ -12,19 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ruamel.yaml import YAML
+from ruamel.yaml import YAML, events
 from ruamel.yaml.comments import CommentedSeq
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
-from ruamel.yaml.events import (
-    AliasEvent,
-    DocumentStartEvent,
-    Event,
-    MappingEndEvent,
-    MappingStartEvent,
-    ScalarEvent,
-    SequenceEndEvent,
-    SequenceStartEvent,
-)
 from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
@@ -152,18 +142,18 @@ class _Builder:
         self._open: list[tuple[dict[str, Any] | list[Any], KeyPath]] = []
         self._key: list[str | None] = []
 
-    def take(self, event: Event) -> None:
+    def take(self, event: events.Event) -> None:
         """Take the next event of the parser."""
         line = event.start_mark.line + 1
-        if isinstance(event, DocumentStartEvent):
+        if isinstance(event, events.DocumentStartEvent):
             self._documents += 1
             if self._documents > 1:
                 self._refuse("a second document starts here", line, "one document in a file")
             if event.tags:
                 self._refuse("%TAG directives are not allowed", line)
-        elif isinstance(event, AliasEvent):
+        elif isinstance(event, events.AliasEvent):
             self._refuse(f"aliases are not allowed, found *{event.anchor}", line, "writing the value again")
-        elif isinstance(event, ScalarEvent | MappingStartEvent | SequenceStartEvent):
+        elif isinstance(event, events.ScalarEvent | events.MappingStartEvent | events.SequenceStartEvent):
             if event.anchor:
                 self._refuse(
                     f"anchors are not allowed, found &{event.anchor}", line, "writing the value where it is used"
@@ -175,28 +165,30 @@ class _Builder:
                 allowed = f"at most {MOST_VALUES} in a file; long lists belong into a CSV table where one can be named"
                 self._refuse("too many keys and values", line, allowed, self._here())
             self._value(event, line)
-        elif isinstance(event, MappingEndEvent | SequenceEndEvent):
+        elif isinstance(event, events.MappingEndEvent | events.SequenceEndEvent):
             self._open.pop()
             self._key.pop()
 
-    def _value(self, event: ScalarEvent | MappingStartEvent | SequenceStartEvent, line: int) -> None:
+    def _value(
+        self, event: events.ScalarEvent | events.MappingStartEvent | events.SequenceStartEvent, line: int
+    ) -> None:
         awaits_key = bool(self._open) and isinstance(self._open[-1][0], dict) and self._key[-1] is None
         if awaits_key:
             self._take_key(event, line)
             return
         value: Any
-        if isinstance(event, ScalarEvent):
+        if isinstance(event, events.ScalarEvent):
             value = self._plain(event, line)
         else:
-            value = {} if isinstance(event, MappingStartEvent) else []
+            value = {} if isinstance(event, events.MappingStartEvent) else []
         path = self._place(value, line)
-        if not isinstance(event, ScalarEvent):
+        if not isinstance(event, events.ScalarEvent):
             if len(self._open) == DEEPEST:
                 self._refuse("nested too deeply", line, f"at most {DEEPEST} levels")
             self._open.append((value, path))
             self._key.append(None)
 
-    def _plain(self, event: ScalarEvent, line: int) -> Any:
+    def _plain(self, event: events.ScalarEvent, line: int) -> Any:
         text = event.value
         if (wrong_character := UNWRITABLE.search(text)) is not None:
             issue = Issue(NO_TEXT, self._file, line, self._here(), shown(wrong_character[0]), WRITABLE)
@@ -213,9 +205,9 @@ class _Builder:
         container, path = self._open[-1]
         return (*path, self._key[-1] or "") if isinstance(container, dict) else (*path, len(container))
 
-    def _take_key(self, event: Event, line: int) -> None:
+    def _take_key(self, event: events.Event, line: int) -> None:
         mapping, path = self._open[-1]
-        if not isinstance(event, ScalarEvent):
+        if not isinstance(event, events.ScalarEvent):
             self._refuse("a key must be a plain name", line)
             return
         key = event.value
@@ -250,7 +242,7 @@ class _Builder:
         raise InputError(Issue(problem, self._file, line, key, allowed=allowed))
 
 
-def _scalar(event: ScalarEvent) -> Any:
+def _scalar(event: events.ScalarEvent) -> Any:
     """The value of a scalar by the core schema of YAML 1.2; quoted scalars are always text."""
     text = event.value
     return plain_scalar(text) if event.implicit[0] else text

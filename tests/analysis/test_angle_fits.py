@@ -234,6 +234,6 @@ def test_network_that_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None
     series = CalibrationSeries(ANGLE, wave(ANGLE)[:, None] + np.random.default_rng(1).normal(0.0, 0.1, (41, 5)))
     choice = choose(series, names=("network", "cubic_spline"))
     assert choice.chosen == "cubic_spline"
-    assert "none of 4" in choice["network"].failure
+    assert "none of 4" in choice.failed["network"]
     with pytest.raises(ValueError, match="no fit of the dividing error succeeded"):
         choose(series, names=("network",))

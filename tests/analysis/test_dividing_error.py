@@ -59,19 +59,12 @@ def test_few_or_equal_readings_stay() -> None:
         chauvenet([0.0, np.nan, 1.0])
 
 
-def test_repeating_finds_what_hid() -> None:
-    readings = np.array([-0.3, 0.1, 0.2, -0.1, 0.0, 0.3, -0.2, 0.1, 2.0, 50.0])
-    assert np.flatnonzero(~chauvenet(readings)).tolist() == [9]
-    assert np.flatnonzero(~chauvenet(readings, repeated=True)).tolist() == [8, 9]
-
-
 def test_many_series_at_once() -> None:
     readings = np.random.default_rng(1).standard_t(2, (4, 6, 10))
-    for repeated in (False, True):
-        whole = chauvenet(readings, repeated)
-        assert not whole.all()
-        alone = [[chauvenet(row, repeated) for row in block] for block in readings]
-        assert np.array_equal(whole, np.array(alone))
+    whole = chauvenet(readings)
+    assert not whole.all()
+    alone = [[chauvenet(row) for row in block] for block in readings]
+    assert np.array_equal(whole, np.array(alone))
 
 
 @pytest.mark.parametrize("n", [5, 10, 20])

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from analysis.monitor.model_fit import RankError
 from analysis.orientation.distortion_model import (
-    InseparableTermsError,
     OrientationError,
     distortion,
     principal_distance,
@@ -29,10 +27,10 @@ UM = 1e-6
 TERMS = ("constant", "principal_distance", "principal_point", "radial3")
 
 
-def line_image(angle, f=F, constant=0.0, point=0.0, radial3=0.0, radial5=0.0):
+def line_image(angle, f=F, constant=0.0, point=0.0, radial3=0.0):
     """Spot positions of the model, typed once more."""
     t = np.tan(angle)
-    return constant + f * t - point * t**2 + radial3 * t**3 + radial5 * t**5
+    return constant + f * t - point * t**2 + radial3 * t**3
 
 
 def in_range(chi_square, freedom):
@@ -98,46 +96,23 @@ def test_principal_point_is_where_the_axis_meets_the_image():
 # ---- the general fit
 
 
-@pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("span", [(-1.25, 1.25), (-0.4, 2.5), (-20.0, 20.0)])
-def test_exact_data_come_back_to_rounding(weighted, span):
+def test_exact_data_come_back_to_rounding(span):
     """Rounding of a linear fit: eps x condition x |L| / |column|, with a factor for sums and weights."""
     angle = np.deg2rad(np.linspace(*span, 55))
-    truth = {"constant": 3e-6, "principal_distance": F, "principal_point": 2e-3, "radial3": -0.5, "radial5": 40.0}
-    position = line_image(angle, constant=3e-6, point=2e-3, radial3=-0.5, radial5=40.0)
+    truth = {"constant": 3e-6, "principal_distance": F, "principal_point": 2e-3, "radial3": -0.5}
+    position = line_image(angle, constant=3e-6, point=2e-3, radial3=-0.5)
     sigma = np.linspace(1, 2, 55) * UM
-    found = fit_interior_orientation(position, angle, sigma, tuple(truth), weighted=weighted)
+    found = fit_interior_orientation(position, angle, sigma, tuple(truth))
     t = np.tan(angle)
-    for term, power in zip(truth, (0, 1, 2, 3, 5), strict=True):
-        rounding = 100 * EPS * found.condition * np.linalg.norm(position) / np.linalg.norm(t**power)
+    columns = np.stack([t**power / np.linalg.norm(t**power) for power in range(4)], axis=1)
+    for term, power in zip(truth, range(4), strict=True):
+        rounding = 100 * EPS * np.linalg.cond(columns) * np.linalg.norm(position) / np.linalg.norm(t**power)
         assert rounding < found.sigma(term) * 1e-3  # so that the tolerance means something
         assert found.value(term) == pytest.approx(truth[term], abs=rounding)
     assert np.abs(found.residual).max() < 100 * EPS * np.abs(position).max()
-    assert found.degrees_of_freedom == 50
+    assert found.degrees_of_freedom == 51
     assert found.chi_square < 1e-6
-
-
-def test_weighted_fit_is_the_textbook_one():
-    """Full covariance, generalised least squares typed from the normal equations; and never a larger sigma."""
-    _, noise = common_noise()
-    rng = np.random.default_rng(5)
-    position = line_image(GF7) + rng.multivariate_normal(np.zeros(55), noise)
-    found = fit_interior_orientation(position, GF7, noise, TERMS, weighted=True)
-    plain = fit_interior_orientation(position, GF7, noise, TERMS)
-    t = np.tan(GF7)
-    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
-    scale = np.diag(1 / np.linalg.norm(columns, axis=0))
-    normal = scale @ columns.T @ np.linalg.solve(noise, columns) @ scale
-    covariance = scale @ np.linalg.inv(normal) @ scale
-    values = covariance @ columns.T @ np.linalg.solve(noise, position)
-    # normal equations lose the digits of the noise's condition number, 1e5, and of the columns', 5 squared
-    assert found.values == pytest.approx(values, rel=1e-9, abs=1e-9 * np.sqrt(np.diagonal(covariance)).min())
-    sigma = np.sqrt(np.diagonal(covariance))
-    assert np.abs((found.covariance - covariance) / np.outer(sigma, sigma)).max() < 1e-9
-    assert np.all(np.diagonal(found.covariance) <= np.diagonal(plain.covariance) * (1 + 1e-9))
-    assert found.chi_square == pytest.approx(plain.chi_square, rel=1e-9)
-    assert np.diagonal(found.correlation) == pytest.approx(np.ones(4), rel=1e-12)
-    assert np.abs(found.correlation).max() <= 1 + 1e-12
 
 
 def test_noise_of_angles_acts_through_the_slope():
@@ -166,38 +141,32 @@ def common_noise():
 
 @pytest.fixture(scope="module")
 def simulated():
-    """400 tests: the *angles* err, by common errors; truth as used, and fits (equal weights, weighted)."""
+    """400 tests: the *angles* err, by common errors; truth as used, and fits."""
     angles, _ = common_noise()
     rng = np.random.default_rng(20)
     read = GF7 + rng.multivariate_normal(np.zeros(55), angles, 400)
     position = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8) + rng.standard_normal((400, 55)) * 0.3 * UM
     truth = np.array([1e-6, F, 1e-3, -0.8])
-    fits = {
-        weighted: [
-            fit_interior_orientation(position[k], read[k], 0.3 * UM, TERMS, angle_covariance=angles, weighted=weighted)
-            for k in range(400)
-        ]
-        for weighted in (False, True)
-    }
-    return truth, fits
+    return truth, [
+        fit_interior_orientation(position[k], read[k], 0.3 * UM, TERMS, angle_covariance=angles) for k in range(400)
+    ]
 
 
-@pytest.mark.parametrize("weighted", [False, True])
-def test_scatter_agrees_with_sigmas(simulated, weighted):
+def test_scatter_agrees_with_sigmas(simulated):
     """Each parameter's chi-square over 400 tests, all parameters together, and the chi-square that the fit states.
 
     Two-sided false-alarm rate 1e-6 each. The error of tan W itself (attenuation) shifts f by
     f (0.2" / 0.7 deg)^2 = 0.03 um, 2e-4 of its sigma.
     """
     truth, fits = simulated
-    errors = np.array([one.values - truth for one in fits[weighted]])
-    sigmas = np.array([[one.sigma(term) for term in TERMS] for one in fits[weighted]])
+    errors = np.array([one.values - truth for one in fits])
+    sigmas = np.array([[one.sigma(term) for term in TERMS] for one in fits])
     for k, term in enumerate(TERMS):
         assert in_range(np.sum((errors[:, k] / sigmas[:, k]) ** 2), 400), term
         assert abs(np.sum(errors[:, k] / sigmas[:, k])) < stats.norm.isf(FALSE_ALARM / 2) * np.sqrt(400), term
-    joint = sum(e @ np.linalg.solve(one.covariance, e) for e, one in zip(errors, fits[weighted], strict=True))
+    joint = sum(e @ np.linalg.solve(one.covariance, e) for e, one in zip(errors, fits, strict=True))
     assert in_range(joint, 400 * 4)
-    assert in_range(sum(one.chi_square for one in fits[weighted]), 400 * 51)
+    assert in_range(sum(one.chi_square for one in fits), 400 * 51)
 
 
 def test_sigmas_from_the_residuals_alone_are_wrong(simulated):
@@ -208,8 +177,8 @@ def test_sigmas_from_the_residuals_alone_are_wrong(simulated):
     inverse = np.linalg.inv(columns.T @ columns)
     ratio = {}
     for k, term in enumerate(TERMS):
-        naive = [np.sqrt(np.sum(one.residual**2) / 51 * inverse[k, k]) for one in fits[False]]
-        chi_square = np.sum([((one.values[k] - truth[k]) / s) ** 2 for one, s in zip(fits[False], naive, strict=True)])
+        naive = [np.sqrt(np.sum(one.residual**2) / 51 * inverse[k, k]) for one in fits]
+        chi_square = np.sum([((one.values[k] - truth[k]) / s) ** 2 for one, s in zip(fits, naive, strict=True)])
         ratio[term] = np.sqrt(chi_square / 400)
     # zero and scale errors go into the constant and f, and no residual shows them: sigmas are several times too small
     assert stats.chi2.sf(400 * ratio["constant"] ** 2, 400) < FALSE_ALARM
@@ -218,76 +187,13 @@ def test_sigmas_from_the_residuals_alone_are_wrong(simulated):
     assert ratio["principal_distance"] > 1.5
 
 
-def test_residuals_and_printed_distortion_have_the_stated_covariance(simulated):
-    """Quadratic forms with the pseudo-inverse; ranks N - P, and N - 2 or N - 1 for eqs. (2) and (3).
-
-    Printed distortion is about its own mean: the camera has a radial term and the angles a constant error.
-    """
+def test_residuals_have_the_stated_covariance(simulated):
+    """A quadratic form with the pseudo-inverse, of rank N - P."""
     _, fits = simulated
     residual = sum(
-        one.residual @ np.linalg.pinv(one.residual_covariance, rcond=1e-9) @ one.residual for one in fits[False][:100]
+        one.residual @ np.linalg.pinv(one.residual_covariance, rcond=1e-9) @ one.residual for one in fits[:100]
     )
     assert in_range(residual, 100 * 51)
-    clean = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8)
-    for with_point, rank in ((True, 53), (False, 54)):
-        if with_point:
-            expected = distortion(clean, GF7, *principal_distance_and_point(clean, GF7))
-        else:
-            expected = distortion(clean, GF7, principal_distance(clean, GF7))
-        total = 0.0
-        for one in fits[False][:100]:
-            printed = one.printed(with_point)
-            error = printed.distortion - expected
-            total += error @ np.linalg.pinv(printed.covariance, rcond=1e-9) @ error
-        assert in_range(total, 100 * rank)
-    f, p = principal_distance_and_point(one.position, one.angle)
-    printed = one.printed(True)
-    assert printed.principal_distance == pytest.approx(float(f), rel=1e-13)
-    assert printed.principal_point == pytest.approx(float(p), abs=2e-11)
-    assert printed.distortion == pytest.approx(distortion(one.position, one.angle, f, p), abs=1e-14)
-    assert one.printed(False).rms == pytest.approx(
-        np.sqrt(np.mean(distortion(one.position, one.angle, principal_distance(one.position, one.angle)) ** 2)),
-        rel=1e-9,
-    )
-
-
-@pytest.mark.parametrize("reference", [None, ("principal_distance",), ("constant", "principal_distance")])
-def test_curve_and_its_sigma(simulated, reference):
-    """The curve at angles between the points: chi-square over 400 tests at each of four angles."""
-    _, fits = simulated
-    between = np.deg2rad([-1.11, -0.4, 0.73, 1.2])
-    clean = line_image(GF7, constant=1e-6, point=1e-3, radial3=-0.8)
-    t, at = np.tan(GF7), np.tan(between)
-    if reference is None:
-        expected = -0.8 * at**3
-    else:
-        powers = [0, 1] if "constant" in reference else [1]
-        taken = np.linalg.lstsq(np.stack([t**k for k in powers], 1), clean, rcond=None)[0]
-        expected = line_image(between, constant=1e-6, point=1e-3, radial3=-0.8)
-        expected = expected - np.stack([at**k for k in powers], 1) @ taken
-    scores = []
-    for one in fits[False]:
-        value, sigma = one.curve(between, reference)
-        scores.append((value - expected) / sigma)
-    for column in np.array(scores).T:
-        assert in_range(np.sum(column**2), 400)
-
-
-def test_compensation_gives_the_ideal_image():
-    position = line_image(GF7, constant=2e-6, radial3=30.0, radial5=-5e3)
-    found = fit_interior_orientation(
-        position, GF7, 1e-7, ("constant", "principal_distance", "radial3", "radial5"), weighted=True
-    )
-    fresh = np.deg2rad([-1.2, -0.31, 0.0, 0.9, 1.25])
-    seen = line_image(fresh, constant=2e-6, radial3=30.0, radial5=-5e3)
-    # 30 m x tan^3 is 250 um at the edge: a plain division by f would be far off
-    assert np.abs(seen - 2e-6 - F * np.tan(fresh)).max() > 1e-4
-    assert found.look_angle(seen) == pytest.approx(fresh, abs=1e-14)
-    ideal, sigma = found.compensated(seen)
-    assert ideal == pytest.approx(2e-6 + F * np.tan(fresh), abs=1e-13)
-    assert np.all(sigma < 1e-6)
-    with pytest.raises(OrientationError, match="beyond the field"):
-        found.look_angle(1.0)
 
 
 # ---- the principal point
@@ -303,18 +209,12 @@ def test_principal_point_over_a_narrow_field():
     assert 0.8e-3 < expected < 1e-3
     assert found.sigma("principal_point") == pytest.approx(expected, rel=1e-9)
     point = found.point
-    assert point.fitted
     assert not point.observable
-    assert not point.significant
-    assert point.edge_effect == pytest.approx(expected * t2.max(), rel=1e-9)
     for part in ("not observable over +-1.25 deg", "take p = 0", "eq. 3", "0.44 um against 1 um", "decentring"):
         assert part in point.statement
-    assert point.statement in found.statements
     # not fitted: the same, said of the p that could have been
     without = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance")).point
-    assert not without.fitted
-    assert without.value == 0
-    assert without.sigma == pytest.approx(expected, rel=1e-9)
+    assert f"p is taken as zero; fitted, it would be known to +- {1e3 * expected:.2g} mm" in without.statement
     assert "not observable" in without.statement
 
 
@@ -324,7 +224,6 @@ def test_principal_point_over_a_wide_field():
     position = line_image(angle, f=0.2, point=50e-6) + rng.standard_normal(55) * UM
     found = fit_interior_orientation(position, angle, UM, ("constant", "principal_distance", "principal_point"))
     assert found.point.observable
-    assert found.point.significant
     assert found.sigma("principal_point") < 4e-6
     assert abs(found.value("principal_point") - 50e-6) < stats.norm.isf(FALSE_ALARM / 2) * found.sigma(
         "principal_point"
@@ -336,23 +235,9 @@ def test_principal_point_over_a_wide_field():
 def test_a_large_tan_squared_term_over_a_narrow_field_is_not_called_zero():
     position = line_image(GF7, point=20e-3)
     point = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point")).point
-    assert point.significant
     assert not point.observable
     assert "take p = 0" not in point.statement
     assert "decentring" in point.statement
-
-
-def test_decentring_is_the_principal_point_with_the_other_sign():
-    position = line_image(GF7, point=20e-3)
-    one = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "principal_point"))
-    two = fit_interior_orientation(position, GF7, UM, ("constant", "principal_distance", "decentring"))
-    assert two.value("decentring") == pytest.approx(-one.value("principal_point"), rel=1e-10)
-    assert two.sigma("decentring") == pytest.approx(one.sigma("principal_point"), rel=1e-10)
-    # but it is distortion, and p is not
-    assert np.abs(one.curve(GF7)[0]).max() == 0
-    assert np.abs(two.curve(GF7)[0]).max() == pytest.approx(20e-3 * np.tan(EDGE) ** 2, rel=1e-9)
-    with pytest.raises(OrientationError, match="same tan\\^2 term"):
-        fit_interior_orientation(position, GF7, UM, ("principal_distance", "principal_point", "decentring"))
 
 
 def test_error_of_the_zero_of_the_angles():
@@ -389,7 +274,6 @@ def test_error_of_the_zero_of_the_angles():
         position + np.random.default_rng(3).standard_normal(55) * UM, read, UM, ("principal_distance",)
     )
     assert bare.probability < 1e-12
-    assert any("lacks a term" in line for line in bare.statements)
 
 
 # ---- bad input
@@ -436,21 +320,13 @@ def test_errors_say_what_to_change(arguments, message):
 
 def test_terms_that_cannot_be_told_apart_are_named():
     one_side = np.deg2rad(np.linspace(1.2, 1.25, 55))
-    with pytest.raises(InseparableTermsError, match=r"one side of zero, cannot separate .*both halves") as caught:
+    with pytest.raises(OrientationError, match=rf"one side of zero, cannot separate {', '.join(TERMS)} .*both halves"):
         fit(angle=one_side)
-    assert set(caught.value.terms) == set(TERMS)
-    assert isinstance(caught.value, RankError)
-    # the vector is what it says: a combination of terms that hardly moves a spot
-    t = np.tan(one_side)
-    columns = np.column_stack([np.ones(55), t, -(t**2), t**3])
-    vector = caught.value.null_vectors[0]
-    assert np.linalg.norm(columns @ vector) < 1e-3 * np.linalg.norm(np.abs(columns) @ np.abs(vector))
     # two angles on each side, the same size: tan and tan^3 are one function of the sign
     pair = np.array([-0.02, -0.02, 0.02, 0.02, 0.0])
-    with pytest.raises(InseparableTermsError) as caught:
+    with pytest.raises(OrientationError, match="cannot separate principal_distance, radial3 "):
         fit(angle=pair, terms=("principal_distance", "radial3"))
-    assert caught.value.terms == ("principal_distance", "radial3")
-    assert fit(angle=pair, terms=("constant", "principal_distance")).condition < 2
+    assert fit(angle=pair, terms=("constant", "principal_distance")).degrees_of_freedom == 3
     # half a field is poor but enough, and the correlation says so
     half = fit(angle=np.deg2rad(np.linspace(0, 1.25, 55)), terms=("constant", "principal_distance"))
     assert half.correlation[0, 1] < -0.8

@@ -464,11 +464,9 @@ def test_stated_saturation():
     assert measure_edge(plateau, saturation=math.inf).mtf[32] == pytest.approx(truth, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"oversampling": 1}, {"oversampling": 2.5}, {"frequency": [0.5]}, {"frequency": [0.0, 3.0]}]
-)
+@pytest.mark.parametrize("wrong", [{"frequency": [0.5]}, {"frequency": [0.0, 3.0]}])
 def test_arguments_that_make_no_sense(wrong):
-    with pytest.raises(ValueError, match=r"oversampling|frequency"):
+    with pytest.raises(ValueError, match="frequency"):
         measure_edge(edge_image(5), **wrong)
 
 

@@ -17,7 +17,7 @@ from tests.benchmarks.page import Page
 from tests.benchmarks.registry import BENCHMARKS, Benchmark, running_order
 from tests.benchmarks.workbench import Workbench
 from twin.run.cli import InputErrorText, explained, progress_columns
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 
 HELP = """Measure how fast everything is, in one run, and hold it against its limits.
 

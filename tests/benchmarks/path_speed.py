@@ -11,15 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 from scenes.models.instrument_model import Instrument
-from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.stopwatch import Work, in_turns
 from tests.benchmarks.workbench import Workbench
-from tests.twin.path_bench import scene_beam
+from tests.twin.path_bench import IDEAL, scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.source import DiskSource
-from twin.path_tracing.stray_rays import monitor_families, pinhole
+from twin.path_tracing.stray_light import monitor_families, pinhole
 from twin.path_tracing.tracer import PathTracer
 
 INSTRUMENTS = ("gf7_pair", "monitor_pair")

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.benchmarks import (
-    geolocation_speed,
     jacobian_speed,
     large_speed,
     layout_speed,
@@ -50,7 +49,6 @@ BENCHMARKS = (
     Benchmark("jacobian", "derivatives in reverse and forward mode", jacobian_speed.measure, 60, 8),
     Benchmark("paths", "paths of the path tracer", path_speed.measure, 25, 10),
     Benchmark("layouts", "information of a monitor's layout, and a search for layouts", layout_speed.measure, 90, 20),
-    Benchmark("geolocation", "ground points of all pixels", geolocation_speed.measure, 8, 2),
     Benchmark("pushbroom", "images of the ground", pushbroom_speed.measure, 60, 15),
     Benchmark("tables", "tables of measurements with a million rows", table_speed.measure, 40, 2),
     Benchmark("quality", "image quality with shadows and without", quality_speed.measure, 20, 5),

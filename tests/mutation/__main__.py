@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,14 +20,17 @@ from tests.mutation.mutants import Mutant, mutants_below
 HELP = """Put small faults into the source, one at a time, and see whether a test finds each.
 
 A seeded sample of all possible faults is drawn from the physics and the estimators. The tests that run a fault's lines
-are tried, quick ones first, until one fails. What survives is either a gap in the tests or changes nothing that can be
-seen; the second kind stands in equivalent.yaml with its reason. An interrupted campaign goes on where it was.
+run in rounds, quick ones first, until a round kills the fault; all killers in that round are recorded. What survives
+is either a gap in the tests or changes nothing that can be seen; the second kind stands in equivalent.yaml with its
+reason. An interrupted campaign goes on where it was.
 
 Examples:
 
   python -m tests.mutation --out runs/mutation                           400 faults, some hours on two cores\n
   python -m tests.mutation --out runs/mutation --only optics --count 40  some of them\n
   python -m tests.mutation --out runs/mutation --again                   survivors once more, after new tests\n
+  python -m tests.mutation --out runs/mutation --every                   every killer of each fault\n
+  python -m tests.mutation --out runs/mutation --without tests/twin/test_live_runs.py    the score without these tests\n
 
 Exit code: 0 at least 90 % of the faults that are not equivalent were found, 1 fewer, 2 bad input.
 """
@@ -36,8 +41,12 @@ PLACES = (
     "twin/monitor/monitor_derivative.py",
     "twin/sensors/area_detector.py",
 )
+COVERED = ("optics", "scenes", "analysis", "twin")
 TESTS = ("optics", "analysis", "oracles", "scenes", "twin")
-"""Folders of tests that take part; those of the commands' robustness, of the papers' verdicts and of speed do not."""
+"""Folders whose tests take part (those of the default tier).
+
+Tests of the commands' robustness, of the papers' verdicts and of speed do not.
+"""
 LIMIT = 0.90
 EQUIVALENT = Path(__file__).with_name("equivalent.yaml")
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -51,6 +60,17 @@ def equivalents() -> dict[str, str]:
 def drawn(every: list[Mutant], count: int, seed: int) -> list[Mutant]:
     """A sample without an order of its own: a mutant is in or out whatever is written elsewhere in the source."""
     return sorted(every, key=lambda one: hashlib.sha256(f"{seed} {one.key}".encode()).digest())[:count]
+
+
+def without(verdict: Verdict, tests: Collection[str]) -> Verdict:
+    """What is left of a verdict if some tests (files, functions or single cases) did not run.
+
+    A killer that has no name, as time that runs out, stays.
+    """
+    left = tuple(
+        name for name in verdict.killers if not {name, name.split("[")[0], name.split("::")[0]}.intersection(tests)
+    )
+    return replace(verdict, killers=left, fate="survived" if verdict.killers and not left else verdict.fate)
 
 
 def summary(verdicts: list[Verdict], known: dict[str, str]) -> dict[str, Any]:
@@ -93,6 +113,12 @@ def main(
     again: Annotated[
         bool, typer.Option("--again", help="Try the survivors again, with coverage measured anew.")
     ] = False,
+    every: Annotated[
+        bool, typer.Option("--every", help="Run all tests that meet a fault, so that every killer is recorded.")
+    ] = False,
+    leave: Annotated[
+        str | None, typer.Option("--without", help="Tests, with commas between them, whose kills do not count.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
 ) -> None:
     """Measure coverage, draw, try, tell."""
@@ -112,10 +138,11 @@ def main(
     todo = [one for one in chosen if one.key not in before or (again and before[one.key].fate != "killed")]
     if todo:
         files = [file for name in TESTS for file in sorted((root / "tests" / name).glob("test_*.py"))]
-        measure(root, files, PLACES, folder, workers)
-        run_campaign(root, todo, read_map(folder, root), results, workers, 1 if quick else 3)
+        measure(root, files, COVERED, folder, workers)
+        run_campaign(root, todo, read_map(folder, root), results, workers, 1 if quick else 3, every)
     verdicts = read_verdicts(results)
-    found = summary([verdicts[one.key] for one in chosen], equivalents())
+    left_out = leave.split(",") if leave else []
+    found = summary([without(verdicts[one.key], left_out) for one in chosen], equivalents())
     (out / "summary.json").write_text(json.dumps(found, indent=2) + "\n")
     if as_json:
         typer.echo(json.dumps(found, indent=2))

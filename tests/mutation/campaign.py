@@ -49,14 +49,14 @@ class Verdict:
     Attributes:
         mutant: the fault.
         fate: "killed" by a test that failed or hung, "survived" all that run its lines, "uncovered" where none does.
-        by: the first test that failed; "" where none did, or none can be named.
+        killers: every test that failed in the rounds that ran; "time" or the exit code where none can be named.
         tests: how many tests ran at the most.
         seconds: how long it took.
     """
 
     mutant: Mutant
     fate: Fate
-    by: str
+    killers: tuple[str, ...]
     tests: int
     seconds: float
 
@@ -74,14 +74,24 @@ def read_verdicts(file: Path) -> dict[str, Verdict]:
             key = entry.pop("key")
             fields = entry.pop("mutant")
             mutant = Mutant(**{**fields, "line": tuple(fields["line"]), "span": tuple(fields["span"])})
-            found[key] = Verdict(mutant=mutant, **entry)
+            found[key] = Verdict(mutant=mutant, **entry | {"killers": tuple(entry["killers"])})
     return found
 
 
 def run_campaign(
-    root: Path, chosen: list[Mutant], known: CoverageMap, results: Path, workers: int, most: int = 3, say: bool = True
+    root: Path,
+    chosen: list[Mutant],
+    known: CoverageMap,
+    results: Path,
+    workers: int,
+    most: int = 3,
+    every: bool = False,
+    say: bool = True,
 ) -> None:
-    """Try every mutant, in ``most`` rounds of tests, and add a line to the results as soon as its fate is known."""
+    """Try every mutant, in ``most`` rounds of tests, and add a line to the results as soon as its fate is known.
+
+    With ``every``, a mutant that a round has killed goes through the later rounds, too, for the rest of its killers.
+    """
     with _copies(root, workers) as copies, ThreadPoolExecutor(workers) as pool:
         free: queue.SimpleQueue[Path] = queue.SimpleQueue()
         for copy in copies:
@@ -90,7 +100,7 @@ def run_campaign(
         def work(mutant: Mutant) -> Verdict:
             copy = free.get()
             try:
-                return try_mutant(copy, mutant, known, most)
+                return try_mutant(copy, mutant, known, most, every)
             finally:
                 free.put(copy)
 
@@ -108,29 +118,31 @@ def run_campaign(
                     typer.echo(text, err=True)
 
 
-def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3) -> Verdict:
+def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3, every: bool = False) -> Verdict:
     """Put a fault into a copy of the tree, run the tests that meet it, quick ones first, and take it out again."""
     started = time.monotonic()
     covering = known.covering(mutant.path, mutant.line)
     if not covering:
-        return Verdict(mutant, "uncovered", "", 0, 0.0)
+        return Verdict(mutant, "uncovered", (), 0, 0.0)
     file = copy / mutant.path
     source = file.read_bytes()
     file.write_bytes(mutant.applied(source))
     count = 0
+    killers: list[str] = []
     try:
         for tests in islice(rounds(covering, known), most):
             count += len(tests)
-            killed, by = _run(copy, tests, sum(known.seconds[name] for name in tests))
-            if killed:
-                return Verdict(mutant, "killed", by, count, time.monotonic() - started)
+            killers += _killers(copy, tests, sum(known.seconds[name] for name in tests))
+            if killers and not every:
+                break
     finally:
         file.write_bytes(source)
-    return Verdict(mutant, "survived", "", count, time.monotonic() - started)
+    fate: Fate = "killed" if killers else "survived"
+    return Verdict(mutant, fate, tuple(killers), count, time.monotonic() - started)
 
 
 def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
-    """Tests to run one after the other until one fails."""
+    """Tests of each round, which run together."""
     files = {name.split("::")[0] for name in covering}
     whole = sorted(
         (name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name]
@@ -154,13 +166,12 @@ def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
             yield tests
 
 
-def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
-    """Whether one of the tests fails, and which."""
+def _killers(copy: Path, tests: list[str], seconds: float) -> list[str]:
+    """Those of the tests that fail."""
     command = [
         sys.executable,
         "-m",
         "pytest",
-        "-x",
         "-q",
         "-n",
         "0",
@@ -188,13 +199,13 @@ def _run(copy: Path, tests: list[str], seconds: float) -> tuple[bool, str]:
                 preexec_fn=partial(resource.setrlimit, resource.RLIMIT_CPU, (limit, limit + 5)),
             )
         except subprocess.TimeoutExpired:
-            return True, "time"
+            return ["time"]
     if ended.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
-        return True, "time"
+        return ["time"]
     if ended.returncode == 0:
-        return False, ""
+        return []
     failed = [line for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    return True, failed[0].split(" ", 1)[1].split(" - ")[0] if failed else f"exit {ended.returncode}"
+    return [line.split(" ", 1)[1].split(" - ")[0] for line in failed] or [f"exit {ended.returncode}"]
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from tests.mutation.__main__ import app, drawn, equivalents, summary
+from tests.mutation.__main__ import app, drawn, equivalents, summary, without
 from tests.mutation.campaign import read_verdicts, run_campaign
 from tests.mutation.coverage_map import CoverageMap, measure, read_map
 from tests.mutation.mutants import mutants_below, mutants_of
@@ -30,6 +30,9 @@ from toy import half
 
 def test_half():
     assert half(3.0) == 1.5
+
+def test_two():
+    assert half(2.0) == 1.0
 
 def test_limit():
     with pytest.raises(ValueError):
@@ -101,7 +104,13 @@ def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
     assert (root / "toy.py").read_bytes() == SOURCE
     nothing_known = summary(list(found.values()), {})
     assert nothing_known["score"] == pytest.approx(1 / 3)
-    (survivor,) = (one for one in found.values() if one.fate == "survived")
+    killed, survivor = (next(one for one in found.values() if one.fate == fate) for fate in ("killed", "survived"))
+    names = ["tests/test_toy.py::test_half", "tests/test_toy.py::test_two"]
+    assert sorted(killed.killers) == names
+    assert without(killed, names[:1]).killers == (names[1],)
+    assert without(killed, names[:1]).fate == "killed"
+    assert without(killed, ["tests/test_toy.py"]).fate == "survived"
+    assert without(survivor, names) == survivor
     assert summary(list(found.values()), {survivor.mutant.key: "times nothing"})["score"] == pytest.approx(1 / 2)
 
 

@@ -6,9 +6,21 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from optics.geometry.polygon import area, clip, compact, difference, hull, intersect, quadrature, sides
+from optics.geometry.polygon import (
+    area,
+    clip,
+    compact,
+    covered,
+    difference,
+    hull,
+    intersect,
+    quadrature,
+    sides,
+    widened,
+)
 from optics.waves.pupil_edge import PupilEdge
-from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, separate
+from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, quadrature_within, separate
+from scenes.models.shadow import Shadows
 
 RNG = np.random.default_rng(7)
 SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
@@ -109,3 +121,51 @@ def test_an_edge_that_is_no_circle() -> None:
     both = intersect(own, *sides(own + move))
     want = -sum(area(part)[0] for part in far) + area(both)[0]
     assert weights.sum() == pytest.approx(want, abs=2 * 7e-5)
+
+
+def _random_shadow(rng: np.random.Generator) -> np.ndarray:
+    """A convex outline of any place, size and thinness, (1, V, 2); one of four is a sliver, one touches the rim."""
+    angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, rng.integers(3, 9)))
+    thin = 10.0 ** rng.uniform(-8.0, 0.0) if rng.random() < 0.5 else 1.0
+    own = 10.0 ** rng.uniform(-2.0, 0.0) * np.stack([np.cos(angle), thin * np.sin(angle)], axis=-1)
+    # slivers along an axis, whose box is as thin as they are, and turned ones
+    turn = rng.choice([0.0, 0.5 * np.pi, rng.uniform(0.0, np.pi)])
+    own = own @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    middle = rng.uniform(-1.0, 1.0, 2)
+    if rng.random() < 0.25:
+        way = middle / np.hypot(*middle)
+        reach = own @ way
+        touching = rng.choice([np.max(reach), np.min(reach)])  # from within, and from without
+        middle = way * (1.0 - touching + 10.0 ** rng.uniform(-14.0, -4.0) * rng.choice([-1.0, 1.0]))
+    return np.asarray((own + middle)[None])
+
+
+@pytest.mark.parametrize("thin", [1e-4, 1e-6, 1e-8, 1e-11])
+@pytest.mark.parametrize("across", [0.0, -0.4600344734959])
+def test_a_sliver_within_a_pupil_has_its_area_and_no_more(thin: float, across: float) -> None:
+    sliver = np.array([[[-0.5, across], [0.3, across], [0.4, across + thin], [-0.3, across + thin]]])
+    for outline in (sliver, sliver[..., ::-1][:, ::-1]):
+        points, weights = quadrature_within(outline, np.ones((1, 1), complex), 5)
+        assert np.sum(weights) == pytest.approx(0.75 * thin, rel=1e-3)
+        assert np.sum(np.abs(weights)) < 2.0 * 0.75 * thin
+        assert np.max(np.abs(points)) < 1.0
+
+
+def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says() -> None:
+    """Of 300 pupils with one to six shadows, slivers and outlines that touch the rim or each other among them."""
+    rng = np.random.default_rng(33)
+    line = (np.arange(300) + 0.5) / 150.0 - 1.0
+    x, y = (a.ravel() for a in np.meshgrid(line, line))
+    raster = np.stack([x, y], axis=-1)[np.hypot(x, y) < 1.0]
+    for _ in range(300):
+        outlines = [_random_shadow(rng) for _ in range(rng.integers(1, 7))]
+        if len(outlines) > 1 and rng.random() < 0.3:  # shares a side with the first
+            outlines[-1] = outlines[0] + (outlines[0][:, 1] - outlines[0][:, 0])[:, None]
+        shadows = Shadows.of([(str(k), outline) for k, outline in enumerate(outlines)], 1)
+        shares = shadows.shares()
+        taken = covered(np.stack([widened(o, 9) for o in outlines], axis=1), raster)[0]
+        # a raster is right to the square root of the length of edges that it counts, some 1e-3 here
+        assert sum(float(share[0]) for share in shares.values()) == pytest.approx(np.mean(taken), abs=4e-3)
+        assert all(-1e-6 < float(share[0]) < 1.0 + 1e-6 for share in shares.values())
+        # squares of wavefronts are sums of these weights, which alternate where a sliver lies in a corner of its box
+        assert np.sum(np.abs(shadows.weights)) < 100.0 * np.sum(shadows.areas) + 1e-3

@@ -8,7 +8,7 @@ import pytest
 from optics.design.design_rays import beam_axes
 from optics.design.design_variables import BIAS, SHAPE, STAND, Prescription, Variable
 from optics.design.merit_function import MeritFunction, Operands
-from optics.design.optimiser import DesignError, optimise
+from optics.design.optimiser import DesignError
 from optics.design.starts import drawn_start, search
 from scenes.models.camera_design import beams_of, camera_of, prescription_of
 
@@ -76,9 +76,9 @@ def test_a_detuned_camera_comes_back(backend, gf7, beams) -> None:
     """From its own conics and from conics that are wrong by a percent gf7 gets to one optimum, no worse than itself."""
     nominal = prescription_of(gf7.spec)
     operands = Operands(gf7.spec.wavelength)
-    best = optimise(backend, nominal, CONICS, beams, operands)
+    best = search(backend, nominal, CONICS, beams, operands).best
     wrong = nominal.with_values(CONICS, nominal.values(CONICS) + np.array([0.015, -0.02, 0.01]))
-    found = optimise(backend, wrong, CONICS, beams, operands)
+    found = search(backend, wrong, CONICS, beams, operands).best
     merit = [np.sqrt(np.sum(j.residuals**2)) for j in (best.before, best.after, found.before, found.after)]
     assert merit[1] < merit[0] < 0.03
     assert merit[2] > 20.0 * merit[0]
@@ -95,7 +95,7 @@ def test_a_detuned_camera_gets_its_focal_length_back(backend, gf7, beams) -> Non
     nominal = prescription_of(gf7.spec)
     distance = MeritFunction.of(backend, nominal, beams, Operands(650e-9)).evaluate(nominal).principal_distance
     start = nominal.with_values(variables[:1], nominal.values(variables[:1]) * 1.01)
-    found = optimise(backend, start, variables, beams, Operands(650e-9, principal_distance=distance))
+    found = search(backend, start, variables, beams, Operands(650e-9, principal_distance=distance)).best
     assert abs(found.before.principal_distance - distance) > 0.01
     assert found.after.principal_distance == pytest.approx(distance, abs=2e-6)
     assert found.after.errors.max() < 0.05
@@ -108,12 +108,12 @@ def test_anamorphism_as_a_constraint(backend, gf7, beams) -> None:
     free = MeritFunction.of(backend, nominal, beams, Operands(650e-9)).evaluate(nominal)
     assert free.anamorphism == pytest.approx(0.972, abs=5e-4)
     operands = Operands(650e-9, principal_distance=free.principal_distance, anamorphism=0.02)
-    found = optimise(backend, nominal, variables, beams, operands, iterations=8)
+    found = search(backend, nominal, variables, beams, operands, iterations=8).best
     assert found.after.anamorphism == pytest.approx(0.98, abs=2e-6)
     # eight iterations bring it near
     assert found.after.principal_distance == pytest.approx(free.principal_distance, abs=1e-5)
     with pytest.raises(DesignError, match="anamorphism") as told:
-        optimise(backend, nominal, variables[-1:], beams, replace(operands, anamorphism=1e-3), iterations=5)
+        search(backend, nominal, variables[-1:], beams, replace(operands, anamorphism=1e-3), iterations=5)
     assert told.value.violated[0] == "anamorphism"
 
 
@@ -135,16 +135,16 @@ def test_constraints_that_cannot_be_held(backend, gf7, beams) -> None:
     """An envelope of half the length with nothing to vary but the image plane."""
     nominal = prescription_of(gf7.spec)
     with pytest.raises(DesignError, match=r"holds all constraints: envelope \(off by 1.* mm\); allow a longer"):
-        optimise(backend, nominal, [Variable("image", "z")], beams, Operands(650e-9, envelope=1.0), iterations=10)
+        search(backend, nominal, [Variable("image", "z")], beams, Operands(650e-9, envelope=1.0), iterations=10)
 
 
 def test_a_start_outside_its_bounds_or_without_light(backend, gf7, beams) -> None:
     nominal = prescription_of(gf7.spec)
     with pytest.raises(DesignError, match=r"M1 conic starts at -1\.51.*outside its bounds"):
-        optimise(backend, nominal, [Variable("M1", "conic", low=-1.0)], beams, Operands(650e-9))
+        search(backend, nominal, [Variable("M1", "conic", low=-1.0)], beams, Operands(650e-9))
     lost = nominal.with_values([Variable("M1", "curvature")], np.array([1.5]))
     with pytest.raises(DesignError, match="passes no light"):
-        optimise(backend, lost, CONICS, beams, Operands(650e-9))
+        search(backend, lost, CONICS, beams, Operands(650e-9))
 
 
 def test_numbers_of_a_prescription(start) -> None:

@@ -10,7 +10,7 @@ from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.assembly import Assembly
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, trace
-from optics.waves.diffraction import Grid, PupilField, huygens, image
+from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.imaging import aim_collimated, imaging_field
 from scenes.models.camera_model import IMAGE, field_direction
 from twin.monitor.monitor_path import MonitorPath
@@ -23,6 +23,46 @@ PERTURBED: State = {
 }
 FINE = quadrature.disk(16, 64)
 AXIS = Grid(-15.5 * 3e-6, 3e-6, 32)
+
+
+def huygens(
+    points: np.ndarray,
+    path: np.ndarray,
+    direction: np.ndarray,
+    amplitude: np.ndarray,
+    wavelength: float,
+    pixels: np.ndarray,
+    normal: np.ndarray | None = None,
+    chunk: int = 256,
+) -> np.ndarray:
+    """Irradiance by Huygens' sum of spherical wavelets from points on the exit wavefront; slow, the check of ``image``.
+
+    Args:
+        points: (N, 3) points on the exit reference sphere, metres.
+        path: (N,) optical path at these points.
+        direction: (N, 3) unit ray directions there.
+        amplitude: (N,) area element times field amplitude at the points (m^2 * field).
+        wavelength: metres.
+        pixels: (M, 3) points where the irradiance is wanted.
+        normal: (3,) unit normal of the detector: each wavelet counts with the root of the cosine of its incidence, so
+            that the result is power per detector area, as in ``image``; None: square to the light.
+        chunk: pixels done at once, to bound memory.
+
+    Returns:
+        (M,) irradiance, 1/m^2 for unit power (sum amplitude * field = 1).
+    """
+    k = 2.0 * np.pi / wavelength
+    out = np.empty(len(pixels))
+    for start in range(0, len(pixels), chunk):
+        arm = pixels[start : start + chunk, None, :] - points[None]
+        distance = np.linalg.norm(arm, axis=-1)
+        obliquity = np.einsum("mnx,nx->mn", arm, direction) / distance
+        if normal is not None:
+            obliquity = obliquity * np.sqrt(np.abs(arm @ normal) / distance)
+        phase = k * ((path - path[0]) + (distance - distance[:, :1]))
+        field = np.sum(amplitude * obliquity / distance * np.exp(1j * phase), axis=1) / wavelength
+        out[start : start + chunk] = np.abs(field) ** 2
+    return out
 
 
 def shifted(grid: Grid, by: float) -> Grid:

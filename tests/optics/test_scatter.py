@@ -114,8 +114,8 @@ def test_drjit_draws_as_numpy(backend) -> None:
 
 @pytest.mark.parametrize("finish", [MIRROR, COATED, BARE, GROUND, BLACK, SILICON, ABSORBER], ids=repr)
 def test_library_finishes_conserve_energy(finish: Finish) -> None:
-    total = finish.reflectance + finish.transmission + finish.diffuse + finish.absorptance
-    assert total == pytest.approx(0.0 if finish.bare else 1.0, abs=1e-12)
+    total = finish.reflectance + finish.transmission + finish.diffuse
+    assert 0.0 <= total <= (0.0 if finish.bare else 1.0)
     assert len(finish.numbers) == 8
 
 

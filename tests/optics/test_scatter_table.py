@@ -140,7 +140,6 @@ def test_finishes_with_tables() -> None:
     ):
         with pytest.raises(ValueError, match=text):
             Finish(**wrong)
-    assert Finish(table=table, scattered_only=True).absorptance == 1.0
 
 
 def test_coatings() -> None:

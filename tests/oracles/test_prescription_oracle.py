@@ -14,7 +14,8 @@ import pytest
 
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.lens.batoid_file import batoid_text, read_batoid
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of
 from scenes.lens.camera_writer import prescription_of
 from scenes.lens.codev_reader import read_codev

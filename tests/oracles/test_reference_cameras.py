@@ -10,7 +10,7 @@ from optics.geometry.surface import plane
 from optics.geometry.tree import Motion, State
 from optics.numerics import quadrature
 from optics.raytrace.assembly import Assembly, Element, Interaction, points_to_world
-from optics.raytrace.line_of_sight import LineChange, chief_directions, line_change
+from optics.raytrace.line_of_sight import LineChange, chief_rays, line_change
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.wavefront import fit_wavefront, path_difference
@@ -60,7 +60,7 @@ def line_geometry(backend, model: CameraModel, states: list[State]) -> LineChang
         model.spec.image.z,
     ]
     backward = model.mirrors[::-1]
-    sight = chief_directions(
+    _, sight = chief_rays(
         backend,
         assemble(bare, [backward[:2]], states, placed=placed),
         assemble(bare, [backward], states, placed=placed),
@@ -166,7 +166,7 @@ def test_nothing_stands_in_the_light(backend, camera, name: str) -> None:
     obstacles = {}
     for mirror, aperture in model.apertures.items():
         edge = Circle(aperture.radius + margin) if isinstance(aperture, Circle) else aperture
-        obstacles[mirror] = bare.elements[mirror].with_aperture(edge)
+        obstacles[mirror] = replace(bare.elements[mirror], aperture=edge)
     width = spec.focal_length * np.tan(spec.field.x) + margin
     depth = spec.focal_length * np.tan(spec.field.y) + margin
     centre = model.focal_plane.translation
@@ -197,5 +197,5 @@ def test_nothing_stands_in_the_light(backend, camera, name: str) -> None:
             tested += len(launch)
     assert tested > 15_000
     # the check sees an obstacle: M1's own light, if M1 were in the way of what reaches M2's plane
-    wide = bare.elements["M2"].with_aperture(Rectangle(3.0, 3.0))
+    wide = replace(bare.elements["M2"], aperture=Rectangle(3.0, 3.0))
     assert blocked(backend, bare, wide, corners[0], corners[1]) == len(launch)

@@ -13,7 +13,7 @@ import pytest
 
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.lens.batoid_file import read_batoid
+from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.prescription import SEQUENCE, Prescription
 
 pytestmark = pytest.mark.oracle

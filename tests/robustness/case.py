@@ -17,7 +17,7 @@ JOBS = Path(__file__).parents[1] / "golden/jobs"
 
 CUTS = (
     "twin.monitor.truth.LineSight.truth",
-    "twin.laboratory.focus_alignment.align",
+    "twin.laboratory.focus_run.align",
     "twin.laboratory.distortion_bench.DistortionBench.record",
     "twin.laboratory.turntable_run.choose",
     "twin.laboratory.distortion_run.choose",
@@ -31,7 +31,7 @@ CUTS = (
     "twin.orbit.export.export_run._exported",
     "twin.orbit.conventions.check_run._searched",
     "twin.orbit.matching.match_run.measure_points",
-    "twin.study.study_command.local_workers",
+    "twin.study.runs.cluster.local_workers",
     "twin.study.gradient.study_gradient._Traced",
     "twin.study.gradient.study_gradient._whole",
     "twin.design.design_run.search",

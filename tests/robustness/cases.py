@@ -24,7 +24,7 @@ from scenes.specs.load import SCENES, load_autocollimator_test, load_error_budge
 from tests.robustness.case import JOBS, Case, Reached, edited, job_of, text_of
 from twin.camera.__main__ import app as camera
 from twin.design.__main__ import app as design
-from twin.design.layout_gradient import LayoutNumber, Slope
+from twin.design.layout_refinement import LayoutNumber, Slope
 from twin.design.search_workers import Journal
 from twin.lab import app as lab
 from twin.live.__main__ import app as live

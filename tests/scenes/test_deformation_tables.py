@@ -8,7 +8,7 @@ import meshlane
 import numpy as np
 import pytest
 
-from scenes.models.deformed_faces import deformed_face
+from scenes.models.nodal_bodies import deformed_face
 from scenes.specs.job import JobSpec, PerturbationSpec, check_nodes
 from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_job
@@ -166,6 +166,7 @@ def test_files_that_are_not_there_or_not_tables(tmp_path, nodes) -> None:
     table(tmp_path / "m1.csv", nodes)
     cases = [
         ("no.csv", "no such file"),
+        ("m2.csv", "did you mean 'm1.csv'"),
         ("m1.xlsx", "neither a table nor a mesh"),
         ("{table: m1.csv, unit: mm}", "units in its heads"),
         ("{table: m1.csv, terms: 2}", "terms"),

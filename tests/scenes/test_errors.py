@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from scenes.yaml.errors import InputError, Issue, key_text, nearest, shown
+from scenes.yaml.errors import InputError, Issue, key_text, nearest, shown, unknown
 
 
 def test_message() -> None:
@@ -59,3 +59,13 @@ def test_shown_is_one_short_line() -> None:
 
 def test_key_text() -> None:
     assert key_text(("a", "b/c", 0, "d")) == "a.b/c[0].d"
+
+
+def test_a_name_that_is_not_known() -> None:
+    wrong = unknown("no such line", "nadr", ("forward", "nadir"), ("lines",))
+    assert (wrong.found, wrong.allowed, wrong.suggestion) == ("'nadr'", "forward, nadir", "nadir")
+    issue = wrong.below("camera").at("a.yaml", 3, ("test",))
+    assert str(issue) == (
+        "a.yaml:3: test.camera.lines: no such line; did you mean 'nadir'? Found 'nadr', allowed: forward, nadir"
+    )
+    assert unknown("no such line", 5, ("nadir",), allowed="a line").allowed == "a line"

@@ -3,6 +3,7 @@ any attitude, which room they leave it, and what heat makes of them.
 """
 
 import re
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -82,7 +83,7 @@ def test_light_goes_as_plain_mirrors_send_it(backend, kind, turn, slant) -> None
         start = start - ((start - start[0]) @ into)[:, None] * into
         ways = np.broadcast_to(into, start.shape)
         state = {"frame": Motion(rotate=tuple(ARCSEC * np.array(turn)), pivot="apex")}
-        elements = {e.name: e.with_aperture(None) for e in parts.elements}
+        elements = {e.name: replace(e, aperture=None) for e in parts.elements}
         systems = assemble(Assembly(RigidTree(parts.bodies), elements, {"all": tuple(elements)}, {}), ["all"], [state])
         traced = trace(backend, systems, make_rays(backend, start, ways), world=True)
         place, way, path, valid = (a[0] for a in traced.numpy(traced.world))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from scenes.lens.batoid_file import read_batoid
+from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import read_catalogue
 from scenes.lens.zemax_reader import read_zemax

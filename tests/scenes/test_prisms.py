@@ -5,6 +5,8 @@ The three mirrors of the 180-deg prism reflect space at its apex, M = R3 R2 R1 =
 angles by n.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,7 +38,7 @@ def parts_0(errors=None):
 
 
 def assembled(parts) -> Assembly:
-    elements = {e.name: e.with_aperture(None) for e in parts.elements}
+    elements = {e.name: replace(e, aperture=None) for e in parts.elements}
     return Assembly(RigidTree(parts.bodies), elements, {"all": tuple(elements)}, {"glass": N})
 
 

@@ -11,9 +11,9 @@ import pytest
 from optics.geometry.tree import Motion, compose
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import nodal_deformation
-from scenes.models.heated_bodies import FINE_CELLS, HeatedBody, heated_bodies
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.job_state import job_state
+from scenes.models.nodal_bodies import FINE_CELLS, HeatedBody, heated_bodies
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec

@@ -13,7 +13,9 @@ from optics.materials.finish import ABSORBER, BARE, Finish
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from scenes.models.camera_model import LINE_AXIS, collimated, field_direction
-from scenes.models.scene_surface import (
+from scenes.models.instrument_model import Instrument
+from scenes.models.scenery import BOARD, FACING_THE_LIGHT, Scenery, _reach
+from scenes.models.scenery_parts import (
     Detector,
     Finishes,
     SceneSurface,
@@ -21,7 +23,17 @@ from scenes.models.scene_surface import (
     mirror_surface,
     solid_surfaces,
 )
-from scenes.models.scenery import Scenery
+from scenes.specs.baffle import Plate, box
+
+IDEAL = Finishes(
+    mirror=Finish(reflectance=1.0),
+    mirror_back=ABSORBER,
+    coated=Finish(transmission=1.0),
+    ground=ABSORBER,
+    detector=Finish(records=True),
+    board=ABSORBER,
+)
+"""Nothing is lost or scattered on the way: for checks of geometry."""
 
 PERFECT = Finish(records=True)
 """A detector that records all of its light."""
@@ -108,3 +120,11 @@ def scene_beam(instrument, backend, x: float = 0.0, y: float = 0.0) -> tuple[np.
     first = to_world.rotation @ (LINE_AXIS - (LINE_AXIS @ direction) * direction)
     first /= np.linalg.norm(first)
     return to_world.apply(middle), heading, np.stack([first, np.cross(heading, first)])
+
+
+def focal_plane_housing(instrument: Instrument, camera: str) -> tuple[Plate, ...]:
+    """A black box around the detectors of a camera, open to the light; its walls stand out 30 mm before them."""
+    reach_x, reach_y = _reach(instrument, camera)
+    pose = FACING_THE_LIGHT @ Pose(np.eye(3), np.array([0.0, 0.0, -2.0 * BOARD]))
+    size = (2.0 * reach_x, 2.0 * reach_y, 2.0 * BOARD + 0.03)
+    return box(f"{camera}/housing", f"base/{camera}/focal_plane", pose, size)

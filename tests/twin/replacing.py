@@ -14,7 +14,7 @@ import sys
 import threading
 from pathlib import Path
 
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 from twin.run.run_folder import RunFolder, is_run_folder, read_manifest, unlisted, write_manifest
 
 STEPS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "ctypes.dlopen", "os.listdir")
@@ -80,7 +80,7 @@ def replace_study(target: Path, stem: str, megabytes: float, resume: bool = Fals
     """As a study does, its chunks and results filled with anything."""
     import numpy as np
 
-    from twin.study.runs.block_result import BlockResult
+    from twin.study.runs.base_job import BlockResult
     from twin.study.runs.chunk_store import ChunkStore
     from twin.study.runs.plan import Plan
     from twin.study.runs.setup import resolve_study

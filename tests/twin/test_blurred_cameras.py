@@ -50,6 +50,7 @@ def with_camera(camera: CameraSpec):
     return job.model_copy(update={"cameras": FrozenMap({"gf7": camera})})
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", library_names("cameras"))
 def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     """And as blurred as a full trace of their own fields says."""
@@ -62,6 +63,7 @@ def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     assert blur_warnings(with_camera(load_camera(name)), backend) == ()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("z", "waves", "left", "words"),
     [
@@ -165,6 +167,7 @@ def test_a_camera_in_a_runs_config_is_named_there(backend, tmp_path) -> None:
     assert f"python -m twin.camera {config} --camera gf7 --refocus" in text
 
 
+@pytest.mark.second
 def test_a_tilted_image_plane(backend) -> None:
     """The focal plane of a camera with a tilt is the plane that ``FocalPlane`` says, and its middle is on it."""
     camera = load_camera("gf7")

@@ -62,6 +62,7 @@ def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
     assert turned.interior[0] == pytest.approx(expected.focal_length, abs=1e-15)
 
 
+@pytest.mark.second
 def test_exact_readings_return_everything() -> None:
     """Places of the sensor are solved to 1e-12 m; 1e-6 of the drift is 20 pm, and 1e-6 of 1 um is as good."""
     campaign = flown(setup_with(exact=True), 1.0, SEED)
@@ -79,6 +80,7 @@ def test_exact_readings_return_everything() -> None:
     assert with_monitor(campaign).schemes["1"].height < 1e-3
 
 
+@pytest.mark.second
 def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     """By hand, over a flat Earth: 1 arcsec of one outer line is H / sin(2 look) per radian, 3.2 m; the curved Earth
     takes 7% off. Heights of a field differ by its d_alpha, forward less aft, against the mean of all, to the same
@@ -96,6 +98,7 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     assert np.ptp(height) > 1.0
 
 
+@pytest.mark.second
 def test_a_monitor_brings_errors_back() -> None:
     """Same noise with and without drift. What a reading leaves is 0.03 arcsec of forward less aft, 0.1 m beside 3 m:
     0.1% of an RMS; 2% allow for d_gamma and d_f. Drifts of 4 arcsec are 12 m and more."""
@@ -111,6 +114,7 @@ def test_a_monitor_brings_errors_back() -> None:
     assert blind.p_value < 1e-6 < told.p_value
 
 
+@pytest.mark.second
 def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     """1 arcsec of the forward line in all readings is 3.15 um of x, f times it, and no error of heights. In the reading
     of one tested pass alone it is that pass's error, metres per arcsec."""
@@ -132,6 +136,7 @@ def test_a_constant_error_of_the_monitor_goes_into_the_interior() -> None:
     assert PooledErrors.of([errors]).height == pytest.approx(abs(height_per_arcsec(campaign)), rel=0.05)
 
 
+@pytest.mark.second
 def test_draws_do_not_change_others() -> None:
     """Without drift the same campaign as that of a file that has no such section."""
     setup = setup_with()

@@ -23,10 +23,9 @@ from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_report import first_order_table
-from twin.camera.camera_run import GRID, camera_data, camera_numbers, find_focus, kind_of, run_camera, verdict
+from twin.camera.camera_run import CAMERA, GRID, camera_data, find_focus, kind_of, run_camera, verdict
 from twin.camera.field_maps import distortion, field_curves, through_focus
-from twin.camera.first_order_data import first_order_data
-from twin.camera.ray_paths import obscuration, ray_paths
+from twin.camera.first_order_data import FIRST_ORDER, first_order_data, obscuration, ray_paths
 
 WAVE = 650e-9
 
@@ -49,21 +48,25 @@ def blurred(tmp_path_factory, backend):
 
 def test_first_order_data_by_hand(gf7, gf7_alone) -> None:
     data = first_order_data(gf7_alone)
+    told = FIRST_ORDER(data)
     spec = gf7.spec
-    assert data.focal_length == pytest.approx(np.sqrt(data.focal_length_line * data.focal_length_track), rel=1e-9)
-    assert data.f_number == pytest.approx(data.focal_length / 0.6, rel=1e-12)
+    line, track = told["focal_length_along_line_m"], told["focal_length_along_track_m"]
+    assert told["focal_length_m"] == pytest.approx(np.sqrt(line * track), rel=1e-9)
+    assert told["f_number"] == pytest.approx(told["focal_length_m"] / 0.6, rel=1e-12)
     # at the image as from the object: of an aplanatic camera f / D is 1 / (2 NA), to its offence against the sine law
-    assert data.working_f_number == pytest.approx(data.f_number, rel=1e-3)
-    assert data.working_f_number_line == pytest.approx(data.focal_length_line / 0.6, rel=5e-3)
-    assert data.working_f_number_track == pytest.approx(data.focal_length_track / 0.6, rel=5e-3)
-    assert data.cutoff == pytest.approx(1.0 / (WAVE * data.working_f_number_line), rel=1e-12)
-    assert data.sampling == pytest.approx(2.0 * data.nyquist / data.cutoff, rel=1e-12)  # 2 samples the cut-off
-    assert data.airy == pytest.approx(1.22 * WAVE * data.working_f_number, rel=1e-12)
-    assert data.pixel_angle == pytest.approx(spec.line.pitch / data.focal_length_line, rel=1e-12)
+    assert told["working_f_number"] == pytest.approx(told["f_number"], rel=1e-3)
+    assert told["working_f_number_along_line"] == pytest.approx(line / 0.6, rel=5e-3)
+    assert told["working_f_number_along_track"] == pytest.approx(track / 0.6, rel=5e-3)
+    assert told["cutoff_per_mm"] == pytest.approx(1e-3 / (WAVE * told["working_f_number_along_line"]), rel=1e-12)
+    sampling = 2.0 * told["nyquist_per_mm"] / told["cutoff_per_mm"]  # 2 samples the cut-off
+    assert told["sampling_lambda_f_per_pixel"] == pytest.approx(sampling, rel=1e-12)
+    assert told["airy_radius_um"] == pytest.approx(1.22e6 * WAVE * told["working_f_number"], rel=1e-12)
+    assert told["pixel_arcsec"] == pytest.approx(np.degrees(spec.line.pitch / line) * 3600.0, rel=1e-12)
     # M2, the stop, as M1 images it: a mirror's equation about M1's vertex, which the beam meets 0.54 m beside
     distance, half = 2.01593, 6.745359 / 2.0
     assert data.entrance_pupil_distance == pytest.approx(-1.0 / (1.0 / distance - 1.0 / half), rel=0.06)
-    assert data.exit_pupil == pytest.approx(abs(data.exit_pupil_distance) / data.working_f_number, rel=1e-9)
+    exit_pupil = abs(data.exit_pupil_distance) / told["working_f_number"]
+    assert told["exit_pupil_m"] == pytest.approx(exit_pupil, rel=1e-9)
     assert data.chief_ray_angle[0] < data.chief_ray_angle[1] < 1e-3  # nearly telecentric
     assert dict(data.obscuration) == {}
 
@@ -228,7 +231,7 @@ def test_a_diffraction_limited_camera_says_so(backend) -> None:
     text = verdict(run)
     assert text.startswith("Diffraction limited over the whole field: the worst wavefront error is 0.0363 waves rms")
     assert "at field (1.25, 0.15) deg, most of it astigmatism (0.0345)" in text
-    numbers = camera_numbers(run)
+    numbers = CAMERA(run)
     assert numbers["bodies_in_the_beam"] is None
     own = numbers["fields"][GRID.index((0.0, 0.0))]
     assert own["wfe_rms_waves"] == pytest.approx(0.015918, rel=1e-3)

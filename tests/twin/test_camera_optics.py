@@ -78,6 +78,7 @@ def test_mtf_of_a_nearly_perfect_camera_is_that_of_a_round_pupil(gf7_alone) -> N
     assert airy(np.array([gf7_alone.spot().airy]), 650e-9, f_number)[0] < 1e-5  # the first dark ring
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("obstruction", [False, True])
 def test_the_same_as_image_quality_says_in_an_instrument(backend, gf7_pair, obstruction: bool) -> None:
     """It looks at the pixel, this at the direction, whose image has moved by some micrometres."""

@@ -12,14 +12,14 @@ from optics.numerics.backend import Backend
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.thermal.heat import Temperature
-from scenes.models.scene_surface import IDEAL
 from scenes.models.scenery import build_scenery
 from scenes.specs.resolved import resolve
 from tests.scenes import monitor_layouts
+from tests.twin.path_bench import IDEAL
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
-from twin.path_tracing.stray_rays import monitor_families
+from twin.path_tracing.stray_light import monitor_families
 from twin.path_tracing.tracer import PathTracer
 from twin.pictures.light_paths import trace_light_paths
 from twin.pictures.scene_file import build_scene
@@ -54,6 +54,7 @@ def hollow(backend, tmp_path_factory) -> MonitorExperiment:
 # --- light ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None:
     """Bit by bit: bodies, elements, photons."""
     plain, written = (
@@ -68,6 +69,7 @@ def test_a_pair_that_is_written_out_is_the_plain_pair(backend, tmp_path) -> None
     np.testing.assert_array_equal(plain.path.expected_photons(STATES), written.path.expected_photons(STATES))
 
 
+@pytest.mark.second
 def test_more_channels_leave_the_others_as_they_are(two, backend, tmp_path) -> None:
     """The first pair alone has the same spots: its parts do not know of the others, and light is traced ray by ray.
 
@@ -94,6 +96,7 @@ def test_more_channels_leave_the_others_as_they_are(two, backend, tmp_path) -> N
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-5 * before.max())
 
 
+@pytest.mark.second
 def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) -> None:
     data = monitor_layouts.two_beams()
     order = ("right_2", "left", "left_2", "right")
@@ -107,6 +110,7 @@ def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) ->
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
 
+@pytest.mark.second
 def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None:
     """Their L and field are those of left and right, not those of the channels that stand farthest out."""
     plain = experiment(monitor_layouts.pair(), tmp_path, backend)
@@ -116,6 +120,7 @@ def test_the_printed_formulas_are_about_the_pair(two, backend, tmp_path) -> None
         assert found.separation_m < max(c.ccd[1] for c in two.instrument.channels) * 1.99
 
 
+@pytest.mark.second
 def test_every_channel_gets_its_light(two) -> None:
     """All spots are whole and in the middle of their CCDs, and get their photons."""
     photons = two.path.expected_photons([{}])[0]
@@ -134,6 +139,7 @@ def test_every_channel_gets_its_light(two) -> None:
         assert np.abs(middle).max() < 1.0
 
 
+@pytest.mark.second
 def test_a_channels_own_photons_and_face(backend, tmp_path) -> None:
     """Half the light gives half the image; a narrower face the wider spot that it gives where all are so narrow."""
     data = monitor_layouts.two_beams()
@@ -159,6 +165,7 @@ def test_a_channels_own_photons_and_face(backend, tmp_path) -> None:
 # --- heat -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_heat_of_a_channels_prisms_moves_its_spot_alone(two) -> None:
     channel = next(c for c in two.instrument.channels if c.key == "forward/left_2")
     field = Temperature(0.0, (0.0, 0.02, 0.05))
@@ -187,6 +194,7 @@ def turned_by_heat(own: MonitorExperiment, prism: str) -> tuple[float, float]:
     return float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))) / 2.0)), float(np.abs(moved[:, 3]).max())
 
 
+@pytest.mark.second
 def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
     """What docs/monitor_layout.md says: by how much a gradient turns the beams, in proportion to the expansion of a
     frame; 1 K everywhere turns nothing.
@@ -241,6 +249,7 @@ def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, bac
         np.testing.assert_allclose(found.length[mine], length[path], rtol=0, atol=1e-12)
 
 
+@pytest.mark.second
 def test_drawings_show_every_channel(two, hollow, backend) -> None:
     for own in (two, hollow):
         paths = trace_light_paths(own.instrument, backend, {})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.twin.study_bench import write_study
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study

@@ -78,6 +78,7 @@ def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
     assert page.count("data:image/png") == 4
 
 
+@pytest.mark.second
 def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
     """Another seed: every reading moves, none by more than 5 sigma (some 70 of them: 4e-5)."""
     folders = [runs / "a", runs / "seed"]
@@ -91,6 +92,7 @@ def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
     assert "no input" not in verdict(strict)  # the seed stands in config.yaml
 
 
+@pytest.mark.second
 def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(runs: Path, tmp_path: Path) -> None:
     """As runs wrote them before there were stated disturbances: `_sigma` alone, of the noise."""
     old = []
@@ -108,6 +110,7 @@ def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(ru
     assert compare(old, 1e-9, 5.0).same
 
 
+@pytest.mark.second
 def test_order_of_runs_only_turns_signs(runs: Path) -> None:
     there, back = compare([runs / "a", runs / "b"], 1e-9, None), compare([runs / "b", runs / "a"], 1e-9, None)
     forward = {(one.file, one.key): one.difference for one in there.found[0].numbers}
@@ -116,12 +119,14 @@ def test_order_of_runs_only_turns_signs(runs: Path) -> None:
     assert all(value is None or value == -backward[key] for key, value in forward.items())
 
 
+@pytest.mark.second
 def test_several_runs_are_held_against_the_first(runs: Path) -> None:
     found = numbers(compare([runs / "a", runs / "again", runs / "b"], 1e-9, None))
     assert [other["same"] for other in found["others"]] == [True, False]
     assert not found["same"]
 
 
+@pytest.mark.second
 def test_small_differences_count_by_the_tolerance(runs: Path, tmp_path: Path) -> None:
     """A truth that is 1e-7 off, and a pixel of an image: found, and not found with a wider tolerance."""
     copy = tmp_path / "copy"

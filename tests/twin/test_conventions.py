@@ -218,6 +218,7 @@ def test_principal_distance_is_eq_3_of_paper_004(gf7_pair, backend):
     assert trace_truth(gf7_pair, backend, [{}]).principal_distance[CAMERA] == pytest.approx(eq_3, rel=2e-4)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
 def test_the_truth_and_the_pixels_in_orbit_see_the_whole_line(name: str, instrument, backend):
     """The looks of its very ends, sent back into the camera, arrive at the outer edges of the first and last pixels."""

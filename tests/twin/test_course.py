@@ -168,6 +168,7 @@ def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
     assert told["chi_square"] > told["limit"]
 
 
+@pytest.mark.second
 def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     resolved = resolve(written(tmp_path, JOB.replace("course:", "disturbances: none\ncourse:")))
     experiment = MonitorExperiment(resolved, backend)
@@ -213,6 +214,7 @@ def test_small_temperatures_act_linearly(prepared) -> None:
     np.testing.assert_allclose(moved[:, 3], moved[:, 0] + moved[:, 2], rtol=1e-5, atol=2e-6)
 
 
+@pytest.mark.second
 def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch) -> None:
     resolved, experiment = resolve(folder / "config.yaml"), prepared
     states = series_states(experiment, resolved.job)

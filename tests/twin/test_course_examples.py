@@ -108,6 +108,7 @@ def test_the_example_of_a_heat_soak_is_what_its_head_says() -> None:
             assert move.shift == pytest.approx([share * one for one in peak.shift], abs=1.1e-9)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["launch", pytest.param("heat_soak", marks=pytest.mark.slow)])
 def test_an_example_is_read_within_its_sigmas(name, backend) -> None:
     """At all times: no light is lost, no spot nears its edge, shifts agree with what is stated, and every change is

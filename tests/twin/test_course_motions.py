@@ -107,6 +107,7 @@ def test_motions_are_added_to_those_under_perturb(tmp_path) -> None:
         load_job(written(tmp_path, JOB + f"perturb:\n{other}"))
 
 
+@pytest.mark.second
 def test_the_course_tells_its_motions(experiment, tmp_path) -> None:
     resolved = resolve(written(tmp_path))
     found = run_series(experiment, resolved, series_states(experiment, resolved.job)).to_dict()

@@ -23,6 +23,7 @@ def row(cameras, camera, label):
     return found, [m.label for m in found.motions].index(label)
 
 
+@pytest.mark.second
 def test_table_is_what_the_images_say(table, backend):
     """Every motion rendered at a size that moves a spot by some 5 px: spots and truth within 1% of the table."""
     setup, cameras = table

@@ -25,7 +25,7 @@ from tests.twin.path_bench import scene_beam
 from twin.main_job.job_tables import deformation_warnings
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.render import app
-from twin.study.runs.perturbed_job import JobMaker
+from twin.study.runs.render_base import JobMaker
 from twin.study.runs.setup import resolve_study
 
 M1, M2 = "base/forward/M1", "base/forward/M2"
@@ -101,7 +101,7 @@ def centres(experiment, states) -> np.ndarray:
 def solution(experiment, path: str) -> tuple[np.ndarray, np.ndarray]:
     """Nodes of the finite elements of a mirror and their displacements in FIELD, (N, 3) each."""
     model = experiment.thermal
-    units = model.mirror_displacements(path)
+    units = model.unit_displacements(path)
     about = np.array({b.path: b for b in experiment.instrument.assembly.tree.bodies}[path].pivots["centre"])
     nodes = units[0].nodes
     moves = sum(g * unit.values for g, unit in zip(FIELD.gradient, units, strict=True))

@@ -21,10 +21,15 @@ from tests.twin.commands import invoke
 from twin.main_job.render_job import render_job
 from twin.render import app
 from twin.sensors import area_detector, poisson_numbers
-from twin.sensors.area_detector import EmvaDetector, FixedPattern
-from twin.sensors.grey_steps import coarse_warnings, told_of_steps
+from twin.sensors.area_detector import (
+    EmvaDetector,
+    FixedOffsets,
+    FixedPattern,
+    ReadNoise,
+    coarse_warnings,
+    told_of_steps,
+)
 from twin.sensors.line_ccd import LineCcd
-from twin.sensors.noise_terms import FixedOffsets, ReadNoise
 
 FALSE_ALARM = 1e-6
 SHEET = {
@@ -286,6 +291,7 @@ def test_a_line_ccd_knows_its_exposure():
         LineCcd.from_specs(spec, full)
 
 
+@pytest.mark.second
 def test_coarse_grey_values_are_warned_of(backend):
     """By the data sheet alone: every one of the library is fine, 8 bits of the monitor's CCD are not."""
     for path in sorted((LIBRARY / "detectors").glob("*.yaml")):

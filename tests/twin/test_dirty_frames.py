@@ -90,6 +90,7 @@ def test_without_the_corrections_dirt_does_harm(bench):
         assert square > chi2.isf(1e-6, 2)
 
 
+@pytest.mark.second
 def test_clean_frames_are_not_touched(bench):
     found, told = squares(bench, (), range(2000, 2010))
     assert found.sum() < chi2.isf(1e-4, 20)
@@ -147,6 +148,7 @@ def test_other_centroids_are_corrected_as_well(bench, centroid):
             assert spot.cost != 0.0
 
 
+@pytest.mark.second
 def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
     job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})
@@ -180,6 +182,7 @@ def test_a_learnt_shape_is_that_of_the_spot_alone(bench, kind):
     assert all(spot.fits for spots in told for spot in spots)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("kind", "sets"), [("saturation", 12), ("reflection", 4), ("vibration", 3)])
 def test_what_the_frames_before_hold_stands_in_the_sigma_of_a_learnt_shape(bench, kind, sets):
     """Where the middle of a brighter spot is left out the noise of the shape counts for more than that of the image

@@ -21,6 +21,7 @@ def run(*arguments: str, **variables: str) -> "subprocess.CompletedProcess[str]"
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, timeout=120, check=False)
 
 
+@pytest.mark.second
 def test_this_machine_is_ready() -> None:
     result = run("-m", "twin.doctor", "--quick", "--json")
     report = json.loads(result.stdout)
@@ -32,6 +33,7 @@ def test_this_machine_is_ready() -> None:
     assert len(names) > 15
 
 
+@pytest.mark.second
 def test_a_missing_library_is_reported_and_fails() -> None:
     result = run("-m", "twin.doctor", "--quick", **{VARIABLE: "/no/such/libLLVM.so"})
     assert result.returncode == 1

@@ -13,7 +13,6 @@ from twin.orbit.flight.earth import (
     Earth,
     curvature_radii,
     east_north_up,
-    rotation_over,
     tai_of,
 )
 
@@ -141,7 +140,7 @@ def test_atomic_time() -> None:
 def test_interpolated_poles() -> None:
     # against the full series at every instant; 1e-14 rad is 70 nm at the satellite
     seconds = np.linspace(-1.0 * DAY, 1.5 * DAY, 200)
-    rotation = rotation_over(EPOCH, seconds[0], seconds[-1])
+    rotation = Earth().rotation(EPOCH, seconds[0], seconds[-1])
     one, two = tai_of(EPOCH)
     matrix = erfa.c2i06a(one, two + (32.184 + seconds) / DAY)
     np.testing.assert_allclose(rotation.celestial(seconds), matrix, rtol=0, atol=1e-14)

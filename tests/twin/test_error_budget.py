@@ -42,6 +42,7 @@ def lines(budget):
     return {name: budget.line(name) for name in LINES}
 
 
+@pytest.mark.second
 def test_images_show_what_the_exact_trace_says(budget):
     """A gradient in one prism moves its own spot by the mean of its traced rays, and no other spot."""
     experiment = budget.experiment
@@ -67,6 +68,7 @@ def test_every_line_is_near_the_printed_one(lines, name):
     assert 0.0 < line.sigma < 0.2 * line.three_sigma
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["prism_180_thermal", "prism_0_rotation", "centroid"])
 def test_the_inverse_view_gives_a_tenth_of_an_arcsecond(backend, budget, lines, name):
     """With the allowed input in its place the line is 0.1 arcsec: the same draws, so only non-linearity is left."""

@@ -52,6 +52,7 @@ def _places(sensor: Sensor, count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     return random.uniform(0.0, sensor.lines - 1.0, count), random.uniform(0.0, sensor.camera.pixels - 1.0, count)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_forward_fx", "th1_nadir_nofx"])
 def test_the_reader_agrees_with_the_communitys_model(name: str) -> None:
     table = np.loadtxt(CSM / f"{name}.csv", delimiter=",", skiprows=1)
@@ -61,6 +62,7 @@ def test_the_reader_agrees_with_the_communitys_model(name: str) -> None:
     assert np.abs(sample - table[:, 4]).max() < 1e-5
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["forward", "nadir"])
 @pytest.mark.parametrize(
     ("effects", "height", "allowed"),
@@ -137,6 +139,7 @@ def _gdal(rpc: RationalPolynomial, shape: tuple[int, int], points: np.ndarray) -
     return np.stack(rows, axis=-1) - 0.5
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["forward", "nadir"])
 def test_gdal_finds_what_the_rigorous_sensor_finds(flight, name: str) -> None:
     sensor = _sensor(flight, name, LightEffects(), lines=1000)
@@ -257,6 +260,7 @@ def test_bad_input(tmp_path: Path, arguments: list[str], words: list[str]) -> No
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.second
 def test_a_spoilt_run_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, ("lines: [forward, nadir, aft]", "lines: [nadir]"))
     assert run("simulate", path, "--out", tmp_path / "run", "--seed", 5, "--quiet").exit_code == 0
@@ -281,6 +285,7 @@ def _told(folder: Path, word: str) -> bool:
     return word in result.stderr
 
 
+@pytest.mark.second
 def test_a_file_is_exported_without_images() -> None:
     source = read_source(SCENES / ORBIT / "simulate.yaml", seed=2)
     assert source.seed == 2

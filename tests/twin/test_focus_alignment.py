@@ -18,9 +18,9 @@ from optics.numerics.backend import load_backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.load import LAB, SCENES
 from scenes.specs.resolved import FocusSetup, resolve_focus
-from twin.laboratory.focus_alignment import Alignment, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_bench import FocusBench
 from twin.laboratory.focus_numbers import focus_numbers
+from twin.laboratory.focus_run import SimulatedFocus, align, line_turn, misset, mount_of, plan_shims, run_focus
 from twin.laboratory.focus_scan import VERTEX_ERROR, Recorder, Standing
 from twin.run.procedure import BenchError, silent
 from twin.targets.target_images import TRACK
@@ -62,17 +62,18 @@ def bench(backend) -> FocusBench:
 
 
 @pytest.fixture(scope="module")
-def alignments(bench) -> dict[int, Alignment]:
+def alignments(bench) -> dict[int, SimulatedFocus]:
     return {seed: align(bench, seed) for seed in SEEDS}
 
 
 @pytest.fixture(scope="module")
-def coarse(bench) -> Alignment:
+def coarse(bench) -> SimulatedFocus:
     """The first seed with shims ground in steps of 50 um, and a second round."""
     mount = bench.setup.test.mount.model_copy(update={"step": 50e-6})
     return align(with_test(bench, mount=mount, rounds=2), SEEDS[0])
 
 
+@pytest.mark.second
 def test_one_round_ends_where_the_paper_did(alignments) -> None:
     for alignment in alignments.values():
         before, after = alignment.states
@@ -82,6 +83,7 @@ def test_one_round_ends_where_the_paper_did(alignments) -> None:
         assert abs(after.true_level) < LEVEL
 
 
+@pytest.mark.second
 def test_measured_defocus_agrees_with_the_traced_one(alignments) -> None:
     """Chi-square with the sites' noise and the common error that the curves' form leaves."""
     states = [state for alignment in alignments.values() for state in alignment.states]
@@ -98,6 +100,7 @@ def test_measured_defocus_agrees_with_the_traced_one(alignments) -> None:
     assert max(np.max(state.defocus_sigma) for state in states) < 5e-6
 
 
+@pytest.mark.second
 def test_level_is_read_and_set_with_the_theodolites_sigma(alignments) -> None:
     """The reading, and the line after the turn that takes out the reading: its error and that of the setting."""
     sigma = next(iter(alignments.values())).bench.setup.test.level
@@ -120,6 +123,7 @@ def test_the_seed_decides(alignments, coarse) -> None:
         assert first["truth"][part] != second["truth"][part]
 
 
+@pytest.mark.second
 def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
     """400 draws: variances of rotations, shifts and chips by chi-square."""
     spec = bench.setup.test.misset
@@ -133,6 +137,7 @@ def test_misset_is_drawn_with_the_files_sizes(bench) -> None:
     assert np.all((low < sums) & (sums < high))
 
 
+@pytest.mark.second
 def test_json(bench, alignments) -> None:
     alignment = alignments[SEEDS[0]]
     data = json.loads(json.dumps(focus_numbers(alignment), allow_nan=False))
@@ -169,11 +174,10 @@ def test_coarse_shims_leave_what_their_rounding_leaves(bench, alignments, coarse
     assert np.max(np.abs(found)) > 3e-6
 
 
+@pytest.mark.second
 def test_a_second_round_goes_on_from_the_first(coarse) -> None:
     assert len(coarse.states) == 3
     first, second = (s.plan for s in coarse.shimmings)
-    assert first.thickness is not None
-    assert second.thickness is not None
     np.testing.assert_allclose(second.thickness - second.rounded_change, first.thickness, rtol=0.0, atol=1e-12)
     # what is left to do is what rounding left, and what the first plane was wrong by
     wrong = np.sqrt(np.diag(first.change_covariance))
@@ -183,6 +187,7 @@ def test_a_second_round_goes_on_from_the_first(coarse) -> None:
         assert abs(state.true_level) < LEVEL
 
 
+@pytest.mark.second
 def test_sense_of_the_motion(bench) -> None:
     """A CCD 80 um downstream of best focus sees the edge sharply when the target is moved along the light, which takes
     the image downstream as well, and not when it is moved against it.
@@ -205,6 +210,7 @@ def test_sense_of_the_motion(bench) -> None:
     assert line_turn(Pose(turned)) == pytest.approx(5.0 * ARCMIN, abs=1e-15)
 
 
+@pytest.mark.second
 def test_what_cannot_be_done_names_the_key(bench, backend) -> None:
     setup = bench.setup
     spec = setup.test.mount

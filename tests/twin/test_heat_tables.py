@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from optics.thermal.nodal_temperature import NodalTemperature
-from scenes.models.heated_bodies import FINE_CELLS
+from scenes.models.nodal_bodies import FINE_CELLS
 from scenes.specs.instrument import MaterialsSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import resolve, resolve_job
@@ -22,7 +22,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.time_series import series_states
 from twin.monitor.truth import trace_truth
 from twin.render import app
-from twin.study.runs.perturbed_job import JobMaker
+from twin.study.runs.render_base import JobMaker
 from twin.study.runs.setup import resolve_study
 
 M1 = "base/forward/M1"

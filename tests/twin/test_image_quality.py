@@ -12,7 +12,7 @@ from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
@@ -66,7 +66,7 @@ def light_of(instrument, backend, state, field: float) -> np.ndarray:
     ways = [assemble(assembly, [f"{CAMERA}/{w}"], [state], placed=placed) for w in ("image_to_stop", "image_to_object")]
     pixel = points_to_world(placed, f"{ROOT}/focal_plane/line", place_of(instrument, field)).real
     guess = model.toward_optics(placed.rotation[:, placed.index[f"{ROOT}/focal_plane"]].real)
-    return -chief_directions(backend, *ways, pixel, guess[:, None], np.array([0.0, 1.0, 0.0]))[0, 0]
+    return -chief_rays(backend, *ways, pixel, guess[:, None], np.array([0.0, 1.0, 0.0]))[1][0, 0]
 
 
 def launched(instrument, backend, state, direction: np.ndarray) -> np.ndarray:
@@ -98,6 +98,7 @@ def rms(difference: np.ndarray) -> float:
     return float(fit_wavefront(NODES.x, NODES.y, NODES.weight, difference[1:]).rms) / WAVELENGTH
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("s", range(len(STATES)))
 def test_wavefront_error_is_that_of_one_traced_beam(gf7_pair, backend, quality, s: int) -> None:
     """More rings, and a chief ray among the rays: what is left is rounding of paths of 10 m, 1e-15 m, and of aiming."""
@@ -122,6 +123,7 @@ def test_nominal_wavefront_errors(quality) -> None:
     np.testing.assert_allclose(turned.mtf_along_line[2], turned.mtf_along_line[0], atol=1e-8)
 
 
+@pytest.mark.second
 @pytest.mark.oracle
 def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
     batoid = pytest.importorskip("batoid")
@@ -147,6 +149,7 @@ def test_wavefront_error_against_batoid(gf7_pair, backend) -> None:
         assert rms(difference) == pytest.approx(value, abs=1e-6)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("despace", [30e-6, -80e-6])
 def test_defocus_of_a_moved_secondary_mirror(gf7_pair, backend, despace: float) -> None:
     moved = {f"{ROOT}/M2": Motion(shift=(0.0, 0.0, despace))}

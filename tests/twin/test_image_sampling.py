@@ -53,6 +53,7 @@ def largest(got: np.ndarray, want: np.ndarray) -> float:
     return float(np.max(np.abs(got - want).max(axis=(-2, -1)) / want.max(axis=(-2, -1))))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("defocus", DEFOCUS)
 def test_blurred_images_are_those_of_many_more_nodes(blurred, defocus: float) -> None:
     path = blurred(defocus)
@@ -64,6 +65,7 @@ def test_blurred_images_are_those_of_many_more_nodes(blurred, defocus: float) ->
     assert largest(got, with_nodes(path, dense).expected_photons(states, single=False)) < ACCURACY
 
 
+@pytest.mark.second
 def test_the_blur_matters(blurred) -> None:
     """Nodes that are right for sharp spots on the whole CCD are wrong by the peak for these."""
     path = blurred(DEFOCUS[-1])
@@ -74,6 +76,7 @@ def test_the_blur_matters(blurred) -> None:
     )
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("defocus", [0.0, *DEFOCUS])
 def test_an_instrument_is_the_same_before_and_after(blurred, defocus: float) -> None:
     """With the template's margin and without."""
@@ -108,6 +111,7 @@ def test_spots_blurred_beyond_the_last_class_are_refused(blurred) -> None:
         blurred(2.0).expected_photons([{}])
 
 
+@pytest.mark.second
 def test_a_beam_that_an_edge_cuts_gets_the_nodes_it_needs(blurred) -> None:
     """Against a rule of twice as many nodes that stand elsewhere."""
     path = blurred(0.0)
@@ -143,6 +147,7 @@ def test_energy_leaves_room_for_diffraction_alone() -> None:
         assert lost_or_gained(np.array([light]), place, share, half, wings)[0] == pytest.approx(expected)
 
 
+@pytest.mark.second
 def test_disagreement_is_of_the_peak(blurred) -> None:
     path = blurred(DEFOCUS[0])
     x, y = path.grid(1), path.grid(0)
@@ -166,6 +171,7 @@ def test_classes_grow_to_the_most_phase() -> None:
     assert classes.class_of(still[:, :1], widening=np.full((2, 1), 2.0))[0] > 0
 
 
+@pytest.mark.second
 def test_figures_with_fine_structure_move_rays_about(blurred) -> None:
     """15 nm of high order on a facet turn rays so that they meet the camera 30 um beside; against a plain sum over rays
     whose density is differentiated on a polar grid. With fourth-order terms alone the image is wrong by 2 %.

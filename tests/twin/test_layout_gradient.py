@@ -22,8 +22,7 @@ from scenes.models.monitor_layout import (
     start_beams,
 )
 from twin.design.layout_bench import FULLEST, LayoutBench, LayoutFacts
-from twin.design.layout_gradient import LayoutNumber, Slope, known_of, numbers_of, slope_of
-from twin.design.layout_refinement import refined
+from twin.design.layout_refinement import LayoutNumber, Slope, known_of, numbers_of, refined, slope_of
 from twin.design.layout_search import Candidate, End, Found, merit, optima, spread
 from twin.monitor.information import Information
 
@@ -246,6 +245,7 @@ class Valley:
         return [self.slope(item) if isinstance(item, LayoutNumber) else self.facts(item) for item in items]
 
 
+@pytest.mark.second
 def test_refinement_ends_where_no_ratio_can_fall(bench: LayoutBench) -> None:
     """The least of the larger of two ratios, found by scipy from the closed form alone."""
     valley = Valley(bench)

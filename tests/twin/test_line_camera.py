@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from optics.geometry.pose import rotation_matrix
 from optics.geometry.tree import Motion
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.specs.orbit.setup import load_three_line_camera
@@ -117,6 +117,7 @@ PERTURBED = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("state", [{}, PERTURBED], ids=["nominal", "perturbed"])
 def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> None:
     """Pixels that were not traced: directions below 1e-6 pixel; and light sent in along the ray arrives at the pixel,
@@ -136,7 +137,7 @@ def test_traced_lines_between_the_traced_points(gf7_pair, backend, state) -> Non
             for way in ("image_to_stop", "image_to_object")
         ]
         guess = gf7_pair.toward_optics(placed, name)[:, None]
-        traced = chief_directions(backend, *batches, image, guess, np.array([0.0, 1.0, 0.0]))[0]
+        traced = chief_rays(backend, *batches, image, guess, np.array([0.0, 1.0, 0.0]))[1][0]
         look, slope = camera.look_and_slope(pixel)
         error = np.linalg.norm(look - traced, axis=-1) / np.linalg.norm(slope, axis=-1)
         assert np.max(error) < 1e-6

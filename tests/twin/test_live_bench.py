@@ -41,6 +41,7 @@ def changed(state: AskedState, knobs: dict[str, float] | None = None, **other) -
     return AskedState(**{**state.model_dump(), "knobs": state.knobs if knobs is None else knobs, **other})
 
 
+@pytest.mark.second
 def test_the_first_state_is_the_main_job(bench, first, backend):
     """Readings, truth and images of `perturb.yaml`, to the bit."""
     run = render_job(resolve("scenes/examples/perturb.yaml"), backend)
@@ -51,6 +52,7 @@ def test_the_first_state_is_the_main_job(bench, first, backend):
     assert np.array_equal(bench.before(first), run.before[:, 0])
 
 
+@pytest.mark.second
 def test_a_state_leaves_nothing_that_only_refers_to_itself(bench, first):
     """What does would stay, images and all, until Python looks for it, which it does the less the more there is."""
 
@@ -73,6 +75,7 @@ def test_a_state_leaves_nothing_that_only_refers_to_itself(bench, first):
         gc.enable()
 
 
+@pytest.mark.second
 def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
     knobs = {f"{M2} shift z": 3.17, f"{M2} figure Z7": -12.5, f"{PLANE} rotate x": 0.1 + 0.2, "base temperature": 0.25}
     asked = changed(first, knobs, frames=3, seed=20)
@@ -85,6 +88,7 @@ def test_a_saved_job_repeats_what_was_shown(bench, first, backend, tmp_path):
     assert np.array_equal(after, run.after[:, 0])
 
 
+@pytest.mark.second
 def test_a_recorded_course_has_the_states_that_were_shown(bench, first, backend, tmp_path):
     """The truth of every time to rounding; the noise of a course is another draw."""
     pivots = {PLANE: "rear_node"}
@@ -133,6 +137,7 @@ def test_a_long_recording_is_thinned_to_what_a_course_may_have(bench, first):
     assert "0.0 s" in times[0]
 
 
+@pytest.mark.second
 def test_without_noise_readings_are_those_of_the_expected_image(bench, first):
     """All estimators agree with the noisy reading within its noise, 5 sigma for 60 numbers: false alarm 3e-5."""
     noisy, _ = bench.state(changed(first, frames=9))
@@ -149,6 +154,7 @@ def test_without_noise_readings_are_those_of_the_expected_image(bench, first):
     assert image.dtype == np.uint16
 
 
+@pytest.mark.second
 def test_the_order_of_states_does_not_matter(bench, first):
     other = changed(first, {f"{M2} shift x": 4.0})
     a, image = bench.state(first)
@@ -225,9 +231,11 @@ def test_hidden_motions_are_drawn_from_what_is_stated(bench, first):
 
     squares, count = 0.0, 0
     for seed in range(40):
-        for one in bench.hidden_amounts(BlindState(**{**first.model_dump(), "blind": seed})):
-            squares += one**2
-            count += 1
+        drawn = bench._drawn(BlindState(**{**first.model_dump(), "blind": seed}))
+        for value, part in zip(drawn, bench.twin.experiment.stated.components, strict=True):
+            if part.sigma:
+                squares += (value / part.sigma) ** 2
+                count += 1
     low, high = chi2.ppf([0.5e-4, 1 - 0.5e-4], count)
     assert low < squares < high
 
@@ -304,10 +312,11 @@ def test_the_picture_of_a_knife_edge(bench):
     assert "Nyquist" not in pictures.draw("target", "forward", 0.0, bench.twin.state, 4, 1)[:100]
 
 
+@pytest.mark.second
 def test_a_course_is_played_with_the_main_jobs_states(backend):
     """A time of the job's course: the truth of the main job's series."""
     bench = LiveBench(twin.load("scenes/examples/orbit.yaml"))
-    course = bench.course
+    course = bench.twin.resolved.job.course
     assert course is not None
     from twin.monitor.time_series import series_states
 

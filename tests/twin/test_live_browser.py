@@ -23,7 +23,7 @@ from twin.study.runs.setup import resolve_study
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
 pytest.importorskip("uvicorn", reason="the extra `live` is not installed")
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
+pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
 M2 = "base/forward/M2"
 DESPACE = f"{M2} shift z"

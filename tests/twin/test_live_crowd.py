@@ -133,6 +133,7 @@ def test_an_answer_that_is_not_taken_is_given_up(monkeypatch):
         assert len(server.connections) == 0
 
 
+@pytest.mark.second
 def test_a_page_that_never_reads_is_dropped_and_leaves_nothing(monkeypatch):
     """A client of its own: others read by themselves, in a thread."""
     from twin.live import clients

@@ -32,9 +32,9 @@ from twin.main_job.render_job import render_job
 from twin.orbit.monitoring.monitoring_flight import states_of
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import InstrumentTwin
-from twin.study.runs.config_tree import with_values
-from twin.study.runs.perturbed_job import read_job
+from twin.study.runs.base_job import with_values
 from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import read_job
 from twin.study.runs.setup import resolve_study
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,6 +99,7 @@ def told(*arguments: object) -> tuple[int, str]:
 # --- what was saved ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_run_opens_in_the_state_that_was_saved(pair, backend, tmp_path, monkeypatch):
     """State, seed and number of frames, the command's own --frames and --seed among them; all frames and readings to
     the bit, however the folder is named.
@@ -131,8 +132,7 @@ def test_a_run_of_a_course_opens_at_its_detail(pair, backend, tmp_path):
     run = render_job(resolve(written(tmp_path, COURSE)), backend, experiment=bench_experiment(pair, tmp_path))
     folder = run_folder(tmp_path / "run", "twin.render", config_text(run.resolved))
     bench = bench_of(read_source(str(folder)), pair)
-    assert bench.course is not None
-    assert bench.course.names[bench.at_rest.time or 0] == "12 min"
+    assert bench.greeting()["course"]["names"][bench.at_rest.time or 0] == "12 min"
     shown, after = bench.state(bench.at_rest)
     assert shown["readings"] == stated(run.recovered_dict())
     assert shown["truth"] == run.truth_dict()
@@ -287,6 +287,7 @@ def test_a_study_folder_opens_its_base_with_factors_as_knobs(studied):
     assert "base of the study choices" in source.about
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("number", range(8))
 def test_a_run_of_a_study_opens_as_it_was_run(studied, number):
     """Everything that its factors set, texts and ratios among it, and its seed."""

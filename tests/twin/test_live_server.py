@@ -351,6 +351,7 @@ def test_two_pages_take_turns():
             seen = numbered(one.recv(5))
 
 
+@pytest.mark.second
 def test_a_slow_reader_hinders_nobody_and_holds_one_answer():
     """A page that reads nothing: answers of 1 MB do not pile up, and the other page is served."""
     computer = StandIn(bytes_each=1_000_000)
@@ -479,6 +480,26 @@ def test_a_stopped_computer_is_told_and_started_again_if_it_stays(monkeypatch):
         computer.condition = "stopped"
         assert [told(ws)["state"] for _ in range(3)] == ["stopped", "ended", "runs"]
     assert computer.started == 1
+
+
+def test_a_computer_that_goes_on_is_told_before_its_answer_comes():
+    class GoesOn(StandIn):
+        async def ask(self, kind: str, question: Any) -> Any:
+            self.condition = "runs"
+            return await super().ask(kind, question)
+
+    computer = GoesOn()
+    with serving(computer) as (port, _), connect(port) as ws, connect(port) as other:
+        for one in (ws, other):
+            one.recv(5)
+        computer.condition = "stopped"
+        for one in (ws, other):
+            assert told(one)["state"] == "stopped"
+        ws.send(state(1))
+        # the next look at the process is a quarter of a second away, the answer some milliseconds
+        for one in (ws, other):
+            assert told(one) == {"type": "computing", "state": "runs", "problem": ""}
+        assert numbered(ws.recv(5)) == 1
 
 
 def test_a_computer_that_cannot_be_started_again_ends_the_server_with_the_reason():

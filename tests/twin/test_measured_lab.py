@@ -15,15 +15,16 @@ from scipy.optimize import least_squares
 from typer.testing import CliRunner
 
 from analysis.focal_plane.through_focus import QUARTIC
-from scenes.specs.load import SCENES, load_turntable_test
+from scenes.specs.load import LAB, SCENES, load_named
 from scenes.specs.orbit.setup import load_three_line_camera
 from scenes.specs.orbit.three_line_camera import LineCameraSpec
 from scenes.specs.resolved import resolve_distortion_test, resolve_focus_test, resolve_turntable_test
+from scenes.specs.turntable import TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.lab import app
 from twin.laboratory.distortion_run import DistortionRun, measure_files
 from twin.laboratory.export import export_turntable
-from twin.laboratory.measured_focus import MeasuredAlignment, align_measured
+from twin.laboratory.focus_run import FocusRun, align_files
 from twin.laboratory.measured_readings import read_turntable
 from twin.laboratory.turntable_run import TurntableRun, run_turntable
 from twin.orbit.flight.line_camera import line_cameras
@@ -57,8 +58,8 @@ def distortion_of(folder: Path) -> DistortionRun:
     return measure_files(resolve_distortion_test(folder / "distortion.yaml").test, 1)  # type: ignore[arg-type]
 
 
-def focus_of(folder: Path) -> MeasuredAlignment:
-    return align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+def focus_of(folder: Path) -> FocusRun:
+    return align_files(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
 
 
 def turntable_of(folder: Path, names: Sequence[str] = ("cubic_spline", "fourier")) -> TurntableRun:
@@ -133,7 +134,7 @@ def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
     # frames are those that the bench recorded, to the bit: their MTF is that of the simulation's own table
     values = [float(row[-2]) for row in rows_of(tmp_path / "files" / "before_mtf.csv")[1:]]
     if table == "images":
-        images = align_measured(resolve_focus_test(tmp_path / "files" / "focus_before_images.yaml").test)  # type: ignore[arg-type]
+        images = align_files(resolve_focus_test(tmp_path / "files" / "focus_before_images.yaml").test)  # type: ignore[arg-type]
         again = sorted(float(v) for scan in images.scans for edge in scan.mtf.values() for v in edge if v > 0.0)
         assert again == sorted(values)
     # after the round the assembly stands where the shims were to bring it
@@ -146,7 +147,7 @@ def test_focus_exported_and_read_back(tmp_path: Path, table: str) -> None:
 
 
 def test_exported_comparisons_are_those_of_the_bench(tmp_path: Path) -> None:
-    spec = load_turntable_test(JOBS / "turntable.yaml")
+    spec = load_named(TurntableTestSpec, LAB, JOBS / "turntable.yaml")
     done = run_turntable(spec, 7, names=("cubic_spline",))
     for name, content in export_turntable(done).items():
         (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -190,11 +191,14 @@ def in_unit(path: Path, old: str, new: str, factor: float) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_order_of_rows_and_columns_changes_no_bit(folder: Path) -> None:
     kinds: list[Callable[[], np.ndarray]] = [
         lambda: turntable_of(folder).series.mean,
         lambda: distortion_of(folder).compensated.fit.values,
-        lambda: np.concatenate([focus_of(folder).defocus, np.diag(focus_of(folder).shimming.plane.covariance)]),
+        lambda: np.concatenate(
+            [focus_of(folder).states[0].defocus, np.diag(focus_of(folder).shimmings[0].plane.covariance)]
+        ),
     ]
     before = [kind() for kind in kinds]
     for k, name in enumerate(("comparisons.csv", "held_out.csv", "spots.csv", "mtf.csv")):
@@ -217,6 +221,7 @@ def renumbered(path: Path, name: str, seed: int) -> None:
     write(path, [head, *body])
 
 
+@pytest.mark.second
 def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     before, run = distortion_of(folder), turntable_of(folder)
     for k, (name, column) in enumerate((("comparisons", "position"), ("held_out", "position"), ("spots", "point"))):
@@ -230,6 +235,7 @@ def test_stops_in_any_order_change_no_bit(folder: Path) -> None:
     np.testing.assert_array_equal(found.compensation.fit(run.series.angle), run.compensation.fit(run.series.angle))
 
 
+@pytest.mark.second
 def test_units_change_nothing_but_rounding(folder: Path) -> None:
     turntable, distortion, focus = turntable_of(folder), distortion_of(folder), focus_of(folder)
     in_unit(folder / "comparisons.csv", "difference [arcsec]", "difference [urad]", ARCSEC * 1e6)
@@ -240,9 +246,12 @@ def test_units_change_nothing_but_rounding(folder: Path) -> None:
     np.testing.assert_allclose(turntable_of(folder).series.mean, turntable.series.mean, atol=ROUNDING * ARCSEC * 0.01)
     fit, again = distortion.compensated.fit, distortion_of(folder).compensated.fit
     assert np.all(np.abs(again.values - fit.values) < ROUNDING * np.sqrt(np.diag(fit.covariance)))
-    assert np.all(np.abs(focus_of(folder).defocus - focus.defocus) < ROUNDING * focus.defocus_sigma)
+    assert np.all(
+        np.abs(focus_of(folder).states[0].defocus - focus.states[0].defocus) < ROUNDING * focus.states[0].defocus_sigma
+    )
 
 
+@pytest.mark.second
 def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
     fit = distortion_of(folder).compensated.fit
     in_unit(folder / "spots.csv", "along [mm]", "column", 1e3 / 7.0)
@@ -264,14 +273,14 @@ def test_columns_in_pixels_and_readings_that_fall(folder: Path) -> None:
 
 
 def test_a_moved_focal_plane_and_a_moved_target(folder: Path) -> None:
-    there = focus_of(folder).defocus
+    there = focus_of(folder).states[0].defocus
     text = (folder / "focus.yaml").read_text()
     in_unit(folder / "mtf.csv", "shift [um]", "shift [um]", -1.0)
     (folder / "focus.yaml").write_text(text.replace("moved: image", "moved: focal_plane"))
-    np.testing.assert_array_equal(focus_of(folder).defocus, there)
+    np.testing.assert_array_equal(focus_of(folder).states[0].defocus, there)
     in_unit(folder / "mtf.csv", "shift [um]", "shift [um]", -1.0 / 0.08)
     (folder / "focus.yaml").write_text(text.replace("moved: image", "moved: target\n  per_shift: 0.08"))
-    np.testing.assert_allclose(focus_of(folder).defocus, there, rtol=1e-9)
+    np.testing.assert_allclose(focus_of(folder).states[0].defocus, there, rtol=1e-9)
 
 
 def test_reference_angles_and_positions_in_place_of_differences(folder: Path) -> None:
@@ -305,6 +314,7 @@ def test_missing_repeats_cost_only_their_own_angle(folder: Path) -> None:
     assert less.repeatability == pytest.approx(whole.repeatability, rel=0.01)
 
 
+@pytest.mark.second
 def test_missing_spots_are_no_spots(folder: Path) -> None:
     whole = distortion_of(folder)
     head, *body = rows_of(folder / "spots.csv")
@@ -356,7 +366,7 @@ def test_distortion_agrees_with_scipy(folder: Path) -> None:
 
 def test_focus_agrees_with_scipy(folder: Path) -> None:
     run_ = focus_of(folder)
-    scan = run_.scans[7]
+    scan = run_.states[0].scans[7]
     for edge, vertex in scan.vertex.items():
         z, v, s = (each[edge][vertex.used] for each in (scan.shift, scan.mtf, scan.sigma))
 
@@ -372,10 +382,12 @@ def test_focus_agrees_with_scipy(folder: Path) -> None:
         assert abs(found.x[1] - vertex.position) < 1e-4 * vertex.sigma
         assert sigma == pytest.approx(vertex.sigma, rel=1e-4)
         assert 2.0 * found.cost == pytest.approx(vertex.chi_square, rel=1e-6)
-    plane = run_.shimming.plane
-    spread = np.hypot(run_.defocus_sigma, plane.extra_sigma)
+    plane = run_.shimmings[0].plane
+    spread = np.hypot(run_.states[0].defocus_sigma, plane.extra_sigma)
     design = np.column_stack([np.ones(len(spread)), plane.place])
-    found = least_squares(lambda x: (-run_.defocus - design @ x) / spread, np.zeros(3), x_scale=[1e-5, 1e-4, 1e-4])
+    found = least_squares(
+        lambda x: (-run_.states[0].defocus - design @ x) / spread, np.zeros(3), x_scale=[1e-5, 1e-4, 1e-4]
+    )
     covariance = np.linalg.inv((design / spread[:, None]).T @ (design / spread[:, None]))
     sigma = np.sqrt(np.diag(covariance))
     assert np.all(np.abs(found.x - [plane.piston, plane.slope_x, plane.slope_y]) < 1e-5 * sigma)
@@ -405,6 +417,7 @@ def test_turntable_agrees_with_scipy(folder: Path) -> None:
 # --- more data -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_more_data_never_raise_a_sigma(folder: Path) -> None:
     """Known noise: each place and each angle that is added lowers sigmas or leaves them."""
     head, *body = rows_of(folder / "mtf.csv")
@@ -413,7 +426,10 @@ def test_more_data_never_raise_a_sigma(folder: Path) -> None:
         places = sorted({(row[0], row[2]) for row in body})[::step]
         write(folder / "mtf.csv", [head, *(row for row in body if (row[0], row[2]) in places)])
         run_ = focus_of(folder)
-        design = np.column_stack([np.ones(len(run_.sites)), run_.shimming.plane.place]) / run_.defocus_sigma[:, None]
+        design = (
+            np.column_stack([np.ones(len(run_.places)), run_.shimmings[0].plane.place])
+            / run_.states[0].defocus_sigma[:, None]
+        )
         sigma = np.sqrt(np.diag(np.linalg.inv(design.T @ design)))
         if last is not None:
             assert np.all(sigma < last)

@@ -19,7 +19,7 @@ from scenes.specs.load import SCENES
 from scenes.specs.resolved import resolve_focus_test
 from scenes.yaml.errors import InputError
 from twin.lab import app
-from twin.laboratory.measured_focus import align_measured
+from twin.laboratory.focus_run import align_files
 from twin.laboratory.measured_readings import read_comparisons
 
 EXAMPLES = SCENES / "lab" / "measured"
@@ -248,17 +248,17 @@ def stack(folder: Path, images: Path) -> Path:
 
 
 def test_a_stack_that_the_twin_did_not_make(stack: Path) -> None:
-    run = align_measured(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
+    run = align_files(resolve_focus_test(stack / "focus.yaml").test)  # type: ignore[arg-type]
     true = np.array([-20e-6, -40e-6, -20e-6, -40e-6])
-    by_place = {tuple(np.rint(1e3 * site.place)): k for k, site in enumerate(run.sites)}
+    by_place = {tuple(np.rint(1e3 * place)): k for k, place in enumerate(run.places)}
     order = [by_place[place] for place in ((0, -100), (0, 100), (20, -100), (20, 100))]
     # a Gaussian's curve is even, its form another than a pupil's: half a micrometre is stated for that
-    sigma = np.hypot(run.defocus_sigma[order], run.spec.vertex_error)
-    assert np.all(np.abs(run.defocus[order] - true) < 4.0 * sigma)
-    sigma_y = float(np.sqrt(run.shimming.plane.covariance[2, 2])) + run.shimming.systematic[2]
-    assert abs(run.shimming.plane.slope_y - 1e-4) < 4.0 * sigma_y
+    sigma = np.hypot(run.states[0].defocus_sigma[order], run.test.vertex_error)
+    assert np.all(np.abs(run.states[0].defocus[order] - true) < 4.0 * sigma)
+    sigma_y = float(np.sqrt(run.shimmings[0].plane.covariance[2, 2])) + run.shimmings[0].systematic[2]
+    assert abs(run.shimmings[0].plane.slope_y - 1e-4) < 4.0 * sigma_y
     assert sigma_y < 1e-5
-    assert not run.no_edge
+    assert not run.readings.no_edge
 
 
 def more(*columns: tuple[str, str]) -> Callable[[Path], None]:
@@ -301,17 +301,17 @@ def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object]
 
 def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None:
     test = resolve_focus_test(stack / "focus.yaml").test
-    before = align_measured(test)  # type: ignore[arg-type]
+    before = align_files(test)  # type: ignore[arg-type]
     flat = np.random.default_rng(1).normal(1000.0, 4.0, (64, 64)).astype(np.uint16)
     tifffile.imwrite(stack / "0_along_8.tiff", flat)
-    after = align_measured(test)  # type: ignore[arg-type]
-    (lost,) = after.no_edge
+    after = align_files(test)  # type: ignore[arg-type]
+    (lost,) = after.readings.no_edge
     assert lost.line == 10
-    assert np.all(np.abs(after.defocus - before.defocus) < 3.0 * before.defocus_sigma)
+    assert np.all(np.abs(after.states[0].defocus - before.states[0].defocus) < 3.0 * before.states[0].defocus_sigma)
     for k in range(9):
         tifffile.imwrite(stack / f"0_along_{k}.tiff", flat)
     with pytest.raises(InputError, match="of its first image without an edge"):
-        align_measured(test)  # type: ignore[arg-type]
+        align_files(test)  # type: ignore[arg-type]
 
 
 # --- size, and series of unequal length ------------------------------------------------------------------
@@ -334,9 +334,9 @@ def test_a_million_rows(folder: Path) -> None:
     head_, *body = (folder / "mtf.csv").read_text().splitlines()
     (folder / "mtf.csv").write_text("\n".join([head_, *body * (1_000_000 // len(body) + 1)]) + "\n")
     start = time.process_time()
-    run = align_measured(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
+    run = align_files(resolve_focus_test(folder / "focus.yaml").test)  # type: ignore[arg-type]
     assert time.process_time() - start < 60.0
-    assert len(run.sites) == 25
+    assert len(run.places) == 25
 
 
 def test_series_of_unequal_length() -> None:

@@ -29,9 +29,8 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from tests.twin.commands import invoke
 from tests.twin.orbit_files import FIELDS, WHOLE, edit, export, flown, read_back, scaled, set_keys, small
-from twin.orbit.angle.angle_export import angle_exported
 from twin.orbit.angle.angle_run import run_angle
-from twin.orbit.angle.measured_angle import run_measured_angle
+from twin.orbit.angle.measured_angle import angle_exported, run_measured_angle
 from twin.orbit.calibration.calibration_export import simulation_exported
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.schemes import schemes_tested
@@ -72,6 +71,7 @@ def files(tmp_path, campaign):
     return export(tmp_path / "data", small(), campaign)
 
 
+@pytest.mark.second
 def test_files_give_the_estimates_of_the_simulation(campaign, files) -> None:
     """Together, each field by itself, and at check points."""
     _, again = read_back(files)
@@ -183,6 +183,7 @@ def _columns(file) -> dict[str, np.ndarray]:
     }
 
 
+@pytest.mark.second
 def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
     """Collinearity written anew from the definition of the look in camera.json, splines and least squares of SciPy.
 
@@ -279,6 +280,7 @@ def _other_quaternion(heads, rows):
     return heads, found
 
 
+@pytest.mark.second
 def test_conventions_units_and_order_do_not_matter(files) -> None:
     """All of them changed at once, rows and columns shuffled. Quaternions go through other rotations, whose rounding of
     1e-16 rad is 1e-10 m: a 1e-7 of a sigma at most."""
@@ -356,6 +358,7 @@ def test_a_wrong_convention_is_not_fitted_silently(files, key, value) -> None:
     assert found.p_value < 1e-9
 
 
+@pytest.mark.second
 def test_more_points_never_raise_a_sigma(files) -> None:
     """Half of the control points taken away raises every sigma or leaves it."""
     _, whole = read_back(files)
@@ -455,6 +458,7 @@ def _ccds(first_shift, second_shift):
     ]
 
 
+@pytest.mark.second
 def test_ccds_that_do_not_lie_in_line_are_known_not_estimated(tmp_path) -> None:
     """A nadir line of two CCDs, one a pixel and a half off: flown with them and analysed with them, the calibration is
     right to its sigmas; analysed as one straight line, the fit is impossible. False alarms 1e-6."""
@@ -531,6 +535,7 @@ def no_thermal() -> dict:
     return {"errors": WHOLE.test.errors.model_copy(update={"star_tracker": still})}
 
 
+@pytest.mark.second
 def test_intersection_angles_of_measured_passes(tmp_path) -> None:
     """Four campaigns of two passes: alpha and beta against the true camera, whose principal points have moved by 60 um
     or 19 arcsec; within the sigmas, false alarm 1e-6 to either side."""
@@ -569,6 +574,7 @@ def test_the_angle_command_on_measurements(files) -> None:
     assert "time: orbit or attitude are not known then" in " ".join(refused.stderr.split())
 
 
+@pytest.mark.second
 def test_velocities_and_one_table_of_the_platform_may_be_left_to_the_positions(campaign, files) -> None:
     """Aberration by the derivative of noisy positions, 0.1 m/s or 3e-10 rad off; orbit and attitude at the same times
     in one table."""
@@ -688,7 +694,7 @@ def test_a_platform_in_files_of_other_formats(tmp_path) -> None:
     """
     from scenes.specs.measured.orbit_data_setup import resolve_check
     from tests.twin.orbit_file_bench import aem, check_files, sp3
-    from twin.orbit.conventions.check_export import exported as check_exported
+    from twin.orbit.conventions.check_run import exported as check_exported
     from twin.orbit.conventions.check_run import run_check
 
     spec = check_files(tmp_path)

@@ -45,6 +45,7 @@ def setup(request, experiment):
     return experiment(request.param)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("number", range(len(SPOT_RANGES) - 1))
 def test_both_classes_are_right_at_their_border(setup, number: int) -> None:
     path = setup.path
@@ -77,6 +78,7 @@ def test_too_few_nodes_would_be_seen(setup) -> None:
     assert np.max(np.abs(few - want)) > 3 * ACCURACY * want.max()
 
 
+@pytest.mark.second
 def test_a_state_has_its_class_in_any_company(setup) -> None:
     path = setup.path
     states = [off_middle(path, 1.0 + share) for share in (0.1, 0.4, 0.7, 0.2)]
@@ -186,6 +188,7 @@ def test_cameras_whose_light_a_body_changes(setup) -> None:
     assert moved[[next(iter(s)) for s in states].index(BASE)] == tuple(setup.instrument.cameras)
 
 
+@pytest.mark.second
 def test_channels_left_alone_are_rendered_once_and_alike(setup) -> None:
     """Photons of one state are those of ``expected_photons`` to the bit, whichever channels were kept."""
     path = setup.path
@@ -198,6 +201,7 @@ def test_channels_left_alone_are_rendered_once_and_alike(setup) -> None:
         kept[:] = 0.0  # the caller's own
 
 
+@pytest.mark.second
 def test_a_state_is_the_same_alone_and_among_others(setup) -> None:
     """More states never change one: photons and lines of sight are the same to the bit."""
     names = list(setup.instrument.cameras)

@@ -18,7 +18,6 @@ from scenes.models.monitor_layout import (
     Beam,
     ImagingBeams,
     MonitorDesignSetup,
-    instrument_file,
     layout_spec,
     prism_mass,
     pupil_share,
@@ -33,7 +32,7 @@ from scenes.yaml.yaml_file import dump_yaml
 from twin.design import monitor_design, monitor_report
 from twin.design.__main__ import app
 from twin.design.layout_bench import BeamFacts, LayoutBench, combined, is_own, touching
-from twin.design.monitor_design import MonitorDesignRun, monitor_design_numbers, run_monitor_design
+from twin.design.monitor_design import LAYOUTS, MonitorDesignRun, run_monitor_design
 from twin.design.search_workers import Journal
 from twin.monitor.information import Information, spot_noise
 from twin.monitor.monitor_experiment import MonitorExperiment
@@ -154,6 +153,7 @@ def posterior(found: Information) -> np.ndarray:
     return np.asarray(found.disturbances.misfit(found.gain) + found.gain @ found.noise @ found.gain.T)
 
 
+@pytest.mark.second
 def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBench, path: MonitorPath) -> None:
     even = replace(bench.detector(), prnu=0.0, dsnu_e=0.0, dark_noise_e=0.0, dark_current_e_per_s=0.0)
     # rounding falls with the number of frames where read noise spreads over its steps
@@ -197,6 +197,7 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
     assert np.all(sigma < 1.35 * np.sqrt(2.0) * airy[:, None])
 
 
+@pytest.mark.second
 def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
     # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
     start = path.instrument
@@ -230,7 +231,7 @@ def test_a_layout_whose_prisms_collide_is_refused_with_both_bodies_and_the_line(
 ) -> None:
     near = replace(SECOND, prism_180_distance=2.42, pupil_x=0.2)
     file = tmp_path / "hand.yaml"
-    file.write_text(instrument_file(layout_spec(setup, (FIRST, near)), "made by hand"), "utf-8")
+    file.write_text(layout_spec(setup, (FIRST, near)).file_text("made by hand"), "utf-8")
     design = written(tmp_path, DESIGN.replace("instrument: gf7_pair", "instrument: hand.yaml"))
     result = CliRunner().invoke(app, ["monitor", str(design), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2
@@ -261,7 +262,7 @@ def test_a_short_search_finds_a_better_layout(whole: MonitorDesignRun, tmp_path:
     file.write_text(best.text, "utf-8")
     again = load_instrument(file)
     assert again.channels_of("forward") == layout_spec(whole.setup, best.facts.beams).channels_of("forward")
-    numbers = monitor_design_numbers(whole)
+    numbers = LAYOUTS(whole)
     assert numbers["search"]["beams_tried"] == 6
     assert list(numbers["ends"]) == ["gf7_pair", "start 1"]
     assert sorted(name for group in numbers["optima"] for name in group) == ["gf7_pair", "start 1"]
@@ -311,7 +312,7 @@ def test_a_search_that_is_broken_off_goes_on_to_the_same_end(
     assert kept == 3  # the head and both beams
     again = run_monitor_design(setup, backend, 1, journal=journal)
     assert journal.exists()  # the command removes it, when the run folder stands
-    assert monitor_design_numbers(again) == monitor_design_numbers(whole)
+    assert LAYOUTS(again) == LAYOUTS(whole)
 
 
 @pytest.mark.slow
@@ -363,7 +364,7 @@ def test_a_start_that_throws_a_ghost_is_refused_with_both_bodies_and_the_line(
 @pytest.mark.slow
 def test_workers_change_nothing(setup: MonitorDesignSetup, backend: Backend, whole: MonitorDesignRun) -> None:
     again = run_monitor_design(setup, backend, 1, workers=2)
-    assert monitor_design_numbers(again) == monitor_design_numbers(whole)
+    assert LAYOUTS(again) == LAYOUTS(whole)
 
 
 @pytest.mark.parametrize(

@@ -67,6 +67,7 @@ def test_scatter_of_the_intersection_angle_agrees_with_sigma(runs):
     assert low < total < high
 
 
+@pytest.mark.second
 def test_maximum_likelihood_reaches_the_cramer_rao_bound(runs):
     """Pooled over 16 coordinates: 3200 deviations, standard error of the ratio 1.3%; limits 10% above, 5% below."""
     setup, _, recovered, clean_before, clean_after = runs
@@ -103,6 +104,7 @@ def test_frames_before_and_after_have_noise_of_their_own(experiment):
             assert all(abs(np.sum(first * s)) < limit * np.sqrt(np.sum((first * s) ** 2)) for s in each[:k])
 
 
+@pytest.mark.second
 def test_default_light_does_not_saturate(runs):
     setup, photons, *_ = runs
     frames = setup.frames_after(photons, FRAMES, 0)[0]

@@ -29,6 +29,7 @@ def data_set() -> xr.Dataset:
     return xr.Dataset(variables, coords, {"title": "a test", "reference_frames": "none"})
 
 
+@pytest.mark.second
 def test_units_are_those_that_udunits_knows_and_the_numbers_stay() -> None:
     given = data_set()
     content = netcdf(given)

@@ -20,6 +20,7 @@ def pair(experiment: Callable[[str], MonitorExperiment]) -> MonitorExperiment:
     return experiment("gf7_pair")
 
 
+@pytest.mark.second
 def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> None:
     """Those that are not keep their numbers, and with them their noise."""
     told: dict[int, str] = {}
@@ -42,6 +43,7 @@ def test_states_that_are_lost_are_left_out_and_told(pair: MonitorExperiment) -> 
     assert list(told) == [11, 3]
 
 
+@pytest.mark.second
 def test_pieces_are_the_whole(pair: MonitorExperiment) -> None:
     states = random_states(5, 2)
     whole, parts = (

@@ -81,6 +81,7 @@ def meets(triangles: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarr
     return found
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("state", [{}, MOVED], ids=["nominal", "moved"])
 def test_share_of_the_prisms_against_rays_and_triangles(gf7_pair, backend, state) -> None:
     """Points of a spiral miss a boundary of length L of the unit disk by some L / sqrt(N) in N^(1/2) points: 3e-5 of
@@ -162,6 +163,7 @@ def raster(pupil, size: int, parts: int = 4) -> tuple[np.ndarray, np.ndarray]:
     return free / parts**2, x + 1j * y
 
 
+@pytest.mark.second
 def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, backend) -> None:
     """Shifts by whole cells, so that only the edges of the raster err: 1e-3 of the diameter a cell, a sixteenth of it
     known; some 1e-4 of the result, of which the mean over an edge leaves 3e-5.
@@ -185,6 +187,7 @@ def test_transfer_function_against_the_autocorrelation_of_a_raster(gf7_pair, bac
         assert np.max(np.abs(clear - want)) > 0.01
 
 
+@pytest.mark.second
 def test_light_and_table_of_a_cut_pupil(gf7_pair, backend) -> None:
     path = path_of(gf7_pair, backend)
     directions = path.directions(places_of(gf7_pair))
@@ -224,6 +227,7 @@ def test_batch_and_single_pupils_agree(gf7_pair, backend) -> None:
     assert np.all(free.mtf_along_track - quality.mtf_along_track > 0.01)
 
 
+@pytest.mark.second
 def test_wavefront_error_is_that_of_the_free_part(gf7_pair, backend) -> None:
     """Against a mean over points of a spiral that are in no shadow."""
     path = path_of(gf7_pair, backend)
@@ -265,6 +269,7 @@ def with_plate(instrument, plate: Plate):
     return replace(instrument, baffles=(*instrument.baffles, plate))
 
 
+@pytest.mark.second
 def test_a_round_plate_before_the_first_mirror(gf7_pair, backend) -> None:
     """A disk square to the beam takes its share of the beam's cross-section, by each of two parts, or as a ring."""
     path = path_of(gf7_pair, backend)

@@ -91,7 +91,7 @@ def test_without_errors_the_angles_come_back(effects: LightEffects) -> None:
     errors = {"station": 0.0, "points": 0.0}
     flight = flown(errors=errors)
     look, dihedral = true_angles()
-    found = estimated(flight.measure(flight.ground(effects), None, effects), flight)
+    found = estimated(flight.measure(flight.ground(effects), None, effects))
     for method in ("tls", "corrected", "printed"):
         assert np.abs(found.angles[method].values - dihedral).max() < 1e-4 * ARCSEC
     assert np.abs(found.look - look).max() < 1e-4 * ARCSEC
@@ -110,7 +110,7 @@ def triangle() -> tuple[float, float]:
 
 
 def bias(flight: AnglePass, effects: LightEffects) -> np.ndarray:
-    measured = tls_angles(flight.measure(flight.ground(effects), None), flight)
+    measured = tls_angles(flight.measure(flight.ground(effects), None))
     return (measured.values - true_angles()[1]) / ARCSEC
 
 
@@ -310,6 +310,7 @@ def test_run_folder(done) -> None:
     assert {link for link in links if not link.startswith(("#", "data:"))} <= files(folder)
 
 
+@pytest.mark.second
 def test_config_repeats_the_run(done, tmp_path: Path) -> None:
     folder, _ = done
     target = tmp_path / "again"

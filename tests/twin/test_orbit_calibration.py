@@ -66,6 +66,7 @@ def interior_of_the_file() -> dict[str, float]:
     return found
 
 
+@pytest.mark.second
 def test_exact_data_return_everything_that_is_observable() -> None:
     """The sensor's times and places are solved to 1e-7 lines and pixels, 1e-12 m in the image, and converge beyond; the
     smallest change is 50 um. Biases: the star trackers' rotation, turned back."""
@@ -148,6 +149,7 @@ def test_errors_of_the_outer_lines_are_as_large_as_their_sigmas() -> None:
     assert np.all((size > 0.5) & (size < 1.5))
 
 
+@pytest.mark.second
 def test_sigmas_are_those_of_the_paper(full) -> None:
     """Interior to the 0.01 mm class and biases to the 1 arcsec class, and so are the errors."""
     found = full.together
@@ -158,6 +160,7 @@ def test_sigmas_are_those_of_the_paper(full) -> None:
         assert np.abs(found.bias(one.name) - one.bias).max() < 2.0 * ARCSEC
 
 
+@pytest.mark.second
 def test_before_calibration_errors_are_of_the_100_m_class(full) -> None:
     """By hand: in plan roll and pitch times 500 km, in height the change of x of forward minus aft, an angle a that
     moves a point by 500 km a / cos^2 25 deg, over the base, 2 tan 25 deg. In plan 30%, for changes of y and f are left
@@ -173,6 +176,7 @@ def test_before_calibration_errors_are_of_the_100_m_class(full) -> None:
         assert errors.height_rms == pytest.approx(height, rel=0.1)
 
 
+@pytest.mark.second
 def test_third_differences_show_the_white_noise(full) -> None:
     """5 sigmas; a circular orbit adds 8 mm to the orbit's, and the drift less than its step of 14 mm in a second."""
     errors = SETUP.test.errors
@@ -183,6 +187,7 @@ def test_third_differences_show_the_white_noise(full) -> None:
         assert np.all(np.abs(orbit.white_sigma - errors.gps.noise[0]) < 5.0 * orbit.white_sigma_error + 5e-3)
 
 
+@pytest.mark.second
 def test_schemes(full) -> None:
     """Five, each on all fields. With its own parameters a field is left with noise, which scheme 5 tells: at most 2 m
     in plan (0.3 px of 5 m and 0.5 arcsec, three lines). Of a scheme's mean the bias of a field differs by the season
@@ -210,6 +215,7 @@ def test_schemes(full) -> None:
     assert np.corrcoef(found, expected)[0, 1] > 0.9
 
 
+@pytest.mark.second
 def test_plan_improves_and_evens_out_with_more_fields_and_heights_stay(full) -> None:
     means = full.scheme_means
     assert len(means.plan) == 4
@@ -222,6 +228,7 @@ def test_plan_improves_and_evens_out_with_more_fields_and_heights_stay(full) -> 
 # Effects on the light
 
 
+@pytest.mark.second
 def test_a_camera_100_m_wrong_takes_the_light_out_to_a_hundredth_of_a_pixel() -> None:
     """Image points by the true sensor with all effects; what is left is seen by the true camera and the true orbit at
     the same exposure times, as straight lines."""
@@ -260,6 +267,7 @@ def one_field(position: tuple[float, float, float]) -> PassData:
     return fly_fields(setup, np.random.SeedSequence(3)).passes[0].data
 
 
+@pytest.mark.second
 def test_light_is_taken_out_of_cameras_anywhere_in_the_body() -> None:
     """Light time, aberration and refraction move an image point by up to 3 px wherever the camera sits: metres do not
     matter at 500 km. A lever arm that is forgotten would count as 3 m of 500 km, 0.6 px."""
@@ -305,6 +313,7 @@ def test_covariances_of_line_and_pixel_keep_their_sign_in_the_focal_plane() -> N
         assert expected[0, 1] < 0.0
 
 
+@pytest.mark.second
 def test_light_that_is_left_in_goes_into_the_parameters(full) -> None:
     """Aberration turns the camera's view by v/c, 5.2 arcsec about the pitch axis, which the bias takes up."""
     clean, *alone, everything = full.light
@@ -355,6 +364,7 @@ def test_without_a_season_latitude_is_all() -> None:
     assert 1e-6 < chi2.sf(total, 200 * 5) < 1.0 - 1e-6
 
 
+@pytest.mark.second
 def test_biases_of_the_example_have_a_season(full) -> None:
     for fit in full.latitude:
         assert fit.p_value < 1e-6
@@ -367,6 +377,7 @@ def test_biases_of_the_example_have_a_season(full) -> None:
 # Datum, seam, campaigns
 
 
+@pytest.mark.second
 def test_a_wrong_datum_is_taken_up_and_told(full) -> None:
     """100 m in plan are 100 m over 500 km = 41 arcsec of roll and pitch; in height 100/500 000 of f. The offsets, held
     by 0.3 m, take up nothing."""
@@ -392,6 +403,7 @@ def test_a_wrong_datum_is_taken_up_and_told(full) -> None:
     assert found[0].ratio == pytest.approx((400.0 / 500e3 / ARCSEC + 25.0) / 40.0, rel=0.1)
 
 
+@pytest.mark.second
 def test_geodetic_control_is_refused(full) -> None:
     one = full.campaign.passes[0]
     lon, lat, height = one.data.earth.geodetic(one.control_ground)
@@ -400,6 +412,7 @@ def test_geodetic_control_is_refused(full) -> None:
         one.data.control_field(one.control_images, geodetic, 1.0, full.campaign.effects)
 
 
+@pytest.mark.second
 def test_image_points_from_elsewhere(full) -> None:
     """Points in another order and with numbers of their own give the same rays; sigma is that of x and y."""
     one = full.campaign.passes[0]
@@ -421,6 +434,7 @@ def test_image_points_from_elsewhere(full) -> None:
         ImagePoints.of([0], [np.nan], [4.0], np.eye(2))
 
 
+@pytest.mark.second
 def test_short_fields_have_honest_sigmas() -> None:
     """1 km and no relief: all points of a field are exposed within one or two readings of the star trackers. Errors
     against covariance, false alarm 1e-6."""
@@ -439,6 +453,7 @@ def test_short_fields_have_honest_sigmas() -> None:
     assert 1e-6 < chi2.sf(total, count) < 1.0 - 1e-6
 
 
+@pytest.mark.second
 def test_campaigns_are_flights_over_the_same_fields(full) -> None:
     repeats = full.repeats
     assert repeats.plan.shape == repeats.height.shape == (2, 5, len(FIELDS))
@@ -534,7 +549,9 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.second) if case == "few readings" else case for case in BAD]
+)
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
     path = write(tmp_path, old, new)
@@ -558,6 +575,7 @@ def test_warnings(tmp_path: Path) -> None:
     assert data["campaigns"] is None
 
 
+@pytest.mark.second
 def test_one_field_is_enough(tmp_path: Path) -> None:
     """Nothing then repeats, and no scheme is compared with another."""
     text = EXAMPLE.read_text("utf-8").replace("repeats: 12", "repeats: 0")

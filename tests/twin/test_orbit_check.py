@@ -57,6 +57,7 @@ FOUND = {
 }
 
 
+@pytest.mark.second
 def test_what_is_stated_rightly_stands_and_what_cannot_be_told_is_said(files) -> None:
     """Camera and platform are wrong by what is stated of them. Half a pixel and half a line look like a turn of the
     platform by two arcseconds, and say so.
@@ -163,7 +164,7 @@ def test_what_is_exported_is_the_pass_that_was_read() -> None:
     """
     from scenes.specs.load import SCENES
     from scenes.specs.measured.orbit_data_setup import resolve_check, resolve_measured_calibration
-    from twin.orbit.conventions.check_export import measurements
+    from twin.orbit.conventions.check_run import measurements
     from twin.orbit.flight.platform_table import TabulatedTrajectory
     from twin.orbit.measured.clock import Readings
     from twin.orbit.measured.measurement_tables import read_measurements

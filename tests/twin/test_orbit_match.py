@@ -62,6 +62,7 @@ def errors(flown: Simulation, found: Match) -> dict[str, np.ndarray]:
     return out
 
 
+@pytest.mark.second
 def test_points_in_files_are_where_the_true_sensor_has_them(flown: Simulation, files) -> None:
     """As in a simulated patch: 0.25 px with another season's light on 5 m pixels, and the covariance holds it."""
     found = matched(*files)
@@ -125,7 +126,7 @@ def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> 
     from scenes.specs.measured.orbit_data import OrbitDataSpec
     from scenes.yaml.spec import validate
     from scenes.yaml.yaml_file import read_yaml
-    from twin.orbit.measured.measurement_tables import PassTables
+    from twin.orbit.measured.measurement_tables import read_pass
 
     folder, data = files
     path = folder / "match.yaml"
@@ -139,7 +140,7 @@ def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> 
     assert list(found.passes) == ["pass"]
     files_of = {key: str(tmp_path / "data" / name) for key, name in found.passes["pass"].files.items()}
     there = found.passes["pass"].model_copy(update=files_of)
-    read = PassTables.read("pass", there).measurements(found.conventions, load_three_line_camera("th1"))
+    read = read_pass("pass", there, found.conventions, load_three_line_camera("th1"))
     assert int(np.sum(read.ground.role == "control")) == numbers["control_points"]
     assert int(np.sum(read.ground.role == "tie")) == numbers["tie_points"]
     assert (tmp_path / "run/artefacts/points.csv").is_file()

@@ -42,7 +42,7 @@ def page_of(evil: str = "", figure: str = "") -> str:
     told = Report(
         f"Test {evil}", "One sentence.", (f"Lead {evil}",), ((f"Label {evil}", evil),), table, sections, {}, (evil,) * 3
     )
-    how = RunFacts(evil, f"{evil}.yaml", evil, 1, 0.0, 1.0, "twin.lab", f"focus {evil}")
+    how = RunFacts(evil, "twin.lab", 0.0, 1.0, evil, 1, f"focus {evil}")
     return render_report("focus", replace(told, verdict=f"Verdict {evil.replace('.', '')}."), how)
 
 
@@ -128,6 +128,7 @@ def test_code_between_backticks_brings_no_markup(evil):
     assert inline(f"a `{evil}` b") == f"a <code>{escape(evil)}</code> b"
 
 
+@pytest.mark.second
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_a_browser_finds_no_breach_and_runs_nothing_that_was_put_in(figure, tmp_path):
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")

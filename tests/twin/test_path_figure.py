@@ -15,9 +15,9 @@ from optics.materials.finish import ABSORBER
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scene_surface import IDEAL, Detector, detector_surface, mirror_surface
 from scenes.models.scenery import Scenery, build_scenery
-from tests.twin.path_bench import scene_beam
+from scenes.models.scenery_parts import Detector, detector_surface, mirror_surface
+from tests.twin.path_bench import IDEAL, scene_beam
 from twin.path_tracing.families import nominal_codes
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import RaySource
@@ -68,6 +68,7 @@ def scene(assembly: Assembly, state: State) -> Scenery:
     return Scenery((mirror, detector_surface(grid, placed.pose("screen"), IDEAL, ("screen",))), (grid,))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "aperture",
     [Circle(0.2), Circle(0.2, (0.01, 0.0), 0.05), Rectangle(0.2, 0.1), Ellipse(0.2, 0.1)],

@@ -16,8 +16,8 @@ from optics.materials.finish import ABSORBER, BARE, Finish, reflectance
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scene_surface import Finishes, solid_surfaces
 from scenes.models.scenery import Scenery
+from scenes.models.scenery_parts import Finishes, solid_surfaces
 from tests.optics.bench import unit
 from tests.twin.path_bench import facing, frame, glass_scene, right_angle_prism, screen, slab
 from twin.path_tracing.families import Event, decode, nominal_codes
@@ -40,6 +40,7 @@ def find(result: PathResult, detector: str, text: str) -> Family:
     return next(f for f in result.families if f.detector == detector and f.text == text)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("angle", [0.0, 0.3, 0.9])
 @pytest.mark.parametrize("coated", [BARE, Finish(reflectance=0.02, transmission=0.97)], ids=["bare", "coated"])
 def test_ghosts_of_a_plane_parallel_plate(backend, angle: float, coated: Finish) -> None:
@@ -163,6 +164,7 @@ def near_edges(rng: np.random.Generator, half: float, n: int) -> RaySource:
     return RaySource.even(target - 0.3 * direction, direction)
 
 
+@pytest.mark.second
 def test_no_light_leaks_through_edges(backend) -> None:
     """Paths aimed at the edges of a bare cube enter and leave it only by refraction at its faces."""
     half = 0.02
@@ -205,6 +207,7 @@ def test_what_the_step_limit_cuts_off_is_under_way(backend) -> None:
         assert abs(balance.error) < 1e-12
 
 
+@pytest.mark.second
 def test_a_screen_sees_the_plate_move_the_beam(backend) -> None:
     """Refraction shifts a beam sideways by d sin(a - b) / cos(b)."""
     angle = 0.6

@@ -11,7 +11,7 @@ from scipy.integrate import dblquad
 from scipy.stats import chi2
 
 from optics.geometry.pose import Pose
-from optics.materials.finish import ABSORBER, Finish
+from optics.materials.finish import Finish
 from optics.materials.scatter import ABg, HarveyShack, total_scatter
 from scenes.models.scenery import Scenery
 from tests.optics.bench import unit
@@ -53,6 +53,7 @@ def check(counts: np.ndarray, expected: np.ndarray) -> None:
     assert statistic < chi2.ppf(1.0 - FALSE_ALARM, counts.size - 1)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("index", [1.0, 1.5], ids=["air", "glass"])
 @pytest.mark.parametrize(
     "scatter",
@@ -103,6 +104,7 @@ def test_diffused_directions_follow_lambert(backend) -> None:
     check(counts, np.full(counts.size, N / counts.size))
 
 
+@pytest.mark.second
 def test_a_scattering_mirror_in_a_scene(backend) -> None:
     """Share and pattern of the light that a mirror scatters onto a small screen, against the BSDF's integral."""
     scatter = ABg(2e-2, 3e-2, 2.0)
@@ -146,4 +148,3 @@ def test_specular_light_is_not_stray(backend) -> None:
     assert sum(f.energy for f in result.families) == pytest.approx(0.5, rel=1e-9)
     assert result.balance.absorbed["mirror"] == pytest.approx(0.5, rel=1e-12)
     assert abs(result.balance.error) < 1e-12
-    assert ABSORBER.absorptance == 1.0

@@ -163,6 +163,7 @@ def test_drawing_more_scatter_keeps_its_power(backend) -> None:
     assert abs(weight.mean() - 1.0) < 3.3 * weight.std() / np.sqrt(N)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("analytic", "tabled"),
     [
@@ -194,6 +195,7 @@ def test_an_analytic_finish_as_a_table_gives_the_same_stray_light(backend, analy
     assert other < 0.03 * two
 
 
+@pytest.mark.second
 def test_energy_is_kept_path_by_path(backend) -> None:
     """Drawn as the power goes, the balance is exact in every run."""
     surface, grid = screen("screen", Pose(np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, 0.4])), 0.3)
@@ -208,6 +210,7 @@ def fresnel(degrees: np.ndarray, index: float) -> np.ndarray:
     return np.asarray(reflectance(np.cos(np.radians(degrees)), 1.0, index))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_coating_by_its_table_is_the_surface_itself(backend, turn: float) -> None:
     """Fresnel's reflectance as a table, met from outside and from inside, is bare glass."""

@@ -16,15 +16,15 @@ from optics.geometry.pose import Pose
 from optics.geometry.tree import Motion
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from scenes.models.scene_surface import IDEAL, Detector, detector_surface
 from scenes.models.scenery import FACING_THE_LIGHT, Scenery, build_scenery
+from scenes.models.scenery_parts import Detector, detector_surface
 from tests.optics.bench import disk_points
-from tests.twin.path_bench import scene_beam
+from tests.twin.path_bench import IDEAL, scene_beam
 from twin.monitor.monitor_path import MonitorPath
 from twin.path_tracing.families import nominal_codes, signature
 from twin.path_tracing.sinks import NOMINAL
 from twin.path_tracing.source import DiskSource, RaySource
-from twin.path_tracing.stray_rays import monitor_families, trace_stray
+from twin.path_tracing.stray_light import monitor_families, trace_stray
 from twin.path_tracing.tracer import (
     BALANCED,
     FAINT,
@@ -51,6 +51,7 @@ def without_prisms(scenery: Scenery) -> Scenery:
     return Scenery(tuple(s for s in scenery.surfaces if s.solid is None), scenery.detectors)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", INSTRUMENTS)
 @pytest.mark.parametrize("state", [{}, STATE], ids=["nominal", "perturbed"])
 def test_three_mirrors_as_the_sequential_trace_has_them(backend, instrument, name: str, state: dict) -> None:
@@ -78,6 +79,7 @@ def test_three_mirrors_as_the_sequential_trace_has_them(backend, instrument, nam
     np.testing.assert_allclose(found.length[own], length[path], rtol=0, atol=1e-12)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", INSTRUMENTS)
 @pytest.mark.parametrize("state", [{}, STATE], ids=["nominal", "perturbed"])
 def test_out_and_back_through_all_prisms_as_the_sequential_trace_has_it(
@@ -155,6 +157,7 @@ def spot_statistic(counts: np.ndarray, shares: np.ndarray, paths: int) -> tuple[
     return float(np.sum((found - expected) ** 2 / expected)), len(found) - 1
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("paths", "fine"), [(200_000, 1000), pytest.param(10_000_000, 5000, marks=pytest.mark.slow)], ids=["fast", "1e7"]
 )
@@ -172,6 +175,7 @@ def test_spot_has_the_shape_of_the_sequential_trace(backend, instrument, name: s
     assert spot_statistic(counts, wrong, paths)[0] > chi2.ppf(0.999, freedom)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("paths", [200_000, pytest.param(10_000_000, marks=pytest.mark.slow)], ids=["fast", "1e7"])
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, name: str, paths: int) -> None:
@@ -188,6 +192,7 @@ def test_nominal_spot_stands_where_the_wave_path_has_it(backend, instrument, nam
     np.testing.assert_allclose(nominal.rms, 5e-6, rtol=0.02)
 
 
+@pytest.mark.second
 def test_one_kernel_for_all_states_and_seeds(backend, gf7_pair) -> None:
     def run(state: dict, seed: int) -> None:
         trace_stray(gf7_pair, backend, state, 20_000, seed, channels=gf7_pair.channels[:1])
@@ -240,6 +245,7 @@ def test_impossible_sampling_and_sources() -> None:
         replace(source, narrow=(0.08, 0.0, 0.05))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("degrees", [30.0, 60.0, 80.0])
 def test_oblique_hits_are_exact_as_well(backend, gf7_pair, degrees: float) -> None:
     """Stray light meets a mirror at any angle: place on M1 against the sequential trace."""

@@ -27,12 +27,12 @@ from twin.pictures.picture import (
     SHOTS,
     PictureError,
     Shot,
+    Studio,
     colour_variant,
     displayed,
     render_shot,
     staged,
     still_patches,
-    which_body,
     without_grain,
     write_pictures,
 )
@@ -60,6 +60,14 @@ def seen(backend, gf7_pair, paths):
         half = Shot(shot.name, shot.width // 2, shot.height // 2, 2, 2, shot.shows)
         out[shot.shows] = (*which_body(gf7_pair, paths, backend, half), staged(gf7_pair, paths, half)[0])
     return out
+
+
+def which_body(instrument, paths, backend, shot: Shot) -> tuple[np.ndarray, list[str]]:
+    """What the middle of every pixel shows first: (height, width) number into the list of bodies, -1 for nothing."""
+    view, parts = staged(instrument, paths, shot)
+    with colour_variant(backend) as mi:
+        index, _ = Studio(mi, parts, view).first_hits(0.0, 0.0)
+    return index, [part.body for part in parts]
 
 
 def pixels_of(index: np.ndarray, bodies: list[str], wanted: str) -> np.ndarray:
@@ -117,6 +125,7 @@ def test_bodies_fill_their_outline(gf7_pair, paths, seen):
         assert found.max(axis=0) == pytest.approx(where.max(axis=0), abs=3.0), body
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["gf7_pair", "monitor_pair"])
 def test_all_that_matters_can_be_seen(backend, instrument, name, seen):
     model = instrument(name)
@@ -158,6 +167,7 @@ def test_colours(backend, gf7_pair, paths):
     assert (image.max(axis=-1) < 80).sum() > 5  # black housings
 
 
+@pytest.mark.second
 def test_a_seed_gives_the_same_picture(backend, gf7_pair, paths):
     first, again, other = (render_shot(gf7_pair, paths, backend, SMALL[2], seed).astype(int) for seed in (7, 7, 8))
     assert np.array_equal(first, again)
@@ -190,6 +200,7 @@ def test_grey_values_rise_with_light():
 # --- Mitsuba's variants -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_former_variant_is_set_again(backend):
     import mitsuba as mi
 

@@ -363,6 +363,7 @@ def test_a_table_of_earth_orientation_that_is_wrong(tmp_path: Path, text: str, t
     assert error.value.file.endswith("eop.txt")
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["oem", "sp3", "aem"])
 def test_files_that_end_anywhere_or_are_damaged_end_in_an_error_or_in_numbers(tmp_path: Path, kind: str) -> None:
     """No traceback but InputError, whatever byte is missing or changed."""
@@ -390,6 +391,7 @@ def test_files_that_end_anywhere_or_are_damaged_end_in_an_error_or_in_numbers(tm
             continue
 
 
+@pytest.mark.second
 @given(st.text(max_size=60))
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_no_text_breaks_a_clock(text: str) -> None:

@@ -82,6 +82,7 @@ def facets_turned(path: MonitorPath, vectors):
     }
 
 
+@pytest.mark.second
 def test_nominal_beams(path) -> None:
     """All of every beam comes back to the CCD's middle: facets are squared by the middle rays, and over an aperture of
     50 mm coma moves the mean of a beam by some 0.01 px.
@@ -129,6 +130,7 @@ def test_prisms_may_move(path) -> None:
     assert 1e-3 < change[:, :3].max() < 0.02
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("prism", "face"), FACES)
 @pytest.mark.parametrize("axis", [0, 1])
 def test_an_angle_error_is_a_turn_of_the_facet(path, prism, face, axis) -> None:
@@ -172,6 +174,7 @@ def test_squared_facets_absorb_the_errors(imperfect) -> None:
     assert np.abs(spots(imperfect, [{}])).max() < 0.05
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("prism", PRISMS)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_an_imperfect_prism_that_turns(imperfect, instrument, backend, prism, axis) -> None:
@@ -221,6 +224,7 @@ def test_perfect_prisms_may_turn_in_images(measured) -> None:
     assert max(still.values()) < STILL
 
 
+@pytest.mark.second
 def test_angle_errors_in_images(measured) -> None:
     """Rows are y, columns x; the facet's turn is traced. Images and beams differ by the shape of coma, which
     changes over the up to 19 px: 0.02 px.

@@ -26,7 +26,7 @@ from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import gf7_with
 from twin.run import cli, reference_frames
 from twin.run.artefact import SvgFigure, Table
-from twin.run.cli import Heartbeat
+from twin.run.cli import heartbeat
 from twin.run.command import add_test
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, BenchError
@@ -146,10 +146,10 @@ def test_progress_is_told_where_there_is_no_terminal(run: Callable, tmp_path: Pa
 
 def test_a_terminal_shows_progress_itself() -> None:
     shown = io.StringIO()
-    with Heartbeat(Console(file=shown, force_terminal=True), lambda: "far", False, 0.02):
+    with heartbeat(Console(file=shown, force_terminal=True), lambda: "far", False, 0.02):
         time.sleep(0.1)
     assert shown.getvalue() == ""
-    with Heartbeat(Console(file=shown), lambda: "far", False, 0.02):
+    with heartbeat(Console(file=shown), lambda: "far", False, 0.02):
         time.sleep(0.1)
     assert set(shown.getvalue().splitlines()) == {"progress: far"}
 

@@ -75,6 +75,7 @@ def centroid(image: np.ndarray, row: float, column: float) -> tuple[float, float
     return r + float(part.sum(axis=1) @ place / total), c + float(part.sum(axis=0) @ place / total)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", LINES)
 def test_marks_lie_where_the_sensor_says(name: str) -> None:
     """Known places on rough terrain, all effects on, found in the noise-free image to 0.01 pixels."""
@@ -156,6 +157,7 @@ def test_noise_follows_the_photon_transfer() -> None:
     assert checked == 3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("name", "direction"), [("nadir", "x"), ("nadir", "y"), ("forward", "x"), ("forward", "y")])
 def test_an_edge_on_the_ground_has_the_mtf_of_the_optics(name: str, direction: str) -> None:
     """An edge of 1 m rms softness on level ground, measured from the image's pixels. 0.01: what a slanted edge of 80
@@ -269,6 +271,7 @@ def fly(seed: int, size: tuple[int, int] = (60, 70)):
     return fly_patch(lines(), PLACE, size, GROUND, ControlSpec(), np.random.SeedSequence(seed))
 
 
+@pytest.mark.second
 def test_the_seed_decides() -> None:
     first, again, other = fly(1), fly(1), fly(2)
     for name in LINES:
@@ -280,6 +283,7 @@ def test_the_seed_decides() -> None:
     assert np.array_equal(first.control.dem.values, again.control.dem.values)
 
 
+@pytest.mark.second
 def test_true_points_are_the_inverse() -> None:
     """The last step of the way to the terrain is 1e-5 m."""
     patch = fly(1)

@@ -13,7 +13,7 @@ from astropy.io import fits
 from PIL import Image
 from typer.testing import CliRunner
 
-from analysis.images.recording_time import recorded
+from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
@@ -296,6 +296,7 @@ def test_one_file_without_a_time_says_nothing(tmp_path):
     assert len(order_warnings([dated], None)) == 1
 
 
+@pytest.mark.second
 def test_files_of_the_main_job_say_which_they_are(run, images, backend, tmp_path):
     """In their note; as they are there is nothing to be said."""
     folder = tmp_path / "images"
@@ -376,6 +377,7 @@ def test_a_job_is_told_from_a_measurement(images, tmp_path):
     assert "this is a job of the monitor, which twin.recover does not read; python -m twin.render" in result.stderr
 
 
+@pytest.mark.second
 def test_random_changes_of_the_file_never_end_in_a_traceback(images, tmp_path):
     """Bytes of a measurement's YAML changed, left out and doubled."""
     text = (HEAD + f"frames:\n  {PLAIN}\nvibration: none\ntemplate: twin\ndark: {{all: [a.tif]}}\n").encode()

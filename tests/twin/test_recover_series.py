@@ -109,6 +109,7 @@ def test_the_smoothed_series_is_the_main_jobs_to_the_last_bit(course, backend):
     assert all(b.sigma[0] <= a.sigma[0] * (1.0 + 1e-9) for a, b in zip(filtered, smoothed, strict=True))
 
 
+@pytest.mark.second
 def test_a_learnt_shape_does_for_a_series_as_well(course, backend):
     """With the model for what moves and the shape from the frames before: shifts of the same frames agree to what one
     shape's noise is, each sigma is that of two images, and filter and smoother know what the times share.
@@ -141,6 +142,7 @@ def test_the_report_shows_the_series(course, backend):
     assert recover_report(found).warnings == ()
 
 
+@pytest.mark.second
 def test_only_time_differences_matter(course, backend):
     """Stated motions are stationary: a series that begins ten hours later says the same."""
     later = [f"{60 * 10 + minute} min" for minute in (0, 12, 30, 50)]

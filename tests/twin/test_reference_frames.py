@@ -29,6 +29,7 @@ def source(node):
     return ast.unparse(node)
 
 
+@pytest.mark.second
 def test_every_writer_of_json_states_frames():
     """A file's content is `described(...)`, or a name that is assigned from it."""
     count = 0
@@ -53,6 +54,7 @@ def test_every_kind_of_result_has_frames():
         described("unheard-of", {})
 
 
+@pytest.mark.second
 def test_every_data_file_beside_the_report_has_frames():
     found = 0
     for path, call in calls("Data"):
@@ -68,6 +70,7 @@ def test_every_data_file_beside_the_report_has_frames():
     assert found >= 4
 
 
+@pytest.mark.second
 def test_every_netcdf_file_has_frames():
     """Data sets are made in few places, and each of them names the frames among its attributes."""
     makers = {path for path, _ in calls("Dataset") if "validation" not in path.parts}

@@ -268,6 +268,7 @@ def test_report_needs_nothing_from_outside(first):
         assert reference not in text
 
 
+@pytest.mark.second
 def test_config_repeats_the_run_bit_for_bit(first, repeated):
     """The config of a run with --seed and --frames holds both, so that it alone repeats the run."""
     folder, _, _ = first
@@ -280,6 +281,7 @@ def test_config_repeats_the_run_bit_for_bit(first, repeated):
         assert np.array_equal(one[image], two[image])
 
 
+@pytest.mark.second
 def test_what_is_drawn_does_not_depend_on_who_draws_it(first, repeated):
     """The first run has a second process where there are two cores, the other never. All else is compared above."""
     folder, place = first[0], repeated[0] / "again"
@@ -291,11 +293,13 @@ def test_what_is_drawn_does_not_depend_on_who_draws_it(first, repeated):
     assert (place / "report.html").read_text() == (folder / "report.html").read_text()
 
 
+@pytest.mark.second
 def test_quiet_says_nothing(repeated):
     _, again, _, _ = repeated
     assert (again.stdout, again.stderr) == ("", "")
 
 
+@pytest.mark.second
 def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
     folder, _, _ = first
     place, _, other, _ = repeated
@@ -306,6 +310,7 @@ def test_another_seed_is_other_noise_on_the_same_truth(first, repeated):
         assert np.mean(one[image] != two[image]) > 0.8
 
 
+@pytest.mark.second
 def test_the_table_is_readable_in_a_narrow_terminal(repeated):
     """No number is cut, and the table fits into 80 columns."""
     place, _, other, _ = repeated
@@ -343,6 +348,7 @@ def test_a_wide_terminal_also_has_the_noise_and_a_job_without_disturbances_says_
     assert "No disturbances are stated" in (tmp_path / "alone" / "report.html").read_text("utf-8")
 
 
+@pytest.mark.second
 def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "30")
     result = run(EXAMPLE, "--out", tmp_path / "run")
@@ -359,6 +365,7 @@ def test_help_teaches():
         assert word in result.stdout
 
 
+@pytest.mark.second
 def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for number in (1, 2):
@@ -366,6 +373,7 @@ def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
         assert (tmp_path / f"runs/perturb-00{number}/manifest.json").is_file()
 
 
+@pytest.mark.second
 def test_force_replaces_a_run(ready, tmp_path):
     assert run(EXAMPLE, "--out", tmp_path / "run", "--quiet").exit_code == 0
     (tmp_path / "run/note.txt").touch()
@@ -500,6 +508,7 @@ def test_a_perturbation_that_loses_the_light_is_explained(case, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["job.yaml"]
 
 
+@pytest.mark.second
 def test_a_full_disk(ready, tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     for size in (1000, 30_000, 100_000, 500_000):
@@ -527,6 +536,7 @@ def test_no_gpu(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.second
 def test_a_missing_library_is_explained(tmp_path, monkeypatch):
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent.so")
     process = start(EXAMPLE, "--out", tmp_path / "run")
@@ -537,6 +547,7 @@ def test_a_missing_library_is_explained(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("number", "code"),
     [(signal.SIGINT, 130), (signal.SIGHUP, 129), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],

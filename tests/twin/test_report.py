@@ -309,6 +309,7 @@ def test_crosstalk_explains_the_systematic_residuals(run):
     assert "in no row of the table" not in forward
 
 
+@pytest.mark.second
 def test_nothing_perturbed(backend, tmp_path):
     job = tmp_path / "nothing.yaml"
     job.write_text("instrument: gf7_pair\nrender: {images: [spots], frames: 2, seed: 3}\n")

@@ -66,7 +66,7 @@ def page_of_a_test(tmp_path_factory) -> Path:
     told = Report(
         "Test of a test", "One of one is right.", ("More of it.",), facts, table, (section,), {}, ("Mind it.",)
     )
-    how = RunFacts("", "test.yaml", "llvm", 1, 0.0, 1.0, "twin.lab", "focus")
+    how = RunFacts("", "twin.lab", 0.0, 1.0, "llvm", 1, "focus")
     page = tmp_path_factory.mktemp("test") / "report.html"
     page.write_text(render_test_report("focus", told, how), encoding="utf-8")
     return page
@@ -130,6 +130,7 @@ def open_page(browser):
         reader.context.close()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("width", "scheme"),
     [
@@ -209,6 +210,7 @@ def test_a_drawing_stands_in_where_there_is_no_webgl(launcher, report) -> None:
         browser.close()
 
 
+@pytest.mark.second
 def test_a_table_is_downloaded_without_network(run, report, open_page) -> None:
     reader = open_page(report, 1400, "light")
     with reader.page.expect_download() as waiting:

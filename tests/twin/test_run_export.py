@@ -29,8 +29,18 @@ from twin.main_job.render_files import write_data
 from twin.main_job.render_job import render_job
 from twin.recover.recover_report import recover_numbers
 from twin.recover.recover_run import run_recover
-from twin.run.data_files import FrameFacts, MapPlace, csv_table, tiff
-from twin.run.data_table import FITS_UNITS, TABLE_FORMATS, DataColumn, DataTable, MissingPackage, ascii_text
+from twin.run.data_files import (
+    FITS_UNITS,
+    TABLE_FORMATS,
+    DataColumn,
+    DataTable,
+    FrameFacts,
+    MapPlace,
+    MissingPackage,
+    ascii_text,
+    csv_table,
+    tiff,
+)
 from twin.run.run_folder import RunFolder, write_manifest
 
 JOB = ROOT / "tests/golden/jobs/perturb.yaml"

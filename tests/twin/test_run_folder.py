@@ -18,9 +18,9 @@ import xarray as xr
 
 from tests.twin.study_bench import ROOT
 from twin.run import durable, run_folder
+from twin.run.owned_files import LOCK, OLD, PARTIAL, Unfinished, scratch
 from twin.run.provenance import versions
 from twin.run.run_folder import MANIFEST, Numbered, RunFolder, RunFolderError, is_run_folder
-from twin.run.unfinished import LOCK, OLD, PARTIAL, Unfinished, scratch
 
 
 def everything(folder: Path) -> set[str]:
@@ -437,7 +437,7 @@ def test_a_run_that_was_being_replaced_is_put_back(tmp_path):
 
 LEFT = """
 import os, signal
-from twin.run.unfinished import scratch
+from twin.run.owned_files import scratch
 with scratch("twin-own") as folder:
     (folder / "sub").mkdir()
     os.kill(os.getpid(), signal.SIGKILL)

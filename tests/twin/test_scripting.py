@@ -36,6 +36,7 @@ def shot(pair: twin.InstrumentTwin) -> twin.Shot:
     return pair.perturbed(DESPACE).perturbed(TURN).render(frames=9, seed=1)
 
 
+@pytest.mark.second
 def test_it_is_what_the_command_gives(pair: twin.InstrumentTwin, shot: twin.Shot, tmp_path: Path) -> None:
     """The library's example is scenes/examples/perturb.yaml: frames to the byte, readings to what files state."""
     out = tmp_path / "run"
@@ -119,6 +120,7 @@ def test_values_are_immutable_and_the_instrument_is_built_once(pair: twin.Instru
         bent.resolved = pair.resolved  # type: ignore[misc]
 
 
+@pytest.mark.second
 def test_recover_takes_channels_by_name_and_refuses_other_frames(pair: twin.InstrumentTwin, shot: twin.Shot) -> None:
     found = pair.recover(shot.before, shot.after)
     turned = pair.recover(
@@ -336,6 +338,7 @@ def test_a_study_runs_from_a_script_without_a_guard(tmp_path: Path) -> None:
         assert float(found.forward_d_f_true[run]) == pytest.approx(float(truth.d_f_um.sel(camera="forward")), rel=1e-9)
 
 
+@pytest.mark.second
 def test_the_users_process_stays_as_it_is() -> None:
     """What commands do with their own, the garbage collector's threshold and what comes at the end, no import does."""
     code = (

@@ -21,7 +21,7 @@ from twin.main_job.verdict import recovered_numbers
 from twin.monitor.image_sampling import WRONG
 from twin.monitor.observation import StateReader
 from twin.scripting import instrument_twin
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 
 BLURRED = {"base/forward/M1": {"figure": {"Z7": "2 um"}}}
 TURNED = {"base/forward/focal_plane": {"rotate": "0 0 300 arcsec"}}
@@ -98,6 +98,7 @@ def test_scripts_studies_and_hands_are_told_the_same(pair, blurred) -> None:
         assert reading.recovery.evidence.widening[0, 0] > 20.0
 
 
+@pytest.mark.second
 def test_a_contradicted_statement_is_no_sigma_that_holds(orbit) -> None:
     shot = orbit.perturbed({"base/forward/M2": {"shift": "0 0 30 um"}}).render(frames=2, seed=1)
     assert not shot.run.sigma_holds

@@ -99,6 +99,7 @@ def spots(path: MonitorPath, rays: CcdRays) -> np.ndarray:
 # --- nothing changes --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("camera", CAMERAS)
 def test_no_angle_changes_and_no_spot_moves_on_its_pixels(camera: str, with_camera, backend) -> None:
     instrument = with_camera(camera)
@@ -114,6 +115,7 @@ def test_no_angle_changes_and_no_spot_moves_on_its_pixels(camera: str, with_came
     np.testing.assert_allclose(found[:, 1:] - found[:, :1], 0.0, rtol=0, atol=PIXELS)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("camera", ["gf7", "monitor"])
 def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, backend) -> None:
     """Spots far off the middle of their CCDs, lines and mirrors out of place."""
@@ -134,6 +136,7 @@ def test_motions_do_the_same_to_a_grown_instrument(camera: str, with_camera, bac
     np.testing.assert_allclose(coarse[:, 1:] - coarse[:, :1], 0.0, rtol=0, atol=PIXELS)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("camera", ["gf7", "monitor"])
 def test_every_ray_meets_every_mirror_and_face_at_the_grown_place(camera: str, with_camera, backend) -> None:
     """Not only the means: rays of the nominal instrument, started at grown places, in the grown one."""
@@ -230,6 +233,7 @@ def redder(instrument: Instrument, size: float) -> Instrument:
     return replace(instrument, cameras=cameras)
 
 
+@pytest.mark.second
 def test_image_quality_is_the_same_for_light_that_grows_too(with_camera, backend) -> None:
     instrument, grown = with_camera("gf7"), 1.0 + ALUMINIUM.expansion * WARMER
     state = heated(instrument, ALUMINIUM, motions=MOVED)

@@ -114,6 +114,7 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
     assert checked == 3 * 441
 
 
+@pytest.mark.second
 def test_the_seed_decides(folder: Path, tmp_path: Path) -> None:
     again = run("simulate", folder / "config.yaml", "--out", tmp_path / "again", "--quiet")
     assert (again.exit_code, again.stdout) == (0, "")

@@ -218,6 +218,7 @@ TIMES = MINUTES * np.arange(0.0, 101.0, 10.0)
 EVERY_OTHER = np.arange(0, 11, 2)
 
 
+@pytest.mark.second
 def test_a_few_courses(experiment) -> None:
     """Twelve courses over half an orbit."""
     courses = traced(experiment("gf7_pair"), TIMES[:5], np.array([0, 2, 4]), 12, 1)

@@ -76,6 +76,7 @@ def test_every_part_is_there(motions, gf7_pair) -> None:
     assert wanted <= {m.step for m in motions}
 
 
+@pytest.mark.second
 def test_it_is_what_forward_mode_gives(path, gf7_pair) -> None:
     """Same derivative, other order of summation: rounding only, of terms as large as the camera's turn makes."""
     some = [m for name in CAMERAS for m in (*line_family(name), *other_motions(gf7_pair, name))]
@@ -126,6 +127,7 @@ def test_what_no_spot_sees(motions, gradient) -> None:
     assert max(size[BASE, kind, axis] for kind in ("shift", "rotate") for axis in range(3)) < 1e-8
 
 
+@pytest.mark.second
 def test_about_a_perturbed_state(path) -> None:
     """Derivatives by components of motions that are not zero: of a rotation vector, which does not just turn."""
     plane, mirror = f"{BASE}/forward/focal_plane", f"{BASE}/forward/M3"
@@ -162,6 +164,7 @@ def test_about_a_perturbed_state(path) -> None:
     assert np.count_nonzero(changed > 1e-5 * size) >= 5  # the state is not the nominal one
 
 
+@pytest.mark.second
 def test_pieces_of_the_beam_add_up(path, motions, gradient) -> None:
     some = motions[::7]
     pieces = spot_gradient(path, some, chunk=4 * 50)

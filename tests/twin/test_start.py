@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.twin.study_bench import ROOT
-from twin.run.ending_signals import ending_later
+from twin.run.durable import ending_later
 from twin.study.runs.cluster import _children_deaf_to_ctrl_c
 
 HEAVY = {"mitsuba", "drjit", "matplotlib", "dask", "distributed", "sklearn", "trimesh", "xarray", "pandas", "pint"}
@@ -51,11 +51,13 @@ def heavy(words: tuple) -> tuple[int, set[str]]:
     return done.returncode, {name.split(".")[0] for name in names} & HEAVY
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_help_imports_nothing_that_computes(program: str) -> None:
     assert heavy((program, "--help")) == (0, set())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("words", READ, ids=" ".join)
 def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tuple, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
@@ -63,10 +65,12 @@ def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tup
     assert heavy((*words, path)) == (2, set())
 
 
+@pytest.mark.second
 def test_a_wrong_option_of_the_mtf_is_told_before_anything_is_drawn() -> None:
     assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pixel-size", "7 um")) == (2, set())
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_ctrl_c_during_imports_leaves_no_traceback(program: str, tmp_path: Path) -> None:
     """One module stands for all: while it is imported, the signal comes."""
@@ -99,6 +103,7 @@ def exit_code_of_a_worker() -> int:
     return codes[0]
 
 
+@pytest.mark.second
 def test_workers_leave_ctrl_c_to_their_command() -> None:
     with _children_deaf_to_ctrl_c():
         assert exit_code_of_a_worker() == 0

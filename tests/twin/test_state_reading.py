@@ -24,6 +24,7 @@ def reader(job, backend) -> StateReader:
     return StateReader(MonitorExperiment(job, backend), 2, 5)
 
 
+@pytest.mark.second
 def test_a_reading_is_the_main_jobs_whatever_was_read_before(job, reader, backend) -> None:
     state = reader.experiment.state(job.job)
     for other in random_states(2, 1):

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from tests.twin.study_bench import ROOT
-from twin.run.ending_signals import exit_on_terminate
+from twin.run.durable import exit_on_terminate
 
 FULL = "/dev/full"
 LIST = ("twin.validate", "--list")
@@ -54,6 +54,7 @@ def run(words, tmp_path, stdout) -> tuple[int, str]:
     return done.returncode, "".join(errors)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("words", COMMANDS)
 def test_a_full_disk(words, tmp_path) -> None:
     with open(FULL, "w") as full:
@@ -66,6 +67,7 @@ def test_a_full_disk(words, tmp_path) -> None:
         assert (tmp_path / "run" / "manifest.json").exists()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("words", COMMANDS)
 def test_a_reader_that_has_gone(words, tmp_path) -> None:
     with closed_pipe() as pipe:

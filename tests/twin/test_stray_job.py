@@ -16,8 +16,14 @@ from scenes.specs.load import LIBRARY
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.errors import InputError
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.stray_light import REACH, diffraction_spots, ghost_warnings, stray_light
-from twin.path_tracing.stray_rays import NominalPathLost, trace_stray
+from twin.path_tracing.stray_light import (
+    REACH,
+    NominalPathLost,
+    diffraction_spots,
+    ghost_warnings,
+    stray_light,
+    trace_stray,
+)
 from twin.render import app
 
 PATHS = 20_000
@@ -33,6 +39,7 @@ def square_prisms(backend):
     return MonitorExperiment(resolved.model_copy(update={"instrument": instrument}), backend)
 
 
+@pytest.mark.second
 def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
     """Square faces throw their reflections onto the spot; 3 arcmin send them past the CCD, and the spot stays."""
     tilted = experiment("gf7_pair")
@@ -58,6 +65,7 @@ def test_the_tilt_keeps_ghosts_off_the_spot(experiment, square_prisms):
         assert np.abs(place).max() < 0.05 * setup.path.pitch
 
 
+@pytest.mark.second
 def test_a_ghost_has_the_energy_of_its_reflections(square_prisms):
     """The reflection off the 180-deg prism's window, over the spot: the coating's R over the way through all faces."""
     light = stray_light(square_prisms, {}, PATHS, 2)
@@ -127,6 +135,7 @@ def test_bad_input(tmp_path, text, says):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.second
 def test_a_baffle_in_the_way_stops_the_light(experiment, backend):
     """A plate before the central prism's facet of one channel: its nominal light is gone, the others' is not."""
     resolved = resolve_job(JobSpec(instrument="gf7_pair"))

@@ -12,17 +12,19 @@ from scipy.stats import chi2, norm, t
 from optics.geometry.tree import Motion
 from optics.materials.finish import MIRROR, Finish
 from optics.materials.scatter import total_scatter
-from scenes.models.scene_surface import Finishes
-from scenes.models.scenery import build_scenery, focal_plane_housing
+from scenes.models.scenery import build_scenery
+from scenes.models.scenery_parts import Finishes
+from tests.twin.path_bench import focal_plane_housing
 from twin.path_tracing.families import Event
 from twin.path_tracing.path_result import Family
 from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
-from twin.path_tracing.stray_rays import NominalPathLost, StrayResult, monitor_families, pinhole, trace_stray
+from twin.path_tracing.stray_light import NominalPathLost, StrayResult, monitor_families, pinhole, trace_stray
 from twin.path_tracing.tracer import BALANCED, FAINT, PathTracer, Sampling
 
 CCD = "forward/left/area_ccd"
 
 
+@pytest.mark.second
 def test_power_is_conserved_in_every_run_without_roulette(backend, gf7_pair) -> None:
     housing = focal_plane_housing(gf7_pair, "forward")
     for seed in range(3):
@@ -39,6 +41,7 @@ def test_power_is_conserved_in_every_run_without_roulette(backend, gf7_pair) -> 
             assert balance.absorbed["forward/M1"] > 0.0
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "sampling", [FAINT, Sampling(roulette=0.5), Sampling(floor=0.2)], ids=["faint", "roulette", "floor"]
 )
@@ -58,6 +61,7 @@ def test_roulette_and_floors_are_unbiased(backend, gf7_pair, sampling: Sampling)
     assert abs(energy.mean() - exact.energy) < norm.ppf(1.0 - 5e-4) * error
 
 
+@pytest.mark.second
 def test_families_scatter_as_their_sigma_says(backend, gf7_pair) -> None:
     """Ghosts' shares of the nominal light over 16 seeds, 15 to 40 paths in each: chi-square about their mean, two-sided
     limits of 1e-6; the sigma of a run goes with its own paths, which makes it a little uneven.
@@ -81,6 +85,7 @@ def test_families_scatter_as_their_sigma_says(backend, gf7_pair) -> None:
     assert chi2.ppf(1e-6, degrees) < total < chi2.isf(1e-6, degrees)
 
 
+@pytest.mark.second
 def test_neither_chunks_nor_threads_change_a_run(backend, gf7_pair) -> None:
     scenery = build_scenery(gf7_pair, {})
     source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
@@ -128,6 +133,7 @@ def share_of(family: Family, finishes: Finishes) -> float:
     return share
 
 
+@pytest.mark.second
 def test_ghosts_name_what_the_light_met_and_have_its_losses(backend, gf7_pair) -> None:
     """The prisms are tilted: on the CCD are left pairs of residual reflections, each R^2 of the nominal spot."""
     run = trace_stray(gf7_pair, backend, {}, 400_000, 1, channels=gf7_pair.channels[:1]).runs["forward/left"]

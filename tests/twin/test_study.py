@@ -137,7 +137,7 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
     folder, path, numbers = done
     plan = Plan.of(resolve_study(path))
     fault = plan.setup.error("states too much", ("responses", "df", "sigma"), "the noise alone")
-    made = StudyRun(numbers, "Seen.", folder, plan, (), fault)
+    made = StudyRun(numbers, "Seen.", folder, fault)
     monkeypatch.setattr(command, "run_study", lambda *_: made)
     result = run(path, "--out", tmp_path / "run")
     assert (result.exit_code, "df" in result.stdout, "Seen." in result.stdout) == (2, True, True)
@@ -200,6 +200,7 @@ def test_a_corrupt_chunk_is_computed_again(done) -> None:
     assert same_bytes(folder) == before
 
 
+@pytest.mark.second
 def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     folder, path, _ = done
     before = same_bytes(folder)
@@ -211,6 +212,7 @@ def test_resume_of_a_finished_study_computes_nothing(done) -> None:
     assert time.monotonic() - begun < 30.0
 
 
+@pytest.mark.second
 def test_folders_that_are_not_ones_own(done, tmp_path) -> None:
     folder, path, _ = done
     before = {name: (folder / name).read_bytes() for name in files(folder)}
@@ -284,6 +286,7 @@ def test_a_scheduler_that_is_not_there(tmp_path) -> None:
     assert "tcp://" in result.stderr
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("address", "told"),
     [

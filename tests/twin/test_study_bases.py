@@ -5,8 +5,7 @@ import math
 import pytest
 
 from scenes.specs.study import ResponseSpec
-from twin.study.runs.block_result import BlockResult
-from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.base_job import BlockResult, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 

@@ -119,7 +119,7 @@ def test_every_error_of_optics_and_analysis_says_whether_it_is_one_of_physics() 
 def test_a_study_all_of_whose_runs_failed_ends_with_1(tmp_path, monkeypatch) -> None:
     for failed, code in ((99, 0), (100, 1)):
         numbers = {"name": "study", "runs": 100, "failed": failed, "responses": {}}
-        done = StudyRun(numbers, "Nothing.", tmp_path / "run", None, ())
+        done = StudyRun(numbers, "Nothing.", tmp_path / "run")
         monkeypatch.setattr(command, "run_study", lambda *_, done=done: done)
         said = invoke(command.app, tmp_path / "study.yaml")
         assert said.exit_code == code

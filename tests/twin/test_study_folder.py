@@ -60,6 +60,7 @@ def is_whole(path: Path, report: str) -> bool:
     return is_run_folder(path) and unlisted(path) == [] and (path / "report.html").read_text() == report
 
 
+@pytest.mark.second
 def test_sources_are_all_that_can_compute() -> None:
     """Everything that the program of a worker may import, wherever in a file the import stands."""
     from tests.test_architecture import PACKAGES, imported_modules
@@ -82,6 +83,7 @@ def test_sources_are_all_that_can_compute() -> None:
     } <= seen
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("change", ["edited", "new", "gone"])
 def test_other_code_is_not_mixed_in(setup, tmp_path, monkeypatch, change) -> None:
     """The detector's quantum efficiency halved in the source between two commands, and the like."""
@@ -192,7 +194,8 @@ class Killed(BaseException):
     """In place of SIGKILL: nothing is cleared up."""
 
 
-@pytest.mark.parametrize("at", ["put_in_place", "remove_run"])
+@pytest.mark.second
+@pytest.mark.parametrize("at", ["durable.put_in_place", "run_folder.remove_run"])
 def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> None:
     """Just before both change places, and just after: a whole study stands there, and --resume comes to the end."""
     path = finish(tmp_path / "run", setup, "old")
@@ -201,10 +204,10 @@ def test_killed_while_it_is_put_in_place(setup, tmp_path, monkeypatch, at) -> No
         raise Killed
 
     with monkeypatch.context() as patch:
-        patch.setattr(f"twin.study.runs.study_folder.{at}", kill)
+        patch.setattr(f"twin.run.{at}", kill)
         with pytest.raises(Killed):
             finish(path, setup, "new", force=True)
-    assert is_whole(path, "old" if at == "put_in_place" else "new")
+    assert is_whole(path, "old" if at == "durable.put_in_place" else "new")
     finish(path, setup, "newer", resume=True)
     assert is_whole(path, "newer")
     assert [place.name for place in tmp_path.iterdir()] == ["run"]
@@ -339,6 +342,7 @@ with StudyFolder(Path(sys.argv[1]), resolve_study(sys.argv[2]), force=True):
 """
 
 
+@pytest.mark.second
 def test_a_study_that_a_killed_command_was_replacing_is_not_lost(setup, tmp_path) -> None:
     path = finish(tmp_path / "run", setup, "old")
     file = write_study(tmp_path / "in")

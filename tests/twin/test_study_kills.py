@@ -117,7 +117,7 @@ def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:
             os._exit(9)
         return evaluate(task)
 
-    monkeypatch.setattr("twin.study.runs.engine.evaluate", deadly)
+    monkeypatch.setattr("twin.study.runs.task.evaluate", deadly)
     store = ChunkStore(tmp_path, plan)
     store.open()
     before = dict(os.environ)

@@ -10,7 +10,7 @@ from scipy.stats import kstest, norm, truncnorm
 from scenes.yaml.errors import InputError
 from tests.twin.study_bench import STUDY, write_study
 from twin.study.runs import setup
-from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.base_job import leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.render_base import BLOCK
 from twin.study.runs.sampling import unit_cube
@@ -31,6 +31,7 @@ def column(plan: Plan, name: str) -> np.ndarray:
     return next(c.values for c in plan.columns if c.name == name)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("kind", ["latin_hypercube", "sobol", "monte_carlo"])
 def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     changes = (("kind: monte_carlo, runs: 100", f"kind: {kind}, runs: {RUNS}"),)
@@ -50,6 +51,7 @@ def test_drawn_designs_follow_their_distributions(tmp_path, kind) -> None:
     assert not np.any(column(other, "m2z") == z)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("limits", [(-1.0, 0.5), (2.0, 3.0), (-4.0, -3.5)])
 def test_truncated_distributions(tmp_path, limits) -> None:
     text = f"truncated: {{mean: 1 um, sigma: 1 um, limits: [{limits[0]} um, {limits[1]} um]}}"
@@ -89,6 +91,7 @@ def test_blocks_and_seeds(tmp_path) -> None:
     assert shared.run(7).seed is None
 
 
+@pytest.mark.second
 def test_config_yaml_says_all(tmp_path) -> None:
     """A table's values travel with it; the numbers and the fingerprint are the same."""
     (tmp_path / "t.csv").write_text("z,name\n1 um,a\n2 um,b\n3 um,c\n", "utf-8")

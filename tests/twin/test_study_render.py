@@ -13,12 +13,10 @@ from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.study_bench import write_study
 from twin.main_job.render_job import render_job
 from twin.monitor.monitor_path import MonitorPath
-from twin.study.runs.base_job import Failure, Run
-from twin.study.runs.block_result import BlockResult
-from twin.study.runs.config_tree import leaf
+from twin.study.runs.base_job import BlockResult, Failure, Run, leaf
 from twin.study.runs.engine import check_responses
-from twin.study.runs.perturbed_job import JobMaker, quantity_at, read_job
 from twin.study.runs.plan import Plan
+from twin.study.runs.render_base import JobMaker, quantity_at, read_job
 from twin.study.runs.setup import resolve_study
 
 
@@ -35,6 +33,7 @@ def study(tmp_path_factory):
     return SimpleNamespace(setup=setup, plan=Plan.of(setup))
 
 
+@pytest.mark.second
 def test_one_run_is_what_the_command_gives(study, backend, monkeypatch) -> None:
     """All keys and all numbers of truth.json and recovered.json, by a job file that says the same by hand.
 
@@ -67,6 +66,7 @@ def test_one_run_is_what_the_command_gives(study, backend, monkeypatch) -> None:
             assert one[key] == value, key
 
 
+@pytest.mark.second
 def test_a_state_among_others_has_the_truth_that_it_has_alone(study, backend) -> None:
     runs = [study.plan.run(k) for k in range(6)]
     together = study.setup.job.evaluate(study.setup.tree, runs, backend)
@@ -77,6 +77,7 @@ def test_a_state_among_others_has_the_truth_that_it_has_alone(study, backend) ->
             assert numbers(outcome["truth"])[key] == pytest.approx(value, rel=1e-8, abs=1e-8), key
 
 
+@pytest.mark.second
 def test_the_same_block_gives_the_same_bits(study, backend) -> None:
     runs = next(study.plan.runs_of(range(1, 2)))
     one = study.setup.job.evaluate(study.setup.tree, runs, backend)
@@ -178,6 +179,7 @@ def test_a_response_that_the_results_do_not_have(study, backend, tmp_path) -> No
     check_responses(resolve_study(right), sample)
 
 
+@pytest.mark.second
 def test_other_keys_than_motions(study, backend) -> None:
     """The number of photons changes the scatter that the analysis expects as the root of it."""
     place = ("instrument", "monitor", "reticle", "photons_per_frame")

@@ -10,9 +10,9 @@ import pytest
 from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
 from twin.run.report import one_sentence
-from twin.study.report import study_sections
+from twin.study.report import study_plots
 from twin.study.report.study_report import report_files
-from twin.study.report.study_runs import StudyRuns
+from twin.study.report.study_statistics import StudyRuns
 
 TWO = "{y: {key: [t, y_um]}, z: {key: [t, z]}}"
 
@@ -137,6 +137,7 @@ def test_when_there_is_little_to_say(tmp_path, case) -> None:
     assert expected in page(tmp_path, study, {"y": y}, np.arange(len(y)) < failed)
 
 
+@pytest.mark.second
 def test_a_grid_with_holes_has_no_indices(tmp_path) -> None:
     study = study_of("{a: {key: [job, a], values: [1, 2, 3]}, b: {key: [job, b], values: [1, 2, 3]}}", "{kind: grid}",
                      report="{sobol: true}")  # fmt: skip
@@ -166,6 +167,7 @@ def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
 THREE = "{a: {key: [job, a], values: [1, 2, 3]}, c: {key: [job, c], values: ['$x_{', '100 $', 'a$b$']}}"
 
 
+@pytest.mark.second
 def test_dollars_are_no_formulas() -> None:
     """Of units and of values that are texts; matplotlib would read what stands between two of them as a formula."""
     study = study_of(THREE, "{kind: grid}", r'{y: {key: [t, y], unit: "$\\foo$"}, z: {key: [t, z], unit: US$}}')
@@ -175,6 +177,7 @@ def test_dollars_are_no_formulas() -> None:
     assert len(made.contents["artefacts/histograms.svg"]) > 1000
 
 
+@pytest.mark.second
 def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     def fail(*_: object) -> None:
         raise RuntimeError("no such font")
@@ -183,7 +186,7 @@ def test_a_figure_that_cannot_be_drawn_costs_nothing_else(monkeypatch) -> None:
     x = columns(study)
     data = dataset(study, {"y": x["a"] + 0.1 * np.arange(9), "z": np.arange(9) ** 2.0})
     whole = report_files(data, study)
-    monkeypatch.setattr(study_sections, "histogram_figure", fail)
+    monkeypatch.setattr(study_plots, "histogram_figure", fail)
     made = report_files(data, study)
     told = "the figure 'Histograms' could not be drawn: no such font"
     assert made.undrawn == (told,)

@@ -13,12 +13,13 @@ from scenes.specs.study import ParetoSpec
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report.linear_model import linear_model
 from twin.study.report.sensitivity_indices import axis_functions, sensitivity_indices
-from twin.study.report.stated_noise import impossible, noise_share
-from twin.study.report.study_analysis import convergences, pareto_front, ranks_of
-from twin.study.report.study_report import summary
-from twin.study.report.study_runs import Factor, StudyRuns
+from twin.study.report.study_analysis import convergences, pareto_front, ranks_of, summary
 from twin.study.report.study_statistics import (
+    Factor,
+    StudyRuns,
     describe,
+    impossible,
+    noise_share,
     quantile_interval,
     runs_for_quantile,
     share_interval,
@@ -188,6 +189,7 @@ def least(coverage: float) -> int:
     return int(stats.binom.ppf(FALSE_ALARM, SEEDS, coverage))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     "case", ["without noise", *(pytest.param(case, marks=pytest.mark.slow) for case in ("noise", "curved"))]
 )
@@ -237,6 +239,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("shape", "stated"),
     [
@@ -343,6 +346,7 @@ def test_a_share_of_noise_above_one_is_an_error_and_not_cut_off() -> None:
     assert impossible(shared) is None
 
 
+@pytest.mark.second
 def test_true_noise_is_possible_where_nothing_else_varies() -> None:
     """Half of such studies have a share above 1; chances are even, so that none of 100 is below 1e-6 (1e-4 a run, of
     fixed seeds), and a tenth of variance too much in 20 000 runs is found.
@@ -358,6 +362,7 @@ def test_true_noise_is_possible_where_nothing_else_varies() -> None:
     assert noise_share(half.responses[0], half.study).share == pytest.approx(0.5, rel=0.05)
 
 
+@pytest.mark.second
 def test_failures_that_go_with_the_response() -> None:
     """Runs fail where the response is bad: the interval of the others misses the truth, that of all runs does not."""
     held = missed = 0

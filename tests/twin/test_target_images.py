@@ -125,6 +125,7 @@ def test_perfect_pupil(perfect, direction):
     assert np.max(worst) < 1e-3
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_aberrated_field(aberrated, direction):
     waves = wavefront_rms(aberrated)
@@ -182,6 +183,7 @@ def test_noise_bias(perfect):
     assert np.any(mean[1:] > far * error[1:])
 
 
+@pytest.mark.second
 def test_against_brute_force(before_gf7, backend):
     """An edge through the aberrated field: traced rays -> point-spread function -> fine raster -> pixels.
 
@@ -296,6 +298,7 @@ def dense_transfer(view: View, frequency: np.ndarray, points: int = 401) -> floa
     return float(np.abs(total) * view.ccd.transfer(*frequency))
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("obstructed", [False, True])
 def test_image_quality_and_bars_see_one_pupil_at_two_frequencies(gf7_pair, backend, obstructed):
     """Bars of the panchromatic line read 0.2351 where image quality says 0.2381 with the prisms in the beam. Both are
@@ -349,8 +352,8 @@ def bar_readings(
                         for each, stream in zip((share, 0.0 * share, 0.0 * share + 1.0), noise, strict=True)
                     ]
                     found = read_bars(view, direction, design, *means, frames)
-                    assert found.reading is not None, found.reason
-                    value, sigma = found.reading
+                    assert found.nyquist is not None, found.reason
+                    value, sigma = found.nyquist
                     assert sigma < 2e-3 / np.sqrt(frames)
                     out.append((value - found.true_nyquist) / sigma)
     return np.array(out)
@@ -363,6 +366,7 @@ def assert_no_chance_of(readings: np.ndarray) -> None:
     assert abs(np.mean(readings)) < stats.norm.isf(0.5 * FALSE_ALARM) / np.sqrt(len(readings))
 
 
+@pytest.mark.second
 def test_bars_agree_with_the_traced_pupil_within_their_sigma(before_gf7):
     """24 readings of nine frames, as in a job, half of them with the image elsewhere on the pixels."""
     states: list[State] = [{}, {"base/forward": Motion(rotate=(1.1e-6, 0.7e-6, 0.0))}]

@@ -138,6 +138,7 @@ def test_no_two_images_share_their_noise(folder):
                 assert abs(np.sum(products)) < FAR * np.sqrt(np.sum(products**2)), names[k]
 
 
+@pytest.mark.second
 def test_config_repeats_the_run(folder, mtf, backend):
     again = resolve(folder / "run" / "config.yaml")
     assert again.job.render.images == ("spots", "knife_edge")

@@ -14,17 +14,17 @@ from scipy.stats import chi2
 
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import choose, compensate
-from scenes.specs.load import EXAMPLES, load_turntable_test
+from scenes.specs.load import EXAMPLES, LAB, load_named
 from scenes.specs.turntable import DividingErrorSpec, TurntableTestSpec
 from scenes.yaml.errors import InputError
 from twin.laboratory.turntable_bench import DividingError, TurntableModel
-from twin.laboratory.turntable_numbers import turntable_numbers
+from twin.laboratory.turntable_numbers import TURNTABLE
 from twin.laboratory.turntable_report import turntable_report
 from twin.laboratory.turntable_run import TurntableRun, run_turntable
 
 ARCSEC = math.pi / 648000
 FALSE_ALARM = 1e-4
-SPEC = load_turntable_test()
+SPEC = load_named(TurntableTestSpec, LAB, "turntable")
 FILE = EXAMPLES.parent / "lab" / "turntable.yaml"
 
 
@@ -39,7 +39,7 @@ def run() -> TurntableRun:
 
 
 def test_spec_and_seed_determine_everything() -> None:
-    first, again, other = (turntable_numbers(run_turntable(SPEC, seed, names=("cubic_spline",))) for seed in (4, 4, 5))
+    first, again, other = (TURNTABLE(run_turntable(SPEC, seed, names=("cubic_spline",))) for seed in (4, 4, 5))
     assert first == again
     assert first["points"] != other["points"]
 
@@ -157,7 +157,7 @@ def test_without_errors_the_truth_comes_out() -> None:
 
 
 def test_contract(run: TurntableRun) -> None:
-    result = json.loads(json.dumps(turntable_numbers(run), allow_nan=False))
+    result = json.loads(json.dumps(TURNTABLE(run), allow_nan=False))
     assert set(result["fits"]) == set(FITS) == set(result["truth"]["fits"])
     assert not result["failed"]
     fits = result["fits"]
@@ -210,7 +210,7 @@ def test_bad_files(old: str, new: str, text: str, tmp_path: Path) -> None:
     path = tmp_path / "turntable.yaml"
     path.write_text(source.replace(old, new), "utf-8")
     with pytest.raises(InputError, match=text) as caught:
-        load_turntable_test(path)
+        load_named(TurntableTestSpec, LAB, path)
     assert caught.value.line
 
 

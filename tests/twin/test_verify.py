@@ -21,7 +21,7 @@ from tests.twin.study_bench import write_study
 from twin.compare.__main__ import app as compare_app
 from twin.run.data_files import FrameFacts, netcdf, preview_png, tiff
 from twin.run.run_folder import MANIFEST, RunFolder, write_manifest
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
@@ -40,7 +40,7 @@ from twin.verify.file_difference import (
     file_difference,
 )
 from twin.verify.folder_state import folder_state
-from twin.verify.repetition import obstacle, of_rounded, repeat_chunk
+from twin.verify.verification import obstacle, of_rounded, repeat_chunk
 
 
 @pytest.fixture

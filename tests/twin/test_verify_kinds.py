@@ -13,7 +13,7 @@ from scenes.yaml.errors import InputError
 from tests.golden.jobs import BY_NAME, ROOT, SET, UNSET, run
 from twin.run.owned_files import MANIFEST
 from twin.verify.folder_state import folder_state
-from twin.verify.repetition import obstacle
+from twin.verify.verification import obstacle
 
 KINDS = (
     *("render", "render_targets", "render_course", "render_stray", "render_deformed", "recover", "uncertainty"),

@@ -1,7 +1,7 @@
 """Every formula of paper 000, broken on purpose: at least one verdict of its checks must turn.
 
 Measurements are drawn once; a mutation is patched in where the checks look the formula up.
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 
 What no check can see, and why: the sign and a factor of (3), whose right side is zero; the modulus in (6) and (7), for
 all normals have z = -1 in the frame used and their products are positive (tested); a common factor of the curves of
@@ -27,7 +27,7 @@ from twin.validation.registry import GROUPS as ALL
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in ALL if group.prefix.startswith("000"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

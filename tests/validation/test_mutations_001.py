@@ -11,7 +11,7 @@ Mutations that nothing can see are not listed:
 - signs in (12) and in Table 5: squares;
 - the arctangent in (2), (3), (5): at 1.3 and 20 arcsec it differs from its argument by 1e-9 at most.
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 import re
@@ -32,7 +32,7 @@ from twin.validation.paper_001 import budget, budget_checks, formulas, formulas_
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 SEED = 2
 D_ALPHA, D_BETA, D_GAMMA, D_F = range(4)

@@ -5,7 +5,7 @@ Not listed, for nothing can be seen of them: the sign of all third differences (
 stepwise solution at half their length (they end at the same place, later), and the sign of pitch in the open
 combination (the rank is the same).
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 from dataclasses import replace
@@ -30,7 +30,7 @@ from twin.validation.paper_003.exact import FIELDS, changed, setup_of, without_l
 from twin.validation.registry import Selection
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix in ("003.model", "003.fields"))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

@@ -4,7 +4,7 @@ them is broken.
 Not listed, for nothing can be seen of them: the two edges' vertices swapped (best focus is their mean), the sign of an
 MTF (it is a modulus), and in (4) the two sums swapped, which is its sign.
 
-They are marked slow: .ci/run runs them, the default does not.
+They belong to the second tier: .ci/run runs them, the default does not.
 """
 
 import dataclasses
@@ -21,15 +21,15 @@ from optics.numerics.backend import load_backend
 from scenes.specs.resolved import resolve_distortion, resolve_focus
 from twin.laboratory import distortion_run as laboratory
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.focus_alignment import align
 from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_run import align
 from twin.validation import registry
 from twin.validation.checks.check import FAILED
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks
 from twin.validation.registry import select
 from twin.validation.runner import run_checks
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.second
 
 GROUPS = tuple(group for group in registry.GROUPS if group.prefix.startswith("004."))
 EXPECTED = {check.id: check.expected for group in GROUPS for check in group.checks}

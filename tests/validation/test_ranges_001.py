@@ -10,9 +10,10 @@ from scenes.specs.resolved import resolve_job
 from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CORRECTED, FAILED, REFUTED
 from twin.validation.checks.group import Context
-from twin.validation.paper_001.ranges import GROUP, ranges_group
+from twin.validation.paper_001.ranges import ranges_group
 from twin.validation.paper_001.ranges.curves import Bench, sampled
 from twin.validation.paper_001.ranges.defocus import variant
+from twin.validation.paper_001.ranges.ranges_group import GROUP
 from twin.validation.paper_001.ranges.turns import EDGE_PX, WIDE_PX, motion_of, single_range
 from twin.validation.registry import select
 from twin.validation.runner import run_checks

@@ -14,9 +14,8 @@ import typer
 
 from scenes.specs.resolved import CameraSetup, resolve_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, print_report, run_command
+from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 
 PROGRAM, KIND, TILT = "twin.camera", "optics", "tilt"
 
@@ -71,22 +70,17 @@ def main(
     def work(setup: CameraSetup, session: Session) -> Result:
         from scenes.models.camera_sharpness import blur_warnings
         from twin.camera.camera_report import camera_report
-        from twin.camera.camera_run import camera_data, camera_numbers, run_camera
+        from twin.camera.camera_run import CAMERA, camera_data, run_camera
         from twin.run.data_files import netcdf
-        from twin.run.page import RunFacts, write_test
 
         run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
         # what a refocused camera's file lacked has been done; how good it is now its verdict says
         warnings = () if refocus else blur_warnings(setup, session.backend)
-        shown = camera_report(run, warnings)
-        numbers = {**camera_numbers(run), "verdict": shown.verdict}
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
-        name = session.backend.name
         options = (*((what,) if what else ()), *(("--refocus",) if refocus else ()))
-        again = (PROGRAM, "config.yaml", *options, "--backend", name)
-        facts = RunFacts(setup.to_yaml(), str(file), name, None, session.started, session.seconds, PROGRAM, "", again)
-        write_test(KIND, numbers, shown, facts, session.folder)
-        return Result(described(KIND, numbers), lambda console: print_report(shown, console))
+        again = (PROGRAM, "config.yaml", *options, "--backend", session.backend.name)
+        shown, config = camera_report(run, warnings), setup.to_yaml()
+        return finished(session, KIND, shown, CAMERA(run), config=config, program=PROGRAM, again=again)
 
     stem = file.stem if camera is None else f"{file.stem}-{camera}"
     run_command(stem, Options(out, None, backend, force, as_json, quiet), resolve, work)

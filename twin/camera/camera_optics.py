@@ -24,6 +24,7 @@ from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
 from optics.waves.pupil_shadow import SMALLEST
@@ -46,13 +47,16 @@ TERMS = 37
 """Zernike terms (Noll's order) that are told of a wavefront: all to seventh order, and the spherical of eighth."""
 
 RINGS = 12
-"""Of the quadrature over the stop: exact for squares of wavefronts up to order 23."""
+"""Rings of the quadrature over the stop, which is exact for squares of wavefronts up to order 23."""
 
 MAP_POINTS = 65
-"""Of a wavefront's map on each axis."""
+"""Points of a wavefront's map on each axis."""
 
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
+
+WORST_LIGHT = 5e-3
+"""Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
 
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
@@ -242,7 +246,7 @@ class CameraOptics:
         return cls(path, FrozenMap(state or {}))
 
     def perturbed(self, state: State) -> Self:
-        """The same camera in another state."""
+        """Return the camera in another state."""
         return replace(self, state=FrozenMap(state))
 
     @property
@@ -252,7 +256,7 @@ class CameraOptics:
 
     @property
     def assembly(self) -> Assembly:
-        """That holds the camera."""
+        """Assembly that holds the camera."""
         return self.path.assembly
 
     @cached_property
@@ -305,11 +309,9 @@ class CameraOptics:
         axis = np.linspace(-1.0, 1.0, points)
         x, y = np.meshgrid(axis, axis)
         inside = np.hypot(x, y) <= 1.0
-        angle = 2.0 * np.pi * np.arange(4 * RINGS) / (4 * RINGS)
-        parts = [np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]
-        parts += [INSIDE * np.stack([np.cos(angle), np.sin(angle)], axis=-1)]
-        parts += [INSIDE * np.stack([x[inside], y[inside]], axis=-1)]
-        stop = np.concatenate(parts)
+        edge = rim(4 * RINGS)
+        within = np.stack([nodes.x, nodes.y], axis=-1)
+        stop = np.concatenate([[[0.0, 0.0]], within, edge, INSIDE * np.stack([x[inside], y[inside]], axis=-1)])
         rays = self.rays(fields, stop)
         wavelength = self.model.spec.wavelength
         error = -self._path(rays) / wavelength
@@ -322,7 +324,7 @@ class CameraOptics:
             flat = error[k] - zernike.basis(3, *stop.T) @ level
             fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
-            table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(angle) :]
+            table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(edge) :]
             # over a part of the disk the terms share tilt among them; what is level there was taken out above
             rms = float(fit.rms if np.all(lit) else np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
             phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
@@ -352,11 +354,7 @@ class CameraOptics:
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
         """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
         nodes = stop_nodes(self.model, RINGS, self.cut is not None)
-        rings = [
-            INSIDE * r / SPOT_RINGS * np.stack([np.cos(a), np.sin(a)], axis=-1)
-            for r in range(1, SPOT_RINGS + 1)
-            for a in [2.0 * np.pi * np.arange(6 * r) / (6 * r)]
-        ]
+        rings = [r / SPOT_RINGS * rim(6 * r) for r in range(1, SPOT_RINGS + 1)]
         stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1), *rings])
         rays = self.rays(fields, stop)
         leaving = rays.direction
@@ -381,7 +379,7 @@ class CameraOptics:
                     rms=float(np.sqrt(np.sum(spread))),
                     rms_along=np.sqrt(spread),
                     farthest=float(np.max(np.linalg.norm(hexapolar - centroid, axis=-1))),
-                    airy=1.22 * self.model.spec.wavelength * self._f_number(leaving[k, 1 + nodes.count :], rings),
+                    airy=0.61 * self.model.spec.wavelength / round_aperture(leaving[k, -len(rings[-1]) :, :2]),
                     place=self._place(rays, k),
                 )
             )
@@ -396,11 +394,20 @@ class CameraOptics:
 
         Raises:
             AimError, BeamMissedError: as ``rays``.
-            ValueError: a pupil that another aperture than the stop cuts, or a wavefront too rough for its polynomials.
+            ValueError: a pupil that edges cut into too many pieces, or a wavefront too rough for its polynomials.
         """
         light = self.directions(fields)
         places = self.path.places(self.state, light)
-        return self.path.pupils(self.state, light, places)
+        pupils = self.path.pupils(self.state, light, places)
+        if self.model.edges:
+            nodes = stop_nodes(self.model, RINGS, True)
+            lit = self.rays(fields, np.stack([nodes.x, nodes.y], axis=-1)).valid @ nodes.share
+            off = float(np.max(np.abs(lit - [pupil.light for pupil in pupils])))
+            if off > WORST_LIGHT:
+                raise UnphysicalError(
+                    f"the shadows of its edges leave {off:.2g} more or less of its light than traced rays do"
+                )
+        return pupils
 
     def mtfs(
         self,
@@ -452,12 +459,23 @@ class CameraOptics:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
 
-    def _f_number(self, leaving: np.ndarray, rings: list[np.ndarray]) -> float:
-        """Of the round beam with the solid angle of the outermost ring's rays (N, 3)."""
-        u, v = leaving[-len(rings[-1]) :, :2].T
-        after_u, after_v = np.roll(u, -1), np.roll(v, -1)
-        sides = len(u)
-        # of the circle that has the polygon's corners on it
-        polygon = 0.5 * abs(float(np.sum(u * after_v - v * after_u)))
-        circle = polygon * np.pi / (0.5 * sides * np.sin(2.0 * np.pi / sides))
-        return float(0.5 / np.sqrt(circle / np.pi))
+
+def rim(count: int) -> np.ndarray:
+    """Places evenly along the edge of the stop, within it by a rounding, in units of its radius, (count, 2)."""
+    turn = 2.0 * np.pi * np.arange(count) / count
+    return np.asarray(INSIDE * np.stack([np.cos(turn), np.sin(turn)], axis=-1))
+
+
+def solid_angle(cosines: np.ndarray) -> float:
+    """Area in direction cosines, (N, 2), of a beam whose edge goes through evenly spread rays: that of the smooth curve
+    through the polygon's corners, which is larger by what a circle is larger than its own.
+    """
+    u, v = cosines.T
+    polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
+    step = 2.0 * np.pi / len(u)
+    return polygon * step / np.sin(step)
+
+
+def round_aperture(cosines: np.ndarray) -> float:
+    """Numerical aperture of the round beam with the solid angle of one whose edge has direction cosines (N, 2)."""
+    return float(np.sqrt(solid_angle(cosines) / np.pi))

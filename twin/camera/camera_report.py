@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,20 +11,9 @@ from matplotlib.figure import Figure
 from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
-from twin.camera.camera_plots import (
-    curves_figure,
-    degrees_text,
-    distortion_figure,
-    error_figure,
-    focus_figure,
-    mtf_figure,
-    refocus_figure,
-    spot_figure,
-    wavefront_figure,
-    zernike_figure,
-)
-from twin.camera.camera_run import MOST_WAVES, CameraRun, refocus_text, verdict
-from twin.camera.layout_plot import layout_figure
+from twin.camera import camera_plots as plots
+from twin.camera.camera_run import CameraRun, refocus_text, verdict
+from twin.camera.first_order_data import FIRST_ORDER
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import look, to_svg
@@ -53,23 +43,23 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
     )
 
 
-def new_name(run: CameraRun) -> str:
-    """Of the refocused camera and its file."""
+def _new_name(run: CameraRun) -> str:
+    """Name of the refocused camera and of its file."""
     return f"{run.setup.camera.name}_refocused"
 
 
-def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure:
+def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *drawn: Any) -> SvgFigure:
     with look(name):
-        return SvgFigure(name, title, caption, to_svg(draw()))
+        return SvgFigure(name, title, caption, to_svg(draw(*drawn)))
 
 
 def _first_order_text(run: CameraRun) -> str:
-    data, d = run.first_order, run.distortion
-    blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in data.obscuration.items())
+    n, d = FIRST_ORDER(run.first_order), run.distortion
+    blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
     return (
-        f"f {data.focal_length:.4g} m, F/{data.f_number:.3g}, field {np.degrees(data.field_line):.3g} by "
-        f"{np.degrees(data.field_track):.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
-        f"distortion at most {1e6 * np.max(np.abs(d.residual)):.3g} µm there; "
+        f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
+        f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
+        f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
         + (f"its own parts stand in the beam: {blocked}." if blocked else "nothing of its own stands in the beam.")
     )
 
@@ -92,37 +82,36 @@ def _facts(run: CameraRun) -> tuple[tuple[str, str], ...]:
 
 def first_order_table(run: CameraRun) -> Table:
     """First-order data, the report's first table."""
-    data, d = run.first_order, run.distortion
-    degrees = np.degrees
+    n = FIRST_ORDER(run.first_order)
 
     def far(value: float) -> str:
         return f"{value:.4g} m" if abs(value) < 1e4 else "infinite"
 
     rows: list[tuple[str, str]] = [
         ("worst wavefront error", f"{run.worst[0]:.4g} waves rms at {field_text(run.camera, run.worst[1])}"),
-        ("focal length", f"{data.focal_length:.5f} m (line {data.focal_length_line:.5f}, "
-         f"track {data.focal_length_track:.5f})"),
-        ("principal distance of the line", f"{d.line_distance:.6f} m"),
-        ("F-number", f"{data.f_number:.3f}"),
-        ("working F-number", f"{data.working_f_number:.3f} (line {data.working_f_number_line:.3f}, "
-         f"track {data.working_f_number_track:.3f})"),
-        ("entrance pupil", f"{1e3 * data.entrance_pupil:.1f} mm, {_before(data.entrance_pupil_distance)} the first "
-         "mirror"),
-        ("exit pupil", f"{far(data.exit_pupil)}, {_before(data.exit_pupil_distance)} the image"),
-        ("chief rays at the image", f"{degrees(data.chief_ray_angle[0]):.3f} deg from its normal in the middle, "
-         f"{degrees(data.chief_ray_angle[1]):.3f} at most"),
-        ("field of view", f"{degrees(data.field_line):.4g} × {degrees(data.field_track):.4g} deg"),
-        ("image", f"{1e3 * data.image_line:.2f} × {1e3 * data.image_track:.2f} mm"),
-        ("plate scale", f"{degrees(data.plate_scale) * 3.6:.4f} arcsec/mm"),
-        ("pixel", f"{1e6 * data.pitch:.4g} µm, {degrees(data.pixel_angle) * 3600:.4f} arcsec"),
-        ("Airy disk", f"{1e6 * data.airy:.3f} µm radius, {data.airy / data.pitch:.2f} pixels"),
-        ("sampling", f"λF / pixel {data.sampling:.3f} (2 samples the cut-off); Nyquist {1e-3 * data.nyquist:.2f}, "
-         f"cut-off {1e-3 * data.cutoff:.1f} cycles/mm"),
-        ("length along the axis", f"{data.length:.4f} m"),
+        ("focal length", f"{n['focal_length_m']:.5f} m (line {n['focal_length_along_line_m']:.5f}, "
+         f"track {n['focal_length_along_track_m']:.5f})"),
+        ("principal distance of the line", f"{run.distortion.line_distance:.6f} m"),
+        ("F-number", f"{n['f_number']:.3f}"),
+        ("working F-number", f"{n['working_f_number']:.3f} (line {n['working_f_number_along_line']:.3f}, "
+         f"track {n['working_f_number_along_track']:.3f})"),
+        ("entrance pupil", f"{1e3 * n['entrance_pupil_m']:.1f} mm, "
+         f"{_before(n['entrance_pupil_before_first_mirror_m'])} the first mirror"),
+        ("exit pupil", f"{far(n['exit_pupil_m'])}, {_before(n['exit_pupil_before_image_m'])} the image"),
+        ("chief rays at the image", "{:.3f} deg from its normal in the middle, {:.3f} at most".format(
+            *n["chief_ray_angle_deg"])),
+        ("field of view", "{:.4g} × {:.4g} deg".format(*n["field_deg"])),
+        ("image", "{:.2f} × {:.2f} mm".format(*n["image_mm"])),
+        ("plate scale", f"{n['plate_scale_arcsec_per_mm']:.4f} arcsec/mm"),
+        ("pixel", f"{n['pixel_um']:.4g} µm, {n['pixel_arcsec']:.4f} arcsec"),
+        ("Airy disk", f"{n['airy_radius_um']:.3f} µm radius, {n['airy_radius_um'] / n['pixel_um']:.2f} pixels"),
+        ("sampling", f"λF / pixel {n['sampling_lambda_f_per_pixel']:.3f} (2 samples the cut-off); "
+         f"Nyquist {n['nyquist_per_mm']:.2f}, cut-off {n['cutoff_per_mm']:.1f} cycles/mm"),
+        ("length along the axis", f"{n['length_m']:.4f} m"),
         ("obscuration by its own parts",
-         ", ".join(f"{b} {100 * s:.2f}%" for b, s in data.obscuration.items()) or "none"),
+         ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
-    caption = f"In the middle of the field, at {1e9 * data.wavelength:.0f} nm, unless it says otherwise."
+    caption = f"In the middle of the field, at {1e9 * run.camera.wavelength:.0f} nm, unless it says otherwise."
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
 
@@ -137,7 +126,7 @@ def _layout(run: CameraRun) -> Section:
     caption = (
         "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
     )
-    figure = _figure("layout", "Layout with rays", caption, lambda: layout_figure(model, backend))
+    figure = _figure("layout", "Layout with rays", caption, plots.layout_figure, model, backend)
     return Section("Layout", (), (figure,))
 
 
@@ -145,7 +134,7 @@ def _refocus(run: CameraRun) -> Section:
     assert run.refocus is not None
     moved = run.refocus
     rows: list[list[Cell]] = [
-        [degrees_text(run, field), float(b), float(a)]
+        [plots.degrees_text(run, field), float(b), float(a)]
         for field, b, a in zip(FIELDS, moved.errors_before, moved.errors_after, strict=True)
     ]
     text = (
@@ -153,10 +142,10 @@ def _refocus(run: CameraRun) -> Section:
         + (", place and tilt" if moved.tilt else "")
         + ". All else here is of the refocused camera."
     )
-    name = new_name(run)
+    name = _new_name(run)
     file = file_with_plane(run.setup.camera, moved.after, name)
     artefacts: tuple[Artefact, ...] = (
-        _figure("refocus", "Before and after", "Waves rms, logarithmic.", lambda: refocus_figure(run)),
+        _figure("refocus", "Before and after", "Waves rms, logarithmic.", plots.refocus_figure, run),
         CameraFile(name.lower(), "The refocused camera", "Its file: other name and image, else as it was.", file),
         Table("refocus-fields", "Wavefront error by field", "Waves rms.", ("field", "before", "after"), rows,
               (None, 4, 4)),
@@ -165,7 +154,7 @@ def _refocus(run: CameraRun) -> Section:
 
 
 def _wavefronts(run: CameraRun) -> Section:
-    heads = ["", *(degrees_text(run, w.field) for w in run.waves)]
+    heads = ["", *(plots.degrees_text(run, w.field) for w in run.waves)]
     rows: list[list[Cell]] = [
         ["rms", *(w.rms for w in run.waves)],
         ["peak to valley", *(w.peak_to_valley for w in run.waves)],
@@ -179,91 +168,49 @@ def _wavefronts(run: CameraRun) -> Section:
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."
-    return Section(
-        "Wavefront",
-        (text,),
-        (
-            _figure(
-                "wavefront-field",
-                "Over the field",
-                "Rms wavefront error; the ring marks the worst field.",
-                lambda: error_figure(run),
-            ),
-            _figure(
-                "wavefront-maps",
-                "Maps",
-                "Over the stop, x along the line to the right, y along the track upward; one scale of colours. "
-                "Positive where the wavefront is ahead.",
-                lambda: wavefront_figure(run),
-            ),
-            _figure(
-                "zernike-bars", "Zernike terms", "In the middle and at the worst field.", lambda: zernike_figure(run)
-            ),
-            table,
-        ),
-    )  # fmt: skip
+    over_field = "Rms wavefront error; the ring marks the worst field."
+    over_stop = (
+        "Over the stop, x along the line to the right, y along the track upward; one scale of colours. Positive where "
+        "the wavefront is ahead."
+    )
+    figures = (
+        _figure("wavefront-field", "Over the field", over_field, plots.error_figure, run),
+        _figure("wavefront-maps", "Maps", over_stop, plots.wavefront_figure, run),
+        _figure("zernike-bars", "Zernike terms", "In the middle and at the worst field.", plots.zernike_figure, run),
+    )
+    return Section("Wavefront", (text,), (*figures, table))
 
 
 def _spots(run: CameraRun) -> Section:
     rows: list[list[Cell]] = [
-        [degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
+        [plots.degrees_text(run, s.field), 1e6 * s.rms, *(1e6 * s.rms_along), 1e6 * s.farthest, s.rms / s.airy]
         for s in run.spots
     ]
     heads = ("field", "rms [µm]", "along line [µm]", "along track [µm]", "largest [µm]", "rms / Airy radius")
-    return Section(
-        "Spots",
-        (),
-        (
-            _figure(
-                "spots",
-                "Spot diagrams",
-                "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk.",
-                lambda: spot_figure(run),
-            ),
-            Table(
-                "spot-sizes",
-                "Spot sizes by field",
-                "Radii about the centroid.",
-                heads,
-                rows,
-                (None, 3, 3, 3, 3, 3),
-            ),
-        ),
-    )
+    caption = "Hexapolar rays about the spot's centroid, in boxes of one size; the circle is the Airy disk."
+    figure = _figure("spots", "Spot diagrams", caption, plots.spot_figure, run)
+    decimals = (None, 3, 3, 3, 3, 3)
+    table = Table("spot-sizes", "Spot sizes by field", "Radii about the centroid.", heads, rows, decimals)
+    return Section("Spots", (), (figure, table))
 
 
 def _mtf(run: CameraRun) -> Section:
     if not run.mtfs:
-        why = f"No MTF is told of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing."
-        if run.optics.model.edges:
-            why = (
-                f"No MTF is told of a camera with edges beside its stop ({', '.join(run.optics.model.edges)}): the "
-                "pupil that they cut is no smooth function. Wavefronts, spots and focus are of the light that they "
-                "leave."
-            )
-        return Section("MTF", (why,))
+        return Section("MTF", (f"No MTF is told {run.without_mtf}.",))
     rows: list[list[Cell]] = []
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)
         limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
-        rows.append([degrees_text(run, mtf.field), *map(float, values), *limits])
+        rows.append([plots.degrees_text(run, mtf.field), *map(float, values), *limits])
     heads = ("field", "along line", "along track", "limit along line", "limit along track")
     text = (
         f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
+    caption = "Along the line and along the track; dashed what diffraction allows."
+    figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
     return Section(
-        "MTF",
-        (text,),
-        (
-            _figure(
-                "mtf",
-                "MTF by field",
-                "Along the line and along the track; dashed what diffraction allows.",
-                lambda: mtf_figure(run),
-            ),
-            Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)),
-        ),
+        "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
     )
 
 
@@ -272,18 +219,17 @@ def _through_focus(run: CameraRun) -> Section:
     where = f"{fixed(abs(best), 1)} µm {'downstream' if best > 0.0 else 'upstream'} of the focal plane"
     text = f"The least error over these fields is {where}." if np.isfinite(best) else "The light has no focus."
     caption = "The detector moves along its normal; positive is downstream, away from the optics."
-    return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, lambda: focus_figure(run)),))
+    return Section("Through focus", (text,), (_figure("focus", "Through focus", caption, plots.focus_figure, run),))
 
 
 def _field(run: CameraRun) -> Section:
     d, curves = run.distortion, run.curves
     half = float(np.max(np.abs(d.position)))
-    largest = float(np.max(np.abs(d.residual)))
     point, both = d.line_point
     text = (
         f"Along the line: principal distance {d.line_distance:.6f} m with the principal point in the line's middle, "
-        f"distortion {1e6 * np.sqrt(np.mean(d.residual**2)):.3g} µm rms and {1e6 * largest:.3g} µm at most, "
-        f"{100 * largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
+        f"distortion {1e6 * d.line_rms:.3g} µm rms and {1e6 * d.line_largest:.3g} µm at most, "
+        f"{100 * d.line_largest / half:.2g}% of half the line. Fitted together: {both:.6f} m and a principal point "
         f"{fixed(1e3 * point, 3)} mm off.",
         f"Over the whole field: the nearest perfect camera has f {d.distance:.6f} m and its principal point at "
         f"({plain(1e3 * d.point[0], 4)}, {plain(1e3 * d.point[1], 6)}) mm from the line's middle, near the parent "
@@ -300,27 +246,16 @@ def _field(run: CameraRun) -> Section:
         [1e3 * float(p), float(np.degrees(w)), 1e6 * float(r)]
         for p, w, r in zip(d.position, d.angle, d.residual, strict=True)
     ]
-    return Section(
-        "Over the field",
-        text,
-        (
-            _figure(
-                "distortion",
-                "Distortion",
-                "Left against the perfect camera with the best principal distance and point; right along the line.",
-                lambda: distortion_figure(run),
-            ),
-            _figure(
-                "field-curves",
-                "Focus and illumination",
-                "Along the line. Illumination is the solid angle of the beam as the focal plane sees it.",
-                lambda: curves_figure(run),
-            ),
-            Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
-            Table("distortion-line", "Distortion along the line", "", ("L [mm]", "W [deg]", "distortion [µm]"), line,
-                  (3, 5, 3)),
-        ),
-    )  # fmt: skip
+    against = "Left against the perfect camera with the best principal distance and point; right along the line."
+    bent = "Along the line. Illumination is the solid angle of the beam as the focal plane sees it."
+    told = ("L [mm]", "W [deg]", "distortion [µm]")
+    artefacts = (
+        _figure("distortion", "Distortion", against, plots.distortion_figure, run),
+        _figure("field-curves", "Focus and illumination", bent, plots.curves_figure, run),
+        Table("field-curves-table", "Along the line", "", heads, rows, (3, 2, 2, 2, 5, 4)),
+        Table("distortion-line", "Distortion along the line", "", told, line, (3, 5, 3)),
+    )
+    return Section("Over the field", text, artefacts)
 
 
 def _bodies(run: CameraRun) -> Section:

@@ -11,26 +11,19 @@ import xarray as xr
 
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.waves.pupil_stack import RoughWavefrontError
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
 from scenes.specs.resolved import CameraSetup
+from twin.camera import field_maps
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
-from twin.camera.field_maps import (
-    Distortion,
-    FieldCurves,
-    ThroughFocus,
-    distortion,
-    field_curves,
-    field_grid,
-    through_focus,
-)
-from twin.camera.first_order_data import FirstOrderData, first_order_data
+from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.monitor.image_quality import CameraQuality, image_quality
-from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, silent
+from twin.run.quantity import Quantity, Record
 from twin.run.reference_frames import frames_text
 
 SHARP = 1.0 / 14.0
@@ -49,10 +42,10 @@ ERROR_GRID = (25, 9)
 """Fields along the line and along the track of the map of wavefront errors."""
 
 MAP_POINTS = 129
-"""Of wavefront maps on each axis."""
+"""Points of a wavefront's map on each axis."""
 
 QUALITY_FIELDS = (-1.0, 0.0, 1.0)
-"""Of half the line: where bodies of an instrument are looked for in the beam."""
+"""Shares of half the line at which bodies of an instrument are looked for in the beam."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +77,7 @@ class CameraRun:
         waves: wavefront errors at GRID.
         spots: spots at GRID.
         mtfs: MTF of the optics at MTF_FIELDS and the design wavelength; empty for a camera too blurred for it.
+        without_mtf: why there is none, empty where there is.
         field: fields of the map of wavefront errors, (A, B, 2).
         errors: rms wavefront error there, waves, (A, B).
         distortion: over the field and along the line.
@@ -100,11 +94,12 @@ class CameraRun:
     waves: tuple[Wavefront, ...]
     spots: tuple[Spot, ...]
     mtfs: tuple[Mtf, ...]
+    without_mtf: str
     field: np.ndarray
     errors: np.ndarray
-    distortion: Distortion
-    curves: FieldCurves
-    focus: ThroughFocus
+    distortion: field_maps.Distortion
+    curves: field_maps.FieldCurves
+    focus: field_maps.ThroughFocus
     refocus: Refocus | None = None
     quality: CameraQuality | None = None
 
@@ -162,21 +157,25 @@ def run_camera(
         instrument = build_instrument(setup.instrument, cameras, backend)
         optics = CameraOptics.within(instrument, setup.mounted, backend)
         quality = image_quality(instrument, backend, [{}], QUALITY_FIELDS).cameras[setup.mounted]
-    field = field_grid(ERROR_GRID)
+    field = field_maps.field_grid(ERROR_GRID)
     errors = FieldBeams.field_errors(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5, optics.cut)
     errors = errors.reshape(field.shape[:2])
-    # a pupil that edges cut has no smooth function, so no MTF
-    sharp = float(errors.max()) < MOST_WAVES and not optics.model.edges
+    sharp, why = (
+        float(errors.max()) < MOST_WAVES,
+        f"of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing",
+    )
     advance("wavefronts", 0, 1)
     waves, spots = optics.wavefronts(GRID, points=MAP_POINTS), optics.spots(GRID)
     advance("wavefronts", 1, 1)
     advance("MTF", 0, 1)
     try:
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
+    except UnphysicalError as error:  # of a pupil that edges cut
+        mtfs, sharp, why = (), False, f"of this pupil: {error}"
     except RoughWavefrontError:  # a telescope that is not made for diffraction's limit: no smooth pupil, no MTF
         mtfs, sharp = (), False
-    focus = through_focus(optics, backend, MTF_FIELDS, sharp)
-    curves = field_curves(optics, sharp)
+    focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
+    curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     return CameraRun(
         setup=setup,
@@ -186,9 +185,10 @@ def run_camera(
         waves=waves,
         spots=spots,
         mtfs=mtfs,
+        without_mtf="" if mtfs else why,
         field=field,
         errors=errors,
-        distortion=distortion(optics),
+        distortion=field_maps.distortion(optics),
         curves=curves,
         focus=focus,
         refocus=moved,
@@ -246,94 +246,92 @@ def refocus_text(run: CameraRun) -> str:
     )
 
 
-def camera_numbers(run: CameraRun) -> dict[str, Any]:
-    """Contents of optics.json without its frames; a key ends in its unit."""
-    data, d, worst = run.first_order, run.distortion, run.worst
-    degrees = np.degrees
-    spec = run.camera
-    out: dict[str, Any] = {
-        "camera": spec.name,
-        "instrument": run.setup.where or None,
-        "mounted": run.setup.mounted,
-        "verdict": verdict(run),
-        "worst_wfe_waves": worst[0],
-        "worst_field": worst[1],
-        "limited_by": [{"aberration": kind, "rms_waves": size} for kind, size in run.limits[:4]],
-        "wavelength_nm": 1e9 * data.wavelength,
-        "image": {"z_m": spec.image.z, "tilt_deg": degrees(spec.image.tilt or 0.0)},
-        "first_order": {
-            "focal_length_m": data.focal_length,
-            "focal_length_along_line_m": data.focal_length_line,
-            "focal_length_along_track_m": data.focal_length_track,
-            "entrance_pupil_m": data.entrance_pupil,
-            "entrance_pupil_before_first_mirror_m": data.entrance_pupil_distance,
-            "exit_pupil_m": data.exit_pupil,
-            "exit_pupil_before_image_m": data.exit_pupil_distance,
-            "f_number": data.f_number,
-            "working_f_number": data.working_f_number,
-            "working_f_number_along_line": data.working_f_number_line,
-            "working_f_number_along_track": data.working_f_number_track,
-            "field_deg": [degrees(data.field_line), degrees(data.field_track)],
-            "image_mm": [1e3 * data.image_line, 1e3 * data.image_track],
-            "plate_scale_arcsec_per_mm": degrees(data.plate_scale) * 3.6,
-            "pixel_um": 1e6 * data.pitch,
-            "pixel_arcsec": degrees(data.pixel_angle) * 3600.0,
-            "nyquist_per_mm": 1e-3 * data.nyquist,
-            "cutoff_per_mm": 1e-3 * data.cutoff,
-            "sampling_lambda_f_per_pixel": data.sampling,
-            "airy_radius_um": 1e6 * data.airy,
-            "chief_ray_angle_deg": degrees(data.chief_ray_angle),
-            "length_m": data.length,
-            "obscuration": dict(data.obscuration),
-        },
-        "fields": [
-            {
-                "field": wave.field,
-                "place_mm": [1e3 * p for p in wave.place],
-                "wfe_rms_waves": wave.rms,
-                "wfe_pv_waves": wave.peak_to_valley,
-                "strehl": wave.strehl,
-                "vignetted": wave.vignetted,
-                "spot_rms_um": 1e6 * spot.rms,
-                "spot_largest_um": 1e6 * spot.farthest,
-                # piston and tilts are taken out
-                "zernike_waves": dict(list(wave.terms.items())[3:]),
-            }
-            for wave, spot in zip(run.waves, run.spots, strict=True)
-        ],
-        "mtf_at_nyquist": [
-            {"field": mtf.field, "along_line": mtf.at(mtf.nyquist)[0], "along_track": mtf.at(mtf.nyquist)[1]}
-            for mtf in run.mtfs
-        ],
-        "distortion": {
-            "principal_distance_m": d.distance,
-            "principal_point_mm": 1e3 * d.point,
-            "rms_um": 1e6 * d.rms,
-            "largest_um": 1e6 * d.largest,
-            "line_principal_distance_m": d.line_distance,
-            "line_rms_um": 1e6 * float(np.sqrt(np.mean(d.residual**2))),
-            "line_largest_um": 1e6 * float(np.max(np.abs(d.residual))),
-            "line_fitted_with_point_m": {"principal_distance": d.line_point[1], "principal_point": d.line_point[0]},
-        },
-        "refocus": None,
-        "bodies_in_the_beam": None,
-    }
-    if run.refocus is not None:
-        moved = run.refocus
-        out["refocus"] = {
-            "z_before_m": moved.before.z,
-            "z_after_m": moved.after.z,
-            "tilt_before_deg": degrees(moved.before.tilt),
-            "tilt_after_deg": degrees(moved.after.tilt),
-            "worst_before_waves": moved.errors_before.max(),
-            "worst_after_waves": moved.errors_after.max(),
-            "rms_before_waves": np.sqrt(np.mean(moved.errors_before**2)),
-            "rms_after_waves": np.sqrt(np.mean(moved.errors_after**2)),
-        }
-    if run.quality is not None:
-        out["bodies_in_the_beam"] = {body: share[0] for body, share in run.quality.bodies.items()}
-    found: dict[str, Any] = plain_data(out)
-    return found
+_WAVE: Record[Wavefront] = Record(
+    "Wavefront error at one field, piston and tilt taken out.",
+    Quantity("field", lambda w: w.field, "shares of the half field, along the line and along the track"),
+    Quantity("place_mm", lambda w: np.array(w.place), "of the chief ray on the line CCD"),
+    Quantity("wfe_rms_waves", lambda w: w.rms, "rms over the stop"),
+    Quantity("wfe_pv_waves", lambda w: w.peak_to_valley, "peak to valley over the stop"),
+    Quantity("strehl", lambda w: w.strehl, "Strehl ratio"),
+    Quantity("vignetted", lambda w: w.vignetted, "share of the stop's area whose light does not come through"),
+)
+_SPOT: Record[Spot] = Record(
+    "Spot at one field.",
+    Quantity("spot_rms_um", lambda s: s.rms, "rms distance from the centroid"),
+    Quantity("spot_largest_um", lambda s: s.farthest, "distance of the farthest ray from the centroid"),
+)
+_MTF: Record[Mtf] = Record(
+    "MTF of the optics alone at the pixels' Nyquist frequency.",
+    Quantity("field", lambda m: m.field, "shares of the half field, along the line and along the track"),
+    Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
+    Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
+)
+_DISTORTION: Record[field_maps.Distortion] = Record(
+    "Where the camera images directions, against the nearest perfect camera: over the field, and along its line.",
+    Quantity("principal_distance_m", lambda d: d.distance, "of the nearest perfect camera"),
+    Quantity("principal_point_mm", lambda d: d.point, "of the nearest perfect camera, from the line's middle"),
+    Quantity("rms_um", lambda d: d.rms, "distance from the perfect camera's images over the field"),
+    Quantity("largest_um", lambda d: d.largest, "the largest such distance"),
+    Quantity("line_principal_distance_m", lambda d: d.line_distance, "with the principal point in the line's middle"),
+    Quantity("line_rms_um", lambda d: d.line_rms, "distortion along the line"),
+    Quantity("line_largest_um", lambda d: d.line_largest, "distortion along the line"),
+    Quantity(
+        "line_fitted_with_point_m",
+        lambda d: {"principal_distance": d.line_point[1], "principal_point": d.line_point[0]},
+        "both fitted to the line together",
+    ),
+)
+_REFOCUS: Record[Refocus] = Record(
+    "The focal plane of the file and the one found, with wavefront errors rms over some fields.",
+    Quantity("z_before_m", lambda r: r.before.z),
+    Quantity("z_after_m", lambda r: r.after.z),
+    Quantity("tilt_before_deg", lambda r: r.before.tilt),
+    Quantity("tilt_after_deg", lambda r: r.after.tilt),
+    Quantity("worst_before_waves", lambda r: r.errors_before.max(), "of the worst field"),
+    Quantity("worst_after_waves", lambda r: r.errors_after.max(), "of the worst field"),
+    Quantity("rms_before_waves", lambda r: np.sqrt(np.mean(r.errors_before**2)), "over the fields"),
+    Quantity("rms_after_waves", lambda r: np.sqrt(np.mean(r.errors_after**2)), "over the fields"),
+)
+
+
+def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
+    """Wavefront, spot and Zernike terms without piston and tilts of every field of ``GRID``."""
+    return [
+        {**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:])}
+        for wave, spot in zip(run.waves, run.spots, strict=True)
+    ]
+
+
+CAMERA: Record[CameraRun] = Record(
+    "optics.json: a camera judged.",
+    Quantity("camera", lambda run: run.camera.name),
+    Quantity("instrument", lambda run: run.setup.where or None, "that the camera is mounted in"),
+    Quantity("mounted", lambda run: run.setup.mounted, "its name there"),
+    Quantity("verdict", verdict),
+    Quantity("worst_wfe_waves", lambda run: run.worst[0], "largest wavefront error over the field, rms"),
+    Quantity("worst_field", lambda run: run.worst[1], "where it is"),
+    Quantity(
+        "limited_by",
+        lambda run: [{"aberration": kind, "rms_waves": size} for kind, size in run.limits[:4]],
+        "kinds of aberration at the worst field, the largest first",
+    ),
+    Quantity("wavelength_nm", lambda run: run.camera.wavelength, "of design"),
+    Quantity(
+        "image",
+        lambda run: {"z_m": run.camera.image.z, "tilt_deg": np.degrees(run.camera.image.tilt or 0.0)},
+        "the focal plane in the prescription",
+    ),
+    Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
+    Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
+    Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
+    Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
+    Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
+    Quantity(
+        "bodies_in_the_beam",
+        lambda run: None if run.quality is None else {body: own[0] for body, own in run.quality.bodies.items()},
+        "body of the instrument -> share of the beam that it takes, at fields along the line",
+    ),
+)
 
 
 def camera_data(run: CameraRun) -> xr.Dataset:

@@ -84,7 +84,7 @@ def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
 
 
 SIZE = (4.6, 4.0)
-"""Of a picture, inches."""
+"""Width and height of a picture, inches."""
 
 
 @dataclass(frozen=True, eq=False)

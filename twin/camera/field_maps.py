@@ -10,8 +10,7 @@ from analysis.orientation.distortion_model import principal_distance, principal_
 from optics.numerics.backend import Backend
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
-from twin.camera.camera_optics import INSIDE, CameraOptics, Field
-from twin.camera.first_order_data import solid_angle
+from twin.camera.camera_optics import CameraOptics, Field, rim, solid_angle
 
 LINE_POINTS = 41
 """Places along the line at which distortion is told: as many as the truth of the main job has."""
@@ -68,6 +67,16 @@ class Distortion:
     def largest(self) -> float:
         """The largest of these distances, metres."""
         return float(np.max(np.linalg.norm(self.places - self.ideal, axis=-1)))
+
+    @property
+    def line_rms(self) -> float:
+        """Rms of the distortion along the line, metres."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
+    def line_largest(self) -> float:
+        """The largest distortion along the line, metres."""
+        return float(np.max(np.abs(self.residual)))
 
 
 def field_grid(count: tuple[int, int] = GRID) -> np.ndarray:
@@ -148,9 +157,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
     share = np.linspace(-1.0, 1.0, count)
     fields = np.stack([share, np.zeros(count)], axis=-1)
     waves = optics.wavefronts(fields, points=3, terms=28)
-    turn = 2.0 * np.pi * np.arange(48) / 48
-    rim = INSIDE * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    leaving = optics.rays(fields, rim).direction[..., 1::-1]
+    leaving = optics.rays(fields, rim(48)).direction[..., 1::-1]
     area = np.array([solid_angle(beam) for beam in leaving])
     wavelength = optics.model.spec.wavelength
     terms = np.array([wave.coefficients for wave in waves]) * wavelength

@@ -1,17 +1,147 @@
-"""First-order data of a camera, and how its pixels sample the image: what stands in the first table of a design."""
+"""First-order data of a camera, how its pixels sample the image, and which of its own parts stand in its light.
+
+Rays of a camera by itself, from the scene to the image, are traced here for the layout as well.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from optics.geometry.aperture import Aperture, Circle, Rectangle
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
-from scenes.models.camera_model import CameraModel, collimated, field_direction
-from twin.camera.camera_optics import CameraOptics
-from twin.camera.ray_paths import obscuration
+from optics.raytrace.trace import make_rays, trace
+from scenes.models.camera_model import IMAGE, CameraModel, collimated, field_direction
+from scenes.specs.camera import CameraSpec
+from twin.camera.camera_optics import CameraOptics, rim, round_aperture
+from twin.run.quantity import Quantity, Record
+
+EARLIER = 6.0
+"""How far before its launch point light is looked at for what stands in it, metres."""
+
+_FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
+_RINGS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class RayPaths:
+    """Rays in the prescription frame.
+
+    Attributes:
+        names: what they meet, the image last, K.
+        points: where they begin and what they meet, (1 + K, F, N, 3), metres.
+    """
+
+    names: tuple[str, ...]
+    points: np.ndarray
+
+
+def ray_paths(
+    model: CameraModel, backend: Backend, fields: Sequence[tuple[float, float]], stop: np.ndarray, earlier: float = 0.0
+) -> RayPaths:
+    """Rays of fields (shares of the half field) through points (N, 2) of the stop in units of its radius.
+
+    They begin ``earlier`` metres before their launch points. No aperture limits them.
+    """
+    spec = model.spec
+    bare = model.bare_assembly(apertures=False)
+    to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]])
+    directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
+    radius = float(model.apertures[spec.stop].bounds[1])
+    launch = collimated(backend, to_stop, directions, radius * stop) - earlier * directions[:, None]
+    heading = np.broadcast_to(directions[:, None], launch.shape)
+    names = (*model.mirrors, IMAGE)
+    rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
+    traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=range(len(names)))
+    points = [launch]
+    for k, name in enumerate(names):
+        points.append(bare.nominal_pose(name).apply(traced.hit(k).reshape(-1, 3)).reshape(launch.shape))
+    return RayPaths(names, np.array(points))
+
+
+def obstacles(model: CameraModel) -> dict[str, Aperture]:
+    """What of a camera may stand in its own light, in each body's own x and y: mirrors and lenses with their edges, and
+    the line CCDs with as much of an edge.
+    """
+    spec, margin = model.spec, model.spec.edge_margin
+    out: dict[str, Aperture] = {}
+    for name, edge in model.apertures.items():
+        if spec.mirrors[name].light == "passes":
+            continue  # a stop's plate stands where its hole is not
+        # the other mirrors' clear apertures have the margin already
+        out[name] = _body(model, name, Circle(edge.radius + margin) if isinstance(edge, Circle) else edge)
+    lines = [(spec.line.pixels * spec.line.pitch, 0.0)]
+    lines += [(band.pixels * band.pitch, band.offset) for band in spec.bands.values()]
+    half = 0.5 * max(length for length, _ in lines) + margin
+    offsets = [offset for _, offset in lines]
+    low, high = min(offsets) - margin, max(offsets) + margin
+    centre = model.image_body.inverse().apply(model.focal_plane.translation)
+    out[IMAGE] = Rectangle(half, 0.5 * (high - low), (float(centre[0]), float(centre[1] + 0.5 * (high + low))))
+    return out
+
+
+def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
+    """A surface with the outer edge and the hole that its file says, else with ``edge``."""
+    given = model.edges.get(name, ())
+    stated = [one.shape for one in given if not one.blocks and not one.turn and isinstance(one.shape, Aperture)]
+    if stated:
+        edge = stated[0]
+    holes = [one.shape for one in given if one.blocks and isinstance(one.shape, Circle) and not any(one.shape.centre)]
+    if holes and isinstance(edge, Circle) and not any(edge.centre) and edge.inner < holes[0].radius < edge.radius:
+        edge = Circle(edge.radius, edge.centre, holes[0].radius)
+    return edge
+
+
+def obscuration(model: CameraModel, backend: Backend) -> Mapping[str, float]:
+    """Share of a beam, of what edges leave of it, that the camera's own mirrors and line CCDs take before it is theirs:
+    body -> the largest over the field. A body that takes nothing is not there.
+    """
+    nodes = quadrature.disk(_RINGS)
+    paths = ray_paths(model, backend, _FIELDS, np.stack([nodes.x, nodes.y], axis=-1), EARLIER)
+    edges, bare = obstacles(model), model.bare_assembly(apertures=False)
+    blocked: dict[str, np.ndarray] = {}
+    for k in range(len(paths.names)):
+        ends = paths.names[max(k - 1, 0) : k + 1] if k else paths.names[:1]
+        for body, edge in edges.items():
+            if body not in ends:
+                taken = _met(backend, bare, body, edge, paths.points[k], paths.points[k + 1])
+                blocked[body] = blocked.get(body, np.zeros(taken.shape, bool)) | taken
+    lit = _lit(model, bare, paths)
+    shares = {body: float(np.max((taken & lit) @ nodes.share / (lit @ nodes.share))) for body, taken in blocked.items()}
+    return {body: share for body, share in shares.items() if share > 0.0}
+
+
+def _lit(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
+    """Which rays edges of surfaces let through, (F, N)."""
+    lit = np.ones(paths.points.shape[1:3], dtype=bool)
+    if not model.edges:
+        return lit
+    return lit & model.uncut(
+        lambda name: bare.nominal_pose(name).inverse().apply(paths.points[1 + paths.names.index(name)])
+    )
+
+
+def _met(backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Which of the stretches start..end, (F, N, 3), meet the clear area of a body, (F, N)."""
+    way = end - start
+    length = np.linalg.norm(way, axis=-1)
+    obstacle = Element(body, body, bare.elements[body].surface, Interaction.PASS, edge)
+    system = assemble(bare.with_element(obstacle), [(body,)])
+    rays = make_rays(backend, start.reshape(-1, 3), (way / length[..., None]).reshape(-1, 3))
+    _, _, path, inside = trace(backend, system, rays).numpy()
+    path, inside = path.reshape(length.shape), inside.reshape(length.shape)
+    return np.asarray(inside & (path > _NEAR) & (path < length - _NEAR))
+
+
+_NEAR = 1e-6
+"""A ray meets a surface where it starts or ends: so close to it does not count, metres."""
+
 
 _SMALL = 1e-5
 """Field angle by which the entrance pupil is found, radians: chief rays cross to its square."""
@@ -22,117 +152,118 @@ _RIM = 48
 
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
-    """Of the middle of the field unless it says otherwise; lengths in metres, angles in radians.
+    """What was traced in the middle of the field for `FIRST_ORDER`; lengths in metres, angles in radians.
 
     Attributes:
+        spec: the camera.
         focal_length_line, focal_length_track: change of the image's place per angle, along the line and the track.
         focal_length: their geometric mean.
-        entrance_pupil: diameter.
         entrance_pupil_distance: of the entrance pupil from the first mirror, positive toward the scene.
-        exit_pupil: diameter; infinite where the image space is telecentric.
         exit_pupil_distance: from the image upstream; negative where it lies behind the image.
-        f_number: focal length over entrance pupil.
-        working_f_number: of the round beam with the same solid angle at the image.
-        working_f_number_line, working_f_number_track: 1 / (2 NA) in both directions.
-        field_line, field_track: full angles of the field of view.
-        image_line, image_track: length and width of the image of the field.
-        plate_scale: angle per length on the image along the line, rad/m.
-        pixel_angle: that a pixel of the line sees along the line.
+        aperture: numerical apertures along the line and along the track.
+        round_aperture: numerical aperture of the round beam with the same solid angle at the image.
+        image: length and width of the image of the whole field.
         chief_ray_angle: of chief rays against the image's normal: in the middle, and the largest over the field.
-        length: from the farthest mirror to the farthest mirror or the image along the parent axis.
-        pitch: of the pixels.
-        nyquist, cutoff: cycles/m; the cut-off of diffraction at the design wavelength along the line.
-        sampling: lambda F / pitch along the line; 2 is Nyquist's sampling of the diffraction limit.
-        airy: radius of the Airy disk.
-        wavelength: of design.
         obscuration: body of the camera -> share of the beam that it takes, largest over the field; empty for none.
     """
 
+    spec: CameraSpec
     focal_length_line: float
     focal_length_track: float
     focal_length: float
-    entrance_pupil: float
     entrance_pupil_distance: float
-    exit_pupil: float
     exit_pupil_distance: float
-    f_number: float
-    working_f_number: float
-    working_f_number_line: float
-    working_f_number_track: float
-    field_line: float
-    field_track: float
-    image_line: float
-    image_track: float
-    plate_scale: float
-    pixel_angle: float
+    aperture: tuple[float, float]
+    round_aperture: float
+    image: tuple[float, float]
     chief_ray_angle: tuple[float, float]
-    length: float
-    pitch: float
-    nyquist: float
-    cutoff: float
-    sampling: float
-    airy: float
-    wavelength: float
     obscuration: Mapping[str, float]
+
+    @property
+    def working_f_number_line(self) -> float:
+        """F-number along the line by the beam at the image, 1 / (2 NA)."""
+        return 0.5 / self.aperture[0]
+
+    @property
+    def length(self) -> float:
+        """Distance along the parent axis between the outermost of the mirrors and the image, metres."""
+        z = [mirror.z for mirror in self.spec.mirrors.values()] + [self.spec.image.z]
+        return float(max(z) - min(z))
+
+
+FIRST_ORDER: Record[FirstOrderData] = Record(
+    "First-order data of a camera, in the middle of its field and at its design wavelength where nothing else is said.",
+    Quantity("focal_length_m", lambda d: d.focal_length, "geometric mean of those along the line and along the track"),
+    Quantity("focal_length_along_line_m", lambda d: d.focal_length_line, "change of the image's place per angle"),
+    Quantity("focal_length_along_track_m", lambda d: d.focal_length_track, "change of the image's place per angle"),
+    Quantity("entrance_pupil_m", lambda d: d.spec.entrance_pupil, "diameter"),
+    Quantity("entrance_pupil_before_first_mirror_m", lambda d: d.entrance_pupil_distance, "positive toward the scene"),
+    Quantity("exit_pupil_m", lambda d: 2.0 * abs(d.exit_pupil_distance) * d.round_aperture, "diameter"),
+    Quantity("exit_pupil_before_image_m", lambda d: d.exit_pupil_distance, "negative where it lies behind the image"),
+    Quantity("f_number", lambda d: d.focal_length / d.spec.entrance_pupil, "focal length over entrance pupil"),
+    Quantity("working_f_number", lambda d: 0.5 / d.round_aperture, "of the round beam with the same solid angle"),
+    Quantity("working_f_number_along_line", lambda d: d.working_f_number_line, "1 / (2 NA) at the image"),
+    Quantity("working_f_number_along_track", lambda d: 0.5 / d.aperture[1], "1 / (2 NA) at the image"),
+    Quantity("field_deg", lambda d: 2.0 * np.array([d.spec.field.x, d.spec.field.y]), "full angles of the field"),
+    Quantity("image_mm", lambda d: np.array(d.image), "length and width of the image of the field"),
+    Quantity(
+        "plate_scale_arcsec_per_mm",
+        lambda d: 3.6 * np.degrees(1.0 / d.focal_length_line),
+        "angle per length on the image, along the line",
+        converted=False,
+    ),
+    Quantity("pixel_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
+    Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.focal_length_line, "angle that a pixel sees"),
+    Quantity("nyquist_per_mm", lambda d: 1e-3 * 0.5 / d.spec.line.pitch, "of the line's pixels", converted=False),
+    Quantity(
+        "cutoff_per_mm",
+        lambda d: 1e-3 / (d.spec.wavelength * d.working_f_number_line),
+        "frequency from which diffraction leaves no contrast along the line",
+        converted=False,
+    ),
+    Quantity(
+        "sampling_lambda_f_per_pixel",
+        lambda d: d.spec.wavelength * d.working_f_number_line / d.spec.line.pitch,
+        "2 where the pixels' Nyquist frequency is the cut-off",
+        converted=False,
+    ),
+    Quantity(
+        "airy_radius_um", lambda d: 1.22 * d.spec.wavelength * 0.5 / d.round_aperture, "first dark ring of a point"
+    ),
+    Quantity(
+        "chief_ray_angle_deg",
+        lambda d: np.array(d.chief_ray_angle),
+        "of chief rays against the image's normal: in the middle, and the largest over the field",
+    ),
+    Quantity("length_m", lambda d: d.length, "along the parent axis between the outermost of mirrors and image"),
+    Quantity("obscuration", lambda d: d.obscuration, "body of the camera -> largest share of a beam that it takes"),
+)
 
 
 def first_order_data(optics: CameraOptics) -> FirstOrderData:
-    """Work them out by tracing the camera as designed. Raises AimError, BeamMissedError."""
+    """Trace what the first-order data of a camera follow from, as designed. Raises AimError, BeamMissedError."""
     model, backend = optics.model, optics.path.backend
-    spec, first = model.spec, model.first_order
+    first = model.first_order
     scale = np.abs(first.scale[0])
-    along, across = float(scale[0, 0]), float(scale[1, 1])
-    corners = [(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)]
-    turn = 2.0 * np.pi * np.arange(_RIM) / _RIM
-    rim = (1.0 - 1e-9) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    rays = optics.rays(corners, np.concatenate([np.zeros((1, 2)), rim]))
-    middle = corners.index((0.0, 0.0))
+    rays = optics.rays(_FIELDS, np.concatenate([np.zeros((1, 2)), rim(_RIM)]))
+    middle = _FIELDS.index((0.0, 0.0))
     cosines = rays.direction[middle, 1:, 1::-1]  # along the line, along the track
     slant = np.arccos(np.clip(np.abs(rays.direction[:, 0, 2]), 0.0, 1.0))
     na_line, na_track = 0.5 * np.ptp(cosines, axis=0)
-    round_beam = float(np.sqrt(solid_angle(cosines) / np.pi))
-    places = rays.position[:, 0, 1::-1]
-    z = [m.z for m in spec.mirrors.values()] + [spec.image.z]
-    distance = float(first.exit_pupil_distance[0])
-    working_line = 0.5 / float(na_line)
+    length, width = np.ptp(rays.position[:, 0, 1::-1], axis=0)
     return FirstOrderData(
-        focal_length_line=along,
-        focal_length_track=across,
+        spec=model.spec,
+        focal_length_line=float(scale[0, 0]),
+        focal_length_track=float(scale[1, 1]),
         focal_length=float(first.focal_length[0]),
-        entrance_pupil=spec.entrance_pupil,
         entrance_pupil_distance=_entrance_pupil(model, optics),
-        exit_pupil=2.0 * abs(distance) * round_beam,
-        exit_pupil_distance=distance,
-        f_number=float(first.focal_length[0]) / spec.entrance_pupil,
-        working_f_number=0.5 / round_beam,
-        working_f_number_line=working_line,
-        working_f_number_track=0.5 / float(na_track),
-        field_line=2.0 * spec.field.x,
-        field_track=2.0 * spec.field.y,
-        image_line=float(np.ptp(places[:, 0])),
-        image_track=float(np.ptp(places[:, 1])),
-        plate_scale=1.0 / along,
-        pixel_angle=spec.line.pitch / along,
+        exit_pupil_distance=float(first.exit_pupil_distance[0]),
+        aperture=(float(na_line), float(na_track)),
+        round_aperture=round_aperture(cosines),
+        image=(float(length), float(width)),
         chief_ray_angle=(float(slant[middle]), float(np.max(slant))),
-        length=float(max(z) - min(z)),
-        pitch=spec.line.pitch,
-        nyquist=optics.nyquist,
-        cutoff=1.0 / (spec.wavelength * working_line),
-        sampling=spec.wavelength * working_line / spec.line.pitch,
-        airy=1.22 * spec.wavelength * 0.5 / round_beam,
-        wavelength=spec.wavelength,
         obscuration=FrozenMap(obscuration(model, backend)),
     )
-
-
-def solid_angle(cosines: np.ndarray) -> float:
-    """Area in direction cosines, (N, 2), of a beam whose edge goes through evenly spread rays: that of the smooth curve
-    through the polygon's corners, which is larger by what a circle is larger than its own.
-    """
-    u, v = cosines.T
-    polygon = 0.5 * abs(float(np.sum(u * np.roll(v, -1) - v * np.roll(u, -1))))
-    step = 2.0 * np.pi / len(u)
-    return polygon * step / np.sin(step)
 
 
 def _entrance_pupil(model: CameraModel, optics: CameraOptics) -> float:

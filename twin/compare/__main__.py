@@ -7,6 +7,7 @@ if __name__ == "__main__":
 
     end_quietly()
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,9 +15,8 @@ import typer
 
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.cli import AsJson, Force, Options, Out, Quiet
-from twin.run.command import Result, print_report, run_command
+from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 
 DIFFERENT = 1
 """Exit code where results differ, as that of diff."""
@@ -59,18 +59,13 @@ def main(
 
     def work(given: None, session: Session) -> Result:
         from twin.compare.compare_report import KIND, PROGRAM, compare, compare_report, numbers
-        from twin.run.page import RunFacts, write_test
 
         comparison = compare(runs, rtol, sigmas)
-        report = compare_report(comparison)
-        found = {**numbers(comparison), "verdict": report.verdict}
+        report = replace(compare_report(comparison), code=0 if comparison.same else DIFFERENT)
         limits = ["--rtol", f"{rtol:g}"] + ([] if sigmas is None else ["--sigmas", f"{sigmas:g}"])
         config = {"runs": [str(run) for run in runs], "rtol": rtol, "sigmas": sigmas}
-        again, times = (PROGRAM, *map(str, runs), *limits), (session.started, session.seconds)
-        facts = RunFacts(dump_yaml(config), "", "", None, *times, PROGRAM, "", again, given=tuple(runs))
-        write_test(KIND, found, report, facts, session.folder)
-        code = 0 if comparison.same else DIFFERENT
-        return Result(described(KIND, found), lambda console: print_report(report, console), code=code)
+        facts = {"config": dump_yaml(config), "again": (PROGRAM, *map(str, runs), *limits), "given": tuple(runs)}
+        return finished(session, KIND, report, numbers(comparison), backend="", program=PROGRAM, **facts)
 
     run_command("compare", Options(out, None, "llvm", force, as_json, quiet), lambda: None, work)
 

@@ -20,16 +20,16 @@ from scenes.specs.procedures import PROCEDURES
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import read_yaml
 from twin.run.cli import AsJson, BackendName, File, Force, Options, Out, Quiet, Seed
-from twin.run.command import run_test
+from twin.run.command import add_test, run_test
 
 PROGRAM = "twin.design"
 
 
-class ByFile(TyperGroup):
+class _ByFile(TyperGroup):
     """A program whose subcommand need not be named: the file says which it is."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As of any group, with the subcommand that may have been left out."""
+        """Parse the arguments with the subcommand that may have been left out."""
         return list(super().parse_args(ctx, self.whole(args)))
 
     def whole(self, args: list[str]) -> list[str]:
@@ -50,11 +50,7 @@ def _is_layout(word: str) -> bool:
 
 
 app = typer.Typer(
-    cls=ByFile,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    no_args_is_help=True,
+    cls=_ByFile, add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
 )
 
 
@@ -69,29 +65,7 @@ def main() -> None:
     """
 
 
-@app.command("camera")
-def camera(
-    file: File,
-    out: Out = None,
-    seed: Seed = None,
-    backend: BackendName = "llvm",
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
-) -> None:
-    """Optimise a camera's prescription: curvatures, conics, aspheric terms and places vary; the wavefront error over
-    the field is made least, with the focal length, the envelope, the anamorphism and free beams as constraints.
-    It is done from several starts (``starts:``), and said whether they agree.
-
-    Example: `python -m twin.design camera scenes/examples/design_gf7_short.yaml`
-
-    The run folder gets the new camera's file in artefacts/,
-    design.json, config.yaml and a report.
-
-    Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
-    """
-    options = Options(out, seed, backend, force, as_json, quiet)
-    run_test(PROGRAM, "camera", PROCEDURES["design camera"], file, options)
+add_test(app, PROGRAM, "camera", PROCEDURES["design camera"])
 
 
 @app.command("monitor")

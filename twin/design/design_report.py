@@ -78,8 +78,8 @@ def design_report(run: DesignRun) -> Report:
         (None, None, None, 1, 1),
     )
     with look("design"):
-        layout = to_svg(layout_figure(found, prescription_of(setup.camera)))
-        errors = to_svg(error_figure(found))
+        layout = to_svg(_layout_figure(found, prescription_of(setup.camera)))
+        errors = to_svg(_error_figure(found))
     sections = (
         Section(
             "Layout",
@@ -134,7 +134,7 @@ def _numbers(before: Evaluation, after: Evaluation) -> list[list[str | float]]:
 _BEFORE, _AFTER = GREY, BLUE
 
 
-def layout_figure(design: Design, start: Prescription) -> Figure:
+def _layout_figure(design: Design, start: Prescription) -> Figure:
     """Beams in the plane of symmetry, before and after, to one scale."""
     figure = new_figure(4.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -171,7 +171,7 @@ def _edges(hits: np.ndarray) -> tuple[int, int]:
     return int(np.argmin(hits[:, 0])), int(np.argmax(hits[:, 0]))
 
 
-def error_figure(design: Design) -> Figure:
+def _error_figure(design: Design) -> Figure:
     """Wavefront error of every field, before and after."""
     figure = new_figure(2.9)
     axes = figure.subplots()

@@ -1,31 +1,26 @@
-"""A camera's prescription optimised with exact Jacobians from several starts: the run and its numbers."""
+"""A camera's prescription optimised with exact Jacobians from several starts: the run, and what design.json says."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from optics.design.design_rays import trace_beams
-from optics.design.merit_function import MeritFunction, Operands
+from optics.design.design_variables import Prescription
+from optics.design.merit_function import Evaluation, MeritFunction, Operands
 from optics.design.optimiser import HELD, ITERATIONS, Design, DesignError, Held, rms_error
 from optics.design.starts import SAME, Attempt, Search, search
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from scenes.models.camera_design import (
-    CameraDesignSetup,
-    beams_of,
-    camera_file,
-    camera_of,
-    operands_of,
-    prescription_of,
-    variables_of,
-)
+from scenes.models import camera_design
 from scenes.models.camera_model import derive_camera
 from scenes.models.camera_sharpness import BLURRED
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.quantity import Quantity, Record
 
 REMARK = """Prescription frame: z along the parent axis, light enters toward +z, y in the plane of symmetry, x along the
 line CCD. Made by python -m twin.design from {start}: least squares of the wavefront error over the field."""
@@ -50,7 +45,7 @@ class DesignRun:
         warnings: what its user should know.
     """
 
-    setup: CameraDesignSetup
+    setup: camera_design.CameraDesignSetup
     searched: Search
     text: str
     warnings: tuple[str, ...] = ()
@@ -61,7 +56,9 @@ class DesignRun:
         return self.searched.best
 
 
-def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent) -> DesignRun:
+def run_design(
+    setup: camera_design.CameraDesignSetup, backend: Backend, seed: int = 0, advance: Advance = silent
+) -> DesignRun:
     """Optimise the camera; the seed is that of the starts that are drawn.
 
     Raises:
@@ -69,18 +66,18 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         BenchError: the constraints cannot be held.
     """
     test, camera = setup.test, setup.camera
-    start, beams = prescription_of(camera), beams_of(camera)
+    start, beams = camera_design.prescription_of(camera), camera_design.beams_of(camera)
     try:
         first = MeritFunction.of(backend, start, beams, Operands(camera.wavelength)).evaluate(start)
     except (AimError, BeamMissedError) as error:
         problem = f"no beams to design with come through: {str(error).partition(';')[0]}"
         raise camera.error(problem, ("mirrors",), allowed="a camera whose whole field gets light") from error
-    operands = operands_of(setup, first.principal_distance, first.envelope)
+    operands = camera_design.operands_of(setup, first.principal_distance, first.envelope)
     try:
         searched = search(
             backend,
             start,
-            variables_of(test),
+            camera_design.variables_of(test),
             beams,
             operands,
             test.steps,
@@ -98,7 +95,7 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         remark += (
             f"\nIts extent along z is {100 * found.after.envelope / found.before.envelope:.2f} % of {camera.name}'s."
         )
-    spec = camera_of(camera, found.prescription, test.name, test.description)
+    spec = camera_design.camera_of(camera, found.prescription, test.name, test.description)
     derive_camera(spec, backend)  # it can be used as a camera
     warnings = []
     worst = float(found.after.errors.max())
@@ -107,60 +104,68 @@ def run_design(setup: CameraDesignSetup, backend: Backend, seed: int = 0, advanc
         warnings.append(f"camera {spec.name} is blurred: {told}")
     if not found.converged:
         warnings.append(f"the search for {spec.name} was still getting better when it ended, after {ITERATIONS} steps")
-    return DesignRun(setup, searched, camera_file(spec, remark), tuple(warnings))
+    return DesignRun(setup, searched, spec.file_text(remark), tuple(warnings))
 
 
-def design_numbers(run: DesignRun) -> dict[str, Any]:
-    """Contents of design.json without its frames."""
-    found, setup = run.found, run.setup
-    before, after = found.before, found.after
-    return {
-        "camera": setup.test.name,
-        "start": setup.camera.name,
-        "wavefront_error_waves": {"before": before.errors.tolist(), "after": after.errors.tolist()},
-        "fields_deg": np.degrees(found.merit.beams.fields).tolist(),
-        "principal_distance_m": {"before": before.principal_distance, "after": after.principal_distance},
-        "envelope_m": {"before": before.envelope, "after": after.envelope},
-        "anamorphism": {"before": before.anamorphism, "after": after.anamorphism},
-        "chief_ray_deg": {"before": _chief_rays(found, False), "after": _chief_rays(found, True)},
-        "clearance_m": {"before": before.clearances.tolist(), "after": after.clearances.tolist()},
-        "improved": found.improved,
-        "held_by": [
-            {
-                "constraint": held.name,
-                "limit_m": held.limit,
-                "broken_at_start_m": max(held.start, 0.0),
-                "worth_waves_per_mm": 1e-3 * held.worth,
-            }
-            for held in found.held
-        ],
-        "jacobians": found.evaluations,
-        "converged": found.converged,
-        "starts": [_start(attempt) for attempt in run.searched.attempts],
-        "starts_at_best": run.searched.agreeing,
-        "local_optimum": run.searched.local,
-    }
+def _known(of: Callable[[Design], Any]) -> Callable[[Attempt], Any]:
+    """What gives a number of the camera that a start came to, None where it came to none."""
+    return lambda attempt: None if attempt.design is None else of(attempt.design)
 
 
-def _start(attempt: Attempt) -> dict[str, Any]:
-    """One start and what came of it."""
-    found = attempt.design
-    return {
-        "drawn": attempt.drawn,
-        "steps": attempt.steps,
-        "wavefront_error_waves": None if found is None else rms_error(found.after),
-        "worst_field_waves": None if found is None else float(found.after.errors.max()),
-        "converged": found is not None and found.converged,
-        "jacobians": None if found is None else found.evaluations,
-        "problem": attempt.problem,
-    }
+def _pair(of: Callable[[Evaluation], Any]) -> Callable[[DesignRun], Any]:
+    """What gives a number of the camera before and after."""
+    return lambda run: {"before": of(run.found.before), "after": of(run.found.after)}
 
 
-def _chief_rays(found: Design, after: bool) -> list[float]:
-    """Angles of the fields' chief rays from the normal of the focal plane, degrees."""
-    prescription = found.prescription if after else found.begun
-    direction = trace_beams(found.merit.backend, prescription, found.merit.beams).direction[:, 0]
-    return np.degrees(np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), np.abs(direction[:, 2]))).tolist()
+def _chief_rays(run: DesignRun) -> dict[str, np.ndarray]:
+    """Angles of the fields' chief rays from the normal of the focal plane, radians, before and after."""
+    found, merit = run.found, run.found.merit
+
+    def angles(prescription: Prescription) -> np.ndarray:
+        direction = trace_beams(merit.backend, prescription, merit.beams).direction[:, 0]
+        return np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), np.abs(direction[:, 2]))
+
+    return {"before": angles(found.begun), "after": angles(found.prescription)}
+
+
+HELD_BY: Record[Held] = Record(
+    "A constraint that keeps the camera from becoming better.",
+    Quantity("constraint", lambda held: held.name, "its name"),
+    Quantity("limit_m", lambda held: held.limit, "its limit; of the anamorphism a pure number"),
+    Quantity("broken_at_start_m", lambda held: max(held.start, 0.0), "by how much the start breaks it"),
+    Quantity(
+        "worth_waves_per_mm", lambda held: 1e-3 * held.worth, "fall of the error when it is eased", converted=False
+    ),
+)
+START: Record[Attempt] = Record(
+    "One start of the search and what came of it.",
+    Quantity("drawn", lambda attempt: attempt.drawn, "whether it was drawn at random"),
+    Quantity("steps", lambda attempt: attempt.steps, "steps in which the constraints were brought in"),
+    Quantity("wavefront_error_waves", _known(lambda found: rms_error(found.after)), "rms over the field"),
+    Quantity("worst_field_waves", _known(lambda found: found.after.errors.max()), "rms in the worst field"),
+    Quantity("converged", lambda a: a.design is not None and a.design.converged, "whether the search settled"),
+    Quantity("jacobians", _known(lambda found: found.evaluations), "Jacobians that were traced"),
+    Quantity("problem", lambda attempt: attempt.problem, "why the constraints cannot be held, empty where they can"),
+)
+DESIGN: Record[DesignRun] = Record(
+    "design.json: an optimised camera, before and after.",
+    Quantity("camera", lambda run: run.setup.test.name, "name of the new camera"),
+    Quantity("start", lambda run: run.setup.camera.name, "name of the camera that it was made from"),
+    Quantity("wavefront_error_waves", _pair(lambda one: one.errors), "of every field, rms, without piston and tilt"),
+    Quantity("fields_deg", lambda run: run.found.merit.beams.fields, "the fields, x and y"),
+    Quantity("principal_distance_m", _pair(lambda one: one.principal_distance), "principal distance"),
+    Quantity("envelope_m", _pair(lambda one: one.envelope), "extent along the axis"),
+    Quantity("anamorphism", _pair(lambda one: one.anamorphism), "focal length along the line over that across it"),
+    Quantity("chief_ray_deg", _chief_rays, "angle of the chief ray from the normal of the focal plane, by field"),
+    Quantity("clearance_m", _pair(lambda one: one.clearances), "room between beams and edges, by passage"),
+    Quantity("improved", lambda run: run.found.improved, "whether the new camera is better"),
+    Quantity("held_by", lambda run: run.found.held, "what keeps it from more, the dearest first", record=HELD_BY),
+    Quantity("jacobians", lambda run: run.found.evaluations, "Jacobians that were traced for the best"),
+    Quantity("converged", lambda run: run.found.converged, "whether the best search settled"),
+    Quantity("starts", lambda run: run.searched.attempts, "what came of every start", record=START),
+    Quantity("starts_at_best", lambda run: run.searched.agreeing, "starts that end within a share of the best"),
+    Quantity("local_optimum", lambda run: run.searched.local, "whether starts end at different cameras"),
+)
 
 
 def agreement(run: DesignRun) -> str:

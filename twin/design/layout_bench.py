@@ -19,20 +19,10 @@ from optics.numerics.backend import Backend, load_backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
+from scenes.models import monitor_layout
 from scenes.models.clearance import LEAST_GAP, convex_bodies, separation
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
-from scenes.models.monitor_layout import (
-    AS_STARTED,
-    RAYS,
-    Beam,
-    ImagingBeams,
-    Layout,
-    MonitorDesignSetup,
-    layout_spec,
-    prism_mass,
-    pupil_share,
-)
 from scenes.models.obstruction import monitor_beams, rays_taken
 from scenes.specs.instrument import CENTRAL_PRISM, SIDES, prism_of
 from scenes.yaml.errors import InputError
@@ -81,7 +71,7 @@ class BeamFacts:
         light: rays of its beams in front of the cameras, segments (N, K, 2, 3), metres.
     """
 
-    beam: Beam
+    beam: monitor_layout.Beam
     refused: str = ""
     seen: Mapping[str, Seen] = field(default_factory=FrozenMap)
     taken: np.ndarray = field(default_factory=lambda: np.zeros(0, np.uint8))
@@ -92,7 +82,7 @@ class BeamFacts:
 
     @cached_property
     def planes(self) -> list[np.ndarray]:
-        """Of the faces of its prisms, (F, 4) each."""
+        """Planes of the faces of each of its prisms, (F, 4) each."""
         return [ConvexHull(corners).equations for corners in self.bodies]
 
 
@@ -114,7 +104,7 @@ class LayoutFacts:
         brightest: how full every spot's brightest pixel is, (C,).
     """
 
-    beams: Layout
+    beams: monitor_layout.Layout
     refused: str = ""
     sigmas: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
     before: Mapping[str, Mapping[str, float]] = field(default_factory=FrozenMap)
@@ -135,7 +125,7 @@ class LayoutBench:
         backend: where to trace.
     """
 
-    def __init__(self, setup: MonitorDesignSetup, backend: Backend) -> None:
+    def __init__(self, setup: monitor_layout.MonitorDesignSetup, backend: Backend) -> None:
         self.setup, self.backend = setup, backend
 
     @cached_property
@@ -144,22 +134,22 @@ class LayoutBench:
         return build_instrument(self.setup.instrument, self.setup.cameras, self.backend)
 
     @cached_property
-    def imaging(self) -> ImagingBeams:
-        """Of the cameras, which all layouts have."""
-        return ImagingBeams.of(self.start, self.backend)
+    def imaging(self) -> monitor_layout.ImagingBeams:
+        """Imaging beams of the cameras, which all layouts have."""
+        return monitor_layout.ImagingBeams.of(self.start, self.backend)
 
     @property
     def imaging_shape(self) -> tuple[int, int, int]:
-        """Of the bits that ``BeamFacts.taken`` packs."""
-        return len(self.setup.instrument.cameras), 3, RAYS
+        """Shape of the bits that ``BeamFacts.taken`` packs."""
+        return len(self.setup.instrument.cameras), 3, monitor_layout.RAYS
 
     @cached_property
     def rows(self) -> dict[str, np.ndarray]:
         """Quantity -> rows on the parameters; the same in all layouts, which leave the cameras as they are."""
         return quantity_rows(self.start, ground_of(self.start))
 
-    def detector(self, name: str = AS_STARTED) -> EmvaDetector:
-        """Of the area CCD that a beam names."""
+    def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
+        """Detector of the area CCD that a beam names."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
         return EmvaDetector.from_sheet(sheet, self.setup.instrument.monitor.area_ccd.exposure)
 
@@ -167,23 +157,25 @@ class LayoutBench:
         """Quantities of which a goal's value is the worst: ``d_f`` of every camera."""
         return tuple(key for key in self.rows if key == name or key.endswith(f"/{name}"))
 
-    def boards_apart(self, one: Beam, other: Beam) -> bool:
+    def boards_apart(self, one: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
         """Whether the area CCDs of two beams have room beside each other at an end of every line."""
-        ccd = layout_spec(self.setup, (one,)).monitor.area_ccd
+        ccd = monitor_layout.layout_spec(self.setup, (one,)).monitor.area_ccd
         return all(
             abs(camera.line_focal_length * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
             for camera in self.start.cameras.values()
         )
 
-    def try_beam(self, beam: Beam) -> BeamFacts:
+    def try_beam(self, beam: monitor_layout.Beam) -> BeamFacts:
         """A beam alone."""
         try:
-            instrument = build_instrument(layout_spec(self.setup, (beam,)), self.setup.cameras, self.backend)
-            taken, mass = self.imaging.taken(instrument), prism_mass(instrument)
-            self._check_limits(pupil_share(taken), mass)
+            instrument = build_instrument(
+                monitor_layout.layout_spec(self.setup, (beam,)), self.setup.cameras, self.backend
+            )
+            taken, mass = self.imaging.taken(instrument), monitor_layout.prism_mass(instrument)
+            self._check_limits(monitor_layout.pupil_share(taken), mass)
             information = self.information(instrument, beam, alike=True)
             self._check_spots(information, instrument)
-        except (InputError, AimError, BeamMissedError, OutsideLimitsError, ValueError) as error:
+        except (InputError, AimError, BeamMissedError, _OutsideLimitsError, ValueError) as error:
             return BeamFacts(beam, refused=_reason(error))
         bodies = convex_bodies(instrument)
         return BeamFacts(
@@ -196,15 +188,17 @@ class LayoutBench:
             light=_light(instrument, self.backend),
         )
 
-    def try_layout(self, beams: Layout) -> LayoutFacts:
+    def try_layout(self, beams: monitor_layout.Layout) -> LayoutFacts:
         """A layout as a whole."""
         try:
-            instrument = build_instrument(layout_spec(self.setup, beams), self.setup.cameras, self.backend)
+            instrument = build_instrument(
+                monitor_layout.layout_spec(self.setup, beams), self.setup.cameras, self.backend
+            )
             return self.judged(beams, instrument)
-        except (InputError, AimError, BeamMissedError, OutsideLimitsError, ValueError) as error:
+        except (InputError, AimError, BeamMissedError, _OutsideLimitsError, ValueError) as error:
             return LayoutFacts(beams, refused=_reason(error))
 
-    def judged(self, beams: Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
+    def judged(self, beams: monitor_layout.Layout, instrument: Instrument, limited: bool = True) -> LayoutFacts:
         """What an instrument is worth as a layout.
 
         Args:
@@ -214,9 +208,9 @@ class LayoutBench:
 
         Raises:
             BeamMissedError, AimError: light does not come to its area CCDs.
-            OutsideLimitsError: it does not keep a limit.
+            _OutsideLimitsError: it does not keep a limit.
         """
-        share, mass = pupil_share(self.imaging.taken(instrument)), prism_mass(instrument)
+        share, mass = monitor_layout.pupil_share(self.imaging.taken(instrument)), monitor_layout.prism_mass(instrument)
         if limited:
             self._check_limits(share, mass)
         information = self.information(instrument, beams[0])
@@ -237,7 +231,7 @@ class LayoutBench:
         )
 
     def information(
-        self, instrument: Instrument, beam: Beam, alike: bool = False, single: bool = True
+        self, instrument: Instrument, beam: monitor_layout.Beam, alike: bool = False, single: bool = True
     ) -> dict[str, Information]:
         """What an instrument's spots know, by the names of the disturbances.
 
@@ -262,22 +256,22 @@ class LayoutBench:
     def _check_limits(self, share: float, mass: float) -> None:
         limits = self.setup.test.limits
         if limits.pupil_share is not None and share > limits.pupil_share:
-            raise OutsideLimitsError(f"its prisms take {100.0 * share:.3g} percent of the imaging pupil")
+            raise _OutsideLimitsError(f"its prisms take {100.0 * share:.3g} percent of the imaging pupil")
         if limits.mass is not None and mass > limits.mass:
-            raise OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
+            raise _OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
 
     def _check_spots(self, information: Mapping[str, Information], instrument: Instrument) -> None:
         ccd = instrument.spec.monitor.area_ccd
         room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
         reach = self.setup.test.limits.spot_sigmas * max(float(one.spot_sigma.max()) for one in information.values())
         if reach > room:
-            raise OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
+            raise _OutsideLimitsError(f"its spots leave their area CCDs: {reach:.3g} px of {room:.3g} px")
         fullest = max(float(one.brightest.max()) for one in information.values())
         if fullest > FULLEST:
-            raise OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
+            raise _OutsideLimitsError(f"its spots are too bright: pixels are filled to {100.0 * fullest:.3g} percent")
 
 
-class OutsideLimitsError(Exception):
+class _OutsideLimitsError(Exception):
     """A layout does not keep a limit of its design."""
 
 
@@ -298,11 +292,7 @@ def _seen(information: Information) -> Seen:
     own = np.array([is_own(body) for body in stated.bodies])
     root = stated.root[np.ix_(~own, ~own)]
     mine = stated.spots[:, own] @ stated.root[np.ix_(own, own)]
-    return Seen(
-        stated.spots[:, ~own] @ root,
-        mine @ mine.T + information.noise,
-        stated.parameters[:, ~own] @ root,
-    )
+    return Seen(stated.spots[:, ~own] @ root, mine @ mine.T + information.noise, stated.parameters[:, ~own] @ root)
 
 
 def _light(instrument: Instrument, backend: Backend) -> np.ndarray:
@@ -330,6 +320,10 @@ def _facets(instrument: Instrument) -> np.ndarray:
 def touching(one: BeamFacts, other: BeamFacts) -> bool:
     """Whether two beams cannot stand together: prisms stand in each other or in the other's light, or one's facet
     reaches over the edge of the other's.
+
+    Args:
+        one: a beam that was tried alone.
+        other: another one.
     """
     # as scenes.models.monitor_chain.facet_places: of two in one corner the one that leans more stands farther out
     away = one.facets - other.facets
@@ -375,4 +369,4 @@ def bench_of(config: str, backend: str) -> LayoutBench:
         config: text of the design's config.yaml.
         backend: where to trace.
     """
-    return LayoutBench(validate(MonitorDesignSetup, parse_yaml(config)), load_backend(backend))
+    return LayoutBench(validate(monitor_layout.MonitorDesignSetup, parse_yaml(config)), load_backend(backend))

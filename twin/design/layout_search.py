@@ -8,6 +8,7 @@ so the same seed finds the same, however many workers there are and wherever it 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, zip_longest
@@ -22,7 +23,7 @@ from twin.design.search_workers import Journal, Workers
 from twin.run.procedure import Advance
 
 FIRST_STEP = 0.15
-"""Of the first change of a beam, relative to the range of each number."""
+"""Size of the first change of a beam, relative to the range of each number."""
 _BATCHES = 4  # of layouts that are built until one stands
 KEPT = 2
 """Layouts of each number of beams whose beams the next round changes."""
@@ -89,11 +90,10 @@ class Found:
     @property
     def refused(self) -> dict[str, int]:
         """Why others cannot stand, with how many."""
-        out: dict[str, int] = {}
+        out: Counter[str] = Counter()
         for end in self.ends:
-            for reason, count in end.refused.items():
-                out[reason] = out.get(reason, 0) + count
-        return out
+            out.update(end.refused)
+        return dict(out)
 
     @property
     def beams(self) -> int:
@@ -213,7 +213,7 @@ class _OneSearch:
         self.built: dict[tuple[int, ...], LayoutFacts] = {}
         self.compared: dict[tuple[int, ...], float] = {}
         self.apart: dict[tuple[int, int], bool] = {}
-        self.refused: dict[str, int] = {}
+        self.refused: Counter[str] = Counter()
 
     def run(self, beams: Sequence[Beam]) -> End:
         """Search from these beams, and from as many more at random as the design asks for."""
@@ -248,7 +248,7 @@ class _OneSearch:
             len(self.pool),
             len(self.compared),
             len(self.built),
-            self.refused,
+            dict(self.refused),
         )
 
     def _part(self, words: str) -> str:
@@ -377,5 +377,4 @@ class _OneSearch:
     def _refuse(self, reason: str) -> None:
         # names and numbers differ from one to the next
         words = ["…" if any(c.isdigit() or c == "/" for c in word) else word for word in reason.split(":")[0].split()]
-        kind = " ".join(words)
-        self.refused[kind] = self.refused.get(kind, 0) + 1
+        self.refused[" ".join(words)] += 1

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from math import degrees, sqrt
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import sqrt
 from pathlib import Path
 from typing import Any
 
 from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
-from scenes.models.monitor_layout import (
-    Beam,
-    MonitorDesignSetup,
-    instrument_file,
-    layout_spec,
-)
+from scenes.models import monitor_layout
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.instrument import InstrumentSpec, channel_of, prism_of
 from scenes.specs.job import JobSpec
@@ -24,6 +20,7 @@ from twin.design.layout_search import Found, Search, merit, optima
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.stray_light import GHOSTS, Ghost, ghosts, stray_light
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.quantity import Quantity, Record
 
 MOST_POINTS = 6
 """Layouts that are drawn and written, at most."""
@@ -61,7 +58,7 @@ class MonitorDesignRun:
         points: on the front of merit, pupil share and mass, the best first; empty where none is as good as the start.
     """
 
-    setup: MonitorDesignSetup
+    setup: monitor_layout.MonitorDesignSetup
     bench: LayoutBench
     found: Found
     points: tuple[Point, ...]
@@ -76,7 +73,7 @@ class MonitorDesignRun:
 
 
 def run_monitor_design(
-    setup: MonitorDesignSetup,
+    setup: monitor_layout.MonitorDesignSetup,
     backend: Backend,
     seed: int = 0,
     advance: Advance = silent,
@@ -113,14 +110,14 @@ def run_monitor_design(
     points = []
     for k, facts in enumerate(clean):
         name = setup.test.name if k == 0 else f"{setup.test.name}_{chr(ord('a') + k)}"
-        spec = layout_spec(setup, facts.beams).model_copy(update={"name": name})
+        spec = monitor_layout.layout_spec(setup, facts.beams).model_copy(update={"name": name})
         lines = [f"{GOAL_NAMES[goal]} {text}" for goal, text in _texts(facts, bench).items()]
         remark = REMARK.format(start=setup.instrument.name, sigmas="; ".join(lines))
-        points.append(Point(name, facts, instrument_file(spec, remark)))
+        points.append(Point(name, facts, spec.file_text(remark)))
     return MonitorDesignRun(setup, bench, found, tuple(points))
 
 
-def _check_start(setup: MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
+def _check_start(setup: monitor_layout.MonitorDesignSetup, backend: Backend, seed: int, advance: Advance) -> None:
     """Refuse a start with ghosts, where they are to be traced: every layout has its prisms' tilts.
 
     Raises:
@@ -135,15 +132,15 @@ def _check_start(setup: MonitorDesignSetup, backend: Backend, seed: int, advance
 
 
 def _ghosts(
-    setup: MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
+    setup: monitor_layout.MonitorDesignSetup, facts: LayoutFacts, backend: Backend, seed: int, advance: Advance
 ) -> tuple[Ghost, ...]:
     """A layout's ghosts; none where they are not to be traced."""
     detector = setup.detectors.get(facts.beams[0].area_ccd, setup.detector)
-    return _traced_ghosts(setup, layout_spec(setup, facts.beams), detector, backend, seed, advance)
+    return _traced_ghosts(setup, monitor_layout.layout_spec(setup, facts.beams), detector, backend, seed, advance)
 
 
 def _traced_ghosts(
-    setup: MonitorDesignSetup,
+    setup: monitor_layout.MonitorDesignSetup,
     spec: InstrumentSpec,
     detector: DetectorSpec,
     backend: Backend,
@@ -202,14 +199,14 @@ def verdict(run: MonitorDesignRun) -> str:
     count = f"{len(best.beams)} beam{'s' if len(best.beams) > 1 else ''} at each end of a line"
     cost = f"{100.0 * best.pupil_share:.3g} % of the pupil ({100.0 * start.pupil_share:.3g} %)"
     mass = f"{best.mass:.3g} kg of prisms ({start.mass:.3g} kg)"
-    cause, share = limiting(run, best)
+    cause, share = _limiting(run, best)
     return (
         f"{test.name} {head} with {count}: {', '.join(parts)}, for {cost} and {mass}, and what is left is for "
         f"{100.0 * share:.0f} % {cause.replace('_', ' ')}: see the causes and the front."
     )
 
 
-def limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
+def _limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
     """The cause that is most of the variance of the goal that is farthest from being reached, and its share."""
     wanted = run.setup.test.goal.wanted
     cases = [
@@ -224,90 +221,105 @@ def limiting(run: MonitorDesignRun, facts: LayoutFacts) -> tuple[str, float]:
     return cause, shares[cause] / sum(shares.values())
 
 
-def beam_numbers(beam: Beam) -> dict[str, Any]:
-    """A beam as plain data with units in the keys."""
-    out: dict[str, Any] = {}
-    for item in fields(beam):
-        value = getattr(beam, item.name)
-        if item.name in ("prisms", "area_ccd"):
-            out[item.name] = value
-        elif item.name == "field":
-            out["field_deg"] = degrees(value)
-        elif item.name == "photons":
-            out["photons"] = value
-        else:
-            out[f"{item.name}_mm"] = 1e3 * value
-    return out
-
-
-def layout_numbers(run: MonitorDesignRun, facts: LayoutFacts) -> dict[str, Any]:
-    """A layout as plain data with units in the keys."""
-
-    def told(values: Any) -> dict[str, Any]:
-        out: dict[str, Any] = {}
-        for name, own in values.items():
-            out[name] = {}
-            for key, value in own.items():
-                unit, size = _unit(key)
-                out[name][f"{key.replace('/', '_')}_{unit}"] = value / size
-        return out
-
-    def split(values: Any) -> dict[str, Any]:
-        out: dict[str, Any] = {}
-        for name, own in values.items():
-            out[name] = {}
-            for key, causes in own.items():
-                unit, size = _unit(key)
-                rms = {cause: sqrt(max(share, 0.0)) / size for cause, share in causes.items()}
-                out[name][f"{key.replace('/', '_')}_{unit}"] = rms
-        return out
-
-    return {
-        "beams": [beam_numbers(beam) for beam in facts.beams],
-        "merit": run.merit(facts),
-        "sigma": told(facts.sigmas),
-        "sigma_unmeasured": told(facts.before),
-        "by_cause": split(facts.shares),
-        "by_cause_unmeasured": split(facts.shares_before),
-        "pupil_share": facts.pupil_share,
-        "mass_kg": facts.mass,
-        "glass_path_mm": 1e3 * facts.glass_path,
-        "spot_sigma_px": facts.spot_sigma,
-    }
-
-
 def _unit(key: str) -> tuple[str, float]:
-    name = key.rpartition("/")[2]
-    return UNITS.get(name, UNITS["angle"])
+    return UNITS.get(key.rpartition("/")[2], UNITS["angle"])
 
 
-def monitor_design_numbers(run: MonitorDesignRun) -> dict[str, Any]:
-    """Contents of layouts.json without its frames."""
-    found, test = run.found, run.setup.test
-    goals = {f"{goal}_{UNITS[goal][0]}": value / UNITS[goal][1] for goal, value in test.goal.wanted.items()}
+def _by_quantity(values: Mapping[str, Mapping[str, Any]], of: Callable[[Any, float], Any]) -> dict[str, Any]:
+    """Disturbances -> quantity with its unit at the end -> what ``of`` makes of a value and of the unit's size."""
     return {
-        "instrument": run.setup.instrument.name,
-        "goal": goals,
-        "start": layout_numbers(run, found.start),
-        "layouts": {point.name: layout_numbers(run, point.facts) for point in run.points},
-        "search": {
-            "beams_tried": found.beams,
-            "beams_standing": found.standing,
-            "layouts_compared": found.compared,
-            "layouts_built": found.built,
-            "layouts_standing": len(found.layouts),
-            "refused": dict(found.refused),
-        },
-        "ends": {
-            end.name: {
-                "merit_by_round": list(end.progress),
-                "merit_by_refinement": list(end.refined),
-                "best": layout_numbers(run, end.layouts[0]) if end.layouts else None,
-            }
-            for end in found.ends
-        },
-        "optima": [[end.name for end in group] for group in optima(found, run.bench)],
+        name: {f"{key.replace('/', '_')}_{_unit(key)[0]}": of(value, _unit(key)[1]) for key, value in own.items()}
+        for name, own in values.items()
     }
 
 
-__all__ = ["MonitorDesignRun", "monitor_design_numbers", "run_monitor_design", "verdict"]
+def _sigmas(values: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
+    return _by_quantity(values, lambda value, size: value / size)
+
+
+def _causes(values: Mapping[str, Mapping[str, Mapping[str, float]]]) -> dict[str, Any]:
+    def rms(causes: Mapping[str, float], size: float) -> dict[str, float]:
+        return {cause: sqrt(max(share, 0.0)) / size for cause, share in causes.items()}
+
+    return _by_quantity(values, rms)
+
+
+BEAM: Record[monitor_layout.Beam] = Record(
+    "One beam of a layout, at both ends of both cameras' lines.",
+    Quantity("pupil_x_mm", lambda beam: beam.pupil_x, "middle in the entrance pupil, toward the central prism"),
+    Quantity("pupil_y_mm", lambda beam: beam.pupil_y, "and toward the beam's own end of the line"),
+    Quantity("width_mm", lambda beam: beam.width, "diameter of its return face"),
+    Quantity("field_deg", lambda beam: beam.field, "angle of its area CCD from the visual axis"),
+    Quantity("prism_180_distance_mm", lambda beam: beam.prism_180_distance, "from the camera's origin"),
+    Quantity("prism_0_distance_mm", lambda beam: beam.prism_0_distance, "from the return face of the 180 deg prism"),
+    Quantity("shift_mm", lambda beam: beam.shift, "of its rhomboid"),
+    Quantity("spread_x_mm", lambda beam: beam.spread_x, "of its facet from the apex, along the base's X"),
+    Quantity("spread_y_mm", lambda beam: beam.spread_y, "and along its Y"),
+    Quantity("prisms", lambda beam: beam.prisms, "their name in the design"),
+    Quantity("photons", lambda beam: beam.photons, "of its spot, per frame; None for the monitor's"),
+    Quantity("area_ccd", lambda beam: beam.area_ccd, "its name in the design"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A layout, or where a search came to, with the run that says what is wanted."""
+
+    run: MonitorDesignRun
+    of: Any
+
+
+LAYOUT: Record[_Part] = Record(
+    "What a layout leaves, one standard deviation, and what it takes.",
+    Quantity("beams", lambda one: one.of.beams, "of every end of a line", record=BEAM),
+    Quantity("merit", lambda one: one.run.merit(one.of), "largest ratio of what is left to what is wanted"),
+    Quantity("sigma", lambda one: _sigmas(one.of.sigmas), "by disturbances and quantity"),
+    Quantity("sigma_unmeasured", lambda one: _sigmas(one.of.before), "without any measurement"),
+    Quantity("by_cause", lambda one: _causes(one.of.shares), "standard deviations by cause; their squares add up"),
+    Quantity("by_cause_unmeasured", lambda one: _causes(one.of.shares_before), "without any measurement"),
+    Quantity("pupil_share", lambda one: one.of.pupil_share, "share of the imaging pupil that the prisms take"),
+    Quantity("mass_kg", lambda one: one.of.mass, "of the prisms"),
+    Quantity("glass_path_mm", lambda one: one.of.glass_path, "longest way of a beam in glass, one way"),
+    Quantity("spot_sigma_px", lambda one: one.of.spot_sigma, "largest standard deviation of a spot's place"),
+)
+SEARCH: Record[Found] = Record(
+    "How much was tried.",
+    Quantity("beams_tried", lambda found: found.beams, "beams that were tried alone"),
+    Quantity("beams_standing", lambda found: found.standing, "of these, that can stand"),
+    Quantity("layouts_compared", lambda found: found.compared, "combinations whose merit was worked out"),
+    Quantity("layouts_built", lambda found: found.built, "of these, built as a whole"),
+    Quantity("layouts_standing", lambda found: len(found.layouts), "of these, that can stand"),
+    Quantity("refused", lambda found: found.refused, "why others cannot stand, with how many"),
+)
+
+
+def _best(end: _Part) -> _Part | None:
+    return _Part(end.run, end.of.layouts[0]) if end.of.layouts else None
+
+
+END: Record[_Part] = Record(
+    "Where one search came to.",
+    Quantity("merit_by_round", lambda end: end.of.progress, "best merit after the first draw and after each round"),
+    Quantity("merit_by_refinement", lambda end: end.of.refined, "merits on the way by gradients"),
+    Quantity("best", _best, "its best layout, None where it found none that stands", record=LAYOUT),
+)
+
+
+def _goals(run: MonitorDesignRun) -> dict[str, float]:
+    return {f"{goal}_{UNITS[goal][0]}": value / UNITS[goal][1] for goal, value in run.setup.test.goal.wanted.items()}
+
+
+LAYOUTS: Record[MonitorDesignRun] = Record(
+    "layouts.json: a search for the layout of a monitor.",
+    Quantity("instrument", lambda run: run.setup.instrument.name, "that it starts from"),
+    Quantity("goal", _goals, "standard deviations that are wanted"),
+    Quantity("start", lambda run: _Part(run, run.found.start), "the layout of that instrument", record=LAYOUT),
+    Quantity("layouts", lambda run: {p.name: _Part(run, p.facts) for p in run.points}, "on the front", record=LAYOUT),
+    Quantity("search", lambda run: run.found, "how much was tried", record=SEARCH),
+    Quantity("ends", lambda run: {e.name: _Part(run, e) for e in run.found.ends}, "of every search", record=END),
+    Quantity(
+        "optima",
+        lambda run: [[end.name for end in group] for group in optima(run.found, run.bench)],
+        "searches that end with the same merit, within 2 %, the best group first",
+    ),
+)

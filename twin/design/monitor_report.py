@@ -19,7 +19,7 @@ from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
 from twin.run.report import Report, Section
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 
 _MOST_CAUSES = 6
 
@@ -46,9 +46,9 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     summary = Table("layouts", "The start and the layouts on the front", caption, heads, rows, decimals)
     best = run.points[0]
     with look("layouts"):
-        front = SvgFigure("front", "What a smaller sigma costs", _FRONT, to_svg(front_figure(run)))
-        causes = SvgFigure("causes", "What limits them", _CAUSES, to_svg(cause_figure(run)))
-        pupils = SvgFigure("pupils", "Beams in the entrance pupil", _PUPILS, to_svg(pupil_figure(run)))
+        front = SvgFigure("front", "What a smaller sigma costs", _FRONT, to_svg(_front_figure(run)))
+        causes = SvgFigure("causes", "What limits them", _CAUSES, to_svg(_cause_figure(run)))
+        pupils = SvgFigure("pupils", "Beams in the entrance pupil", _PUPILS, to_svg(_pupil_figure(run)))
     drawings = tuple(_drawing(run, point) for point in run.points[:2])
     sections = (
         Section("The front", (_search_text(run),), (front, _beams_table(run))),
@@ -179,7 +179,7 @@ def _cause_table(run: MonitorDesignRun, name: str) -> Table:
     return Table(f"causes-{name.lower()}".replace("/", "-").replace(".", "-"), title, "σ.", tuple(heads), rows, places)
 
 
-def front_figure(run: MonitorDesignRun) -> Figure:
+def _front_figure(run: MonitorDesignRun) -> Figure:
     """Layouts: sigma against pupil share, and against mass."""
     figure = new_figure(3.6)
     left, right = figure.subplots(1, 2, sharey=True)
@@ -209,7 +209,7 @@ def front_figure(run: MonitorDesignRun) -> Figure:
     return figure
 
 
-def cause_figure(run: MonitorDesignRun) -> Figure:
+def _cause_figure(run: MonitorDesignRun) -> Figure:
     """Standard deviations by cause: unmeasured, start, best; a panel for each goal, of the worst disturbances."""
     goals = tuple(run.setup.test.goal.wanted)
     figure = new_figure(3.4)
@@ -245,7 +245,7 @@ def _cause_bars(axes: Axes, run: MonitorDesignRun, goal: str) -> None:
     plain_axes(axes)
 
 
-def pupil_figure(run: MonitorDesignRun) -> Figure:
+def _pupil_figure(run: MonitorDesignRun) -> Figure:
     """Where the beams of the start and of each layout go through the entrance pupil."""
     shown = _named(run)[:4]
     figure = new_figure(3.0)

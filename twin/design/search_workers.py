@@ -12,7 +12,6 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -21,11 +20,8 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import LIMIT, one_blas_thread
 from scenes.models.monitor_layout import Beam
 from twin.design.layout_bench import BeamFacts, LayoutBench, LayoutFacts, Seen, bench_of
-from twin.design.layout_gradient import LayoutNumber, Slope, slope_of
-from twin.run.durable import make_folders
-from twin.run.procedure import Advance
-from twin.run.provenance import source_digest
-from twin.run.run_folder import RunFolderError
+from twin.design.layout_refinement import LayoutNumber, Slope, slope_of
+from twin.run import durable, procedure, provenance, run_folder
 
 _CLASSES: Mapping[str, type[Any]] = {
     cls.__name__: cls for cls in (Beam, BeamFacts, LayoutFacts, LayoutNumber, Seen, Slope)
@@ -49,7 +45,7 @@ class Journal:
 
     def __init__(self, file: Path | None, config: str) -> None:
         self.file = file
-        self._head = hashlib.sha256(f"{source_digest()}\n{config}".encode()).hexdigest()
+        self._head = hashlib.sha256(f"{provenance.source_digest()}\n{config}".encode()).hexdigest()
         self._known: dict[str, Any] = {}
         self._out: BinaryIO | None = None
 
@@ -65,11 +61,11 @@ class Journal:
 
     def _read(self, file: Path) -> None:
         try:
-            make_folders(file.parent)
+            durable.make_folders(file.parent)
             self._out = file.open("r+b" if file.exists() else "x+b")
             lines = self._out.read().splitlines(keepends=True)
             if lines and lines[0] != f"{self._head}\n".encode():
-                raise RunFolderError(
+                raise run_folder.RunFolderError(
                     f"{file} is of another search, or of another version of this program; remove it to begin anew"
                 )
             whole = len(lines[0]) if lines else 0
@@ -85,11 +81,11 @@ class Journal:
             self._out.truncate(whole)
             self._out.seek(whole)
         except OSError as error:
-            raise RunFolderError(f"{file}: {error.strerror}") from error
+            raise run_folder.RunFolderError(f"{file}: {error.strerror}") from error
         if not whole:
             self._write(self._head)
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file."""
         self._close()
 
@@ -114,7 +110,7 @@ class Journal:
             self._out.flush()
         except OSError as error:
             text = f"{self.file}: {error.strerror}; what it holds is kept, go on with --resume"
-            raise RunFolderError(text) from error
+            raise run_folder.RunFolderError(text) from error
 
 
 def _line(name: str, result: Any) -> str:
@@ -174,7 +170,7 @@ class Workers:
         RunFolderError: on entering, the journal is another search's, or cannot be written.
     """
 
-    def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: Advance) -> None:
+    def __init__(self, bench: LayoutBench, count: int, journal: Journal, advance: procedure.Advance) -> None:
         self.bench, self.count, self.journal, self.advance = bench, count, journal, advance
         self._config = bench.setup.to_yaml()
         self._pool: ProcessPoolExecutor | None = None
@@ -189,7 +185,7 @@ class Workers:
             self._pool = ProcessPoolExecutor(self.count, multiprocessing.get_context("spawn"))
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         """End the processes and close the journal."""
         try:
             if self._pool is not None:
@@ -199,7 +195,7 @@ class Workers:
                 else:
                     os.environ[LIMIT] = self._before
         finally:
-            self.journal.__exit__(kind, error, at)
+            self.journal.__exit__()
 
     def ask(self, part: str, items: Sequence[Any]) -> list[Any]:
         """What comes of every item, in their order; what the journal has is not worked out again.

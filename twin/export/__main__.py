@@ -15,9 +15,8 @@ import typer
 from scenes.yaml.errors import nearest
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.cli import AsJson, Force, InputErrorText, Options, Out, Quiet
-from twin.run.command import Result, print_report, run_command
+from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 from twin.run.run_folder import Manifest
 
 PROGRAM = "twin.export"
@@ -56,7 +55,7 @@ def main(
 
     def read() -> Manifest:
         from twin.export.export_run import FRAMES, NONE, read_source
-        from twin.run.data_table import TABLE_FORMATS
+        from twin.run.data_files import TABLE_FORMATS
 
         for option, value, allowed in (("--frames", frames, FRAMES), ("--tables", tables, (*TABLE_FORMATS, NONE))):
             if value not in allowed:
@@ -69,17 +68,12 @@ def main(
 
     def work(manifest: Manifest, session: Session) -> Result:
         from twin.export.export_run import KIND, export, export_report
-        from twin.run.page import RunFacts, write_test
 
         done = export(run, manifest, frames, tables, session.folder, session.advance)
-        report = export_report(done)
-        found = {**done.numbers(), "verdict": report.verdict}
-        chosen = ["--frames", frames, "--tables", tables]
-        again, times = (PROGRAM, str(run), *chosen), (session.started, session.seconds)
+        again = (PROGRAM, str(run), "--frames", frames, "--tables", tables)
         config = dump_yaml({"run": str(run), "frames": frames, "tables": tables})
-        facts = RunFacts(config, "", "", None, *times, PROGRAM, "", again, given=(run,))
-        write_test(KIND, found, report, facts, session.folder)
-        return Result(described(KIND, found), lambda console: print_report(report, console))
+        facts = {"config": config, "again": again, "given": (run,)}
+        return finished(session, KIND, export_report(done), done.numbers(), backend="", program=PROGRAM, **facts)
 
     stem = f"{run.resolve().name}-files"
     run_command(stem, Options(out, None, "llvm", force, as_json, quiet), read, work)

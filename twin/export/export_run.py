@@ -17,8 +17,7 @@ from scenes.yaml.input_file import is_file, why_unreadable
 from twin.export.fits_frames import Card, detector_cards, expected_fits, frames_fits, read_frames, run_cards
 from twin.export.result_tables import result_tables
 from twin.run.artefact import Cell, Table
-from twin.run.data_files import read_netcdf
-from twin.run.data_table import TABLE_FORMATS, DataTable, MissingPackage
+from twin.run.data_files import TABLE_FORMATS, DataTable, MissingPackage, read_netcdf
 from twin.run.procedure import Advance
 from twin.run.report import Report, Section
 from twin.run.run_folder import MANIFEST, Manifest, RunFolder, altered, read_manifest

@@ -20,8 +20,7 @@ import tifffile
 import xarray as xr
 
 from scenes.specs.resolved import ResolvedJob
-from twin.run.data_files import WRITER
-from twin.run.data_table import ascii_text
+from twin.run.data_files import WRITER, ascii_text
 
 __all__ = ["Card", "RecordedFrames", "detector_cards", "expected_fits", "frames_fits", "read_frames", "run_cards"]
 

@@ -19,7 +19,7 @@ from analysis.monitor import parameters
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
-from twin.run.data_table import DataColumn, DataTable
+from twin.run.data_files import DataColumn, DataTable
 from twin.run.run_folder import MANIFEST
 
 __all__ = ["NUMBERS", "result_tables"]

@@ -13,15 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from analysis.monitor.autocollimator import (
-    AXES,
-    ReadingMap,
-    column_component,
-    exact_reading,
-    mean_difference,
-    reading_of_normal,
-    relation_factor,
-)
+from analysis.monitor import autocollimator
 from analysis.spots.centroid import energy_centroid, mean_frames
 from analysis.spots.spot_positions import SpotPositions
 from analysis.units import ARCSEC
@@ -53,7 +45,7 @@ class Series:
     @property
     def stream(self) -> tuple[int, int, int]:
         """Number of its random streams: a series draws the same whichever others are run with it."""
-        return AXES.index(self.axis), round(self.half_angle / ARCSEC), round(1e3 * self.step / ARCSEC)
+        return autocollimator.AXES.index(self.axis), round(self.half_angle / ARCSEC), round(1e3 * self.step / ARCSEC)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +66,12 @@ class SeriesResult:
     @property
     def scale(self) -> float:
         """What mirror 2 is multiplied with: 1 (X), 1 / cos b (Y), 1 / sin b (Z)."""
-        return 1.0 / relation_factor(self.series.axis, 2, 2.0 * self.series.half_angle)
+        return 1.0 / autocollimator.relation_factor(self.series.axis, 2, 2.0 * self.series.half_angle)
 
     @property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
         """Mirror 1 and scaled mirror 2, (rows,) each, radians."""
-        component = column_component(self.series.axis)
+        component = autocollimator.column_component(self.series.axis)
         return self.readings[0, :, component], self.scale * self.readings[1, :, component]
 
     @property
@@ -88,13 +80,15 @@ class SeriesResult:
         scaled mirror 2.
         """
         first, second = self.columns
-        return mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
+        return autocollimator.mean_difference(self.series.angles if self.series.axis == "Z" else first, second)
 
     @property
     def from_exact(self) -> np.ndarray:
         """Readings minus those of ideal mirrors, lens and turntable to all orders, (2, rows, 2), radians."""
         args = self.series.axis, self.series.angles
-        return self.readings - np.stack([exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS])
+        return self.readings - np.stack(
+            [autocollimator.exact_reading(*args, u, 2.0 * self.series.half_angle) for u in UNITS]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +119,7 @@ _BENCH, _PATTERN, _READINGS, _FRAMES = range(4)
 def series_per_axis(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
     """The main series: one about each axis."""
     p = spec.programme
-    return tuple(Series(axis, getattr(p.stands, axis), p.table, p.steps) for axis in AXES)
-
-
-def whole_programme(spec: AutocollimatorTestSpec) -> tuple[Series, ...]:
-    """All series of the programme: three axes, two half angles, three steps."""
-    p = spec.programme
-    return tuple(
-        Series(axis, half_angle, step, p.steps)
-        for axis in AXES
-        for half_angle in (p.narrow, p.wide)
-        for step in (p.small, p.table, p.large)
-    )
+    return tuple(Series(axis, getattr(p.stands, axis), p.table, p.steps) for axis in autocollimator.AXES)
 
 
 def run_autocollimator_test(
@@ -202,7 +185,7 @@ def states_of(spec: AutocollimatorTestSpec, series: Series, seed: int | None) ->
     angles = np.concatenate([[0.0], series.angles])
     angles[2:] += on * e.turntable_step * readings.standard_normal(series.steps)
     unrest = on * e.reading * readings.standard_normal((len(angles), 2, 2))
-    k = AXES.index(series.axis)
+    k = autocollimator.AXES.index(series.axis)
     axis = np.where(np.arange(3) == k, 1.0, tilts[k])
     axis = axis / np.linalg.norm(axis)
     out: list[State] = []
@@ -233,7 +216,7 @@ def declared_spread(
     between = 2.0 * series.half_angle
     angles = np.broadcast_to(series.angles, (draws, series.steps + 1)).copy()
     angles[:, 1:] += e.turntable_step * rng.standard_normal((draws, series.steps))
-    k = AXES.index(series.axis)
+    k = autocollimator.AXES.index(series.axis)
     axis = np.where(np.arange(3) == k, 1.0, e.axis_tilt * rng.standard_normal((draws, 3)))
     turn = rotation_matrix(angles[..., None] * (axis / np.linalg.norm(axis, axis=1, keepdims=True))[:, None])
     columns = []
@@ -242,16 +225,18 @@ def declared_spread(
         mount = rotation_matrix(e.mirror_mount * rng.standard_normal((draws, 3)) * [1.0, 1.0, 0.0])
         start = mount @ np.array([0.0, 0.0, -1.0])
         normal = np.einsum("xi,drxy,yj,dj->dri", frame, turn, frame, start, optimize=True)
-        reading = reading_of_normal(normal) - reading_of_normal(start)[:, None]
+        reading = autocollimator.reading_of_normal(normal) - autocollimator.reading_of_normal(start)[:, None]
         roll = rotation_matrix(e.ccd_rotation * rng.standard_normal((draws, 1)) * [0.0, 0.0, 1.0])[:, :2, :2]
-        reading = np.einsum("dij,drj->dri", roll, reading)[..., column_component(series.axis)]
+        reading = np.einsum("dij,drj->dri", roll, reading)[..., autocollimator.column_component(series.axis)]
         reading *= 1.0 + e.focal_length * rng.standard_normal((draws, 1))
         # the reading at zero is common to all rows; image_sigma already holds its share
         unrest = e.reading * rng.standard_normal((draws, series.steps + 2))
         reading += unrest[:, 1:] - unrest[:, :1] + image_sigma * rng.standard_normal(reading.shape)
         columns.append(reading)
     first = series.angles if series.axis == "Z" else columns[0]
-    return np.asarray(np.mean(np.abs(first - columns[1] / relation_factor(series.axis, 2, between)), axis=1))
+    return np.asarray(
+        np.mean(np.abs(first - columns[1] / autocollimator.relation_factor(series.axis, 2, between)), axis=1)
+    )
 
 
 def _triple(vector: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
@@ -283,7 +268,7 @@ class Reader:
             self._paths[half_angle] = AutocollimatorPath(build_bench(self.spec, half_angle), self.backend)
         return self._paths[half_angle]
 
-    def _calibrate(self) -> ReadingMap:
+    def _calibrate(self) -> autocollimator.ReadingMap:
         """Calibration of the ideal autocollimator by noise-free images of known turns about X and Y together."""
         p = self.spec.programme
         reach = 1.02 * max(p.small, p.table, p.large) * p.steps
@@ -292,7 +277,9 @@ class Reader:
         windows = self.path(p.narrow).windows([{axis_body("X"): Motion(rotate=_triple(turn))} for turn in known])
         photons, corner = windows.photons[0], windows.corner[0]
         place, _ = self.place(self.detector.expected_dn(photons, self.exposure), corner)
-        return ReadingMap.fit(place, reading_of_normal(rotation_matrix(known) @ np.array([0.0, 0.0, -1.0])))
+        return autocollimator.ReadingMap.fit(
+            place, autocollimator.reading_of_normal(rotation_matrix(known) @ np.array([0.0, 0.0, -1.0]))
+        )
 
     def place(self, mean: np.ndarray, corner: np.ndarray) -> tuple[np.ndarray, SpotPositions]:
         """Spots (B, 2) on the whole CCD, (row, column) px, from mean windows (B, H, W) and their corners (B, 2)."""

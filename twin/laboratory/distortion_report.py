@@ -6,24 +6,30 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from analysis.orientation.distortion_model import design
 from analysis.orientation.interior import gain
+from analysis.spots.centroid import mean_frames
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera_tests import MeasuredDistortionSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.laboratory.distortion_numbers import DISTORTION, POINTS
-from twin.laboratory.distortion_plots import COMPENSATED, RAW, curve_svg, spot_svg
-from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion, rms
+from twin.laboratory.distortion_numbers import DISTORTION, ESTIMATE, POINTS
+from twin.laboratory.distortion_run import DistortionRun, SimulatedDistortion
 from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
+from twin.laboratory.turntable_run import rms
 from twin.run.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts
 from twin.run.report import Report, Section, one_sentence
+from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 ZERO_SHARE = 0.3
@@ -255,7 +261,7 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
     shown = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
     further = ("residual_compensated_um", "sets_kept")
     artefacts: tuple[Artefact, ...] = (
-        SvgFigure("distortion-curve", "Distortion over the field", caption, curve_svg(run)),
+        SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),
         POINTS.table(
             "distortion-points", "Point by point", "Means of the sets kept.", data["points"], (*shown, *further)
         ),
@@ -350,13 +356,8 @@ def _joint(joint: Mapping[str, Any]) -> Section:
 
 
 def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
-    keys = ("principal_distance_mm", "principal_distance_mm_sigma", "principal_point_mm", "principal_point_mm_sigma")
-    heads: tuple[str, ...] = ("estimate", "f [mm]", "sigma of f [mm]", "p [mm]", "sigma of p [mm]", "D [µm rms]")
-    digits: tuple[int | None, ...] = (None, 4, 3, 3, 3, 2)
-    rows: list[tuple[Cell, ...]] = [
-        (ESTIMATES[name], *(one[key] for key in keys), one["distortion_rms_um"])
-        for name, one in data["estimates"].items()
-    ]
+    heads, digits = ["estimate", *(one.shown_head for one in ESTIMATE)], [None, *(one.decimals for one in ESTIMATE)]
+    rows: list[tuple[Cell, ...]] = [(ESTIMATES[name], *one.values()) for name, one in data["estimates"].items()]
     found = (
         "Equations (1) to (4) (Li et al., doi 10.3788/IRLA20200143) have no constant: W has to count exactly from the "
         f"direction that is imaged to the line's middle. The constant finds it {run.compensated.zero / ARCSEC:.3f} "
@@ -374,30 +375,19 @@ def _estimates(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             "own truth.",
         ]
         caption += " Errors are against the same estimate from exact chief rays at the true angles."
-        heads, digits = (*heads, "error of f [mm]", "error of p [mm]", "error of D [µm rms]"), (*digits, 3, 2, 2)
-        errors = [(1e3 * (e.f - e.f_true), 1e3 * (e.p - e.p_true), 1e6 * e.error) for e in run.estimates.values()]
+        heads, digits = [*heads, "error of f [mm]", "error of p [mm]", "error of D, rms [µm]"], [*digits, 3, 2, 2]
+        pairs = [(one, run.true_estimates[name]) for name, one in run.estimates.items()]
+        errors = [(1e3 * (e.f - t.f), 1e3 * (e.p - t.p), 1e6 * rms(e.distortion - t.distortion)) for e, t in pairs]
         rows = [(*row, *error) for row, error in zip(rows, errors, strict=True)]
     terms = [name.replace("_", " ") for name in data["covariance_terms"]]
+    title, note = "Equations (1) to (4) and fits with a constant", "Square millimetres, noise that is stated and found."
     covariance: list[tuple[Cell, ...]] = [(n, *row) for n, row in zip(terms, data["covariance_mm2"], strict=True)]
     return Section(
         "Estimators and what can be observed",
         (*text, _typeset(run.compensated.fit.point.statement)),
         (
-            Table(
-                "distortion-estimates",
-                "Equations (1) to (4) and fits with a constant",
-                caption,
-                heads,
-                rows,
-                digits,
-            ),
-            Table(
-                "distortion-covariance",
-                "Covariance of constant, f and p",
-                "Square millimetres, all noise that is stated and found.",
-                ("", *terms),
-                covariance,
-            ),
+            Table("distortion-estimates", title, caption, heads, rows, digits),
+            Table("distortion-covariance", "Covariance of constant, f and p", note, ("", *terms), covariance),
         ),
     )
 
@@ -446,7 +436,7 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
                 "A spot, enlarged",
                 "Mean of the frames of one exposure in the middle of the field; the cross is the energy centroid, the "
                 "circle its window.",
-                spot_svg(run),
+                _spot_svg(run),
             )
         )
     gone = [*data.get("rejected_readings", ()), *data.get("rejected_comparisons", ())]
@@ -471,3 +461,68 @@ def _noise(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             )
         )
     return Section("Noise, and what was rejected", tuple(text), tuple(artefacts), folded=1 if gone else 0)
+
+
+def _curve_svg(run: DistortionRun) -> str:
+    """Distortion over the field, what is left of a smooth curve, and of a simulated bench the error."""
+    with look("distortion-curve"):
+        known = isinstance(run, SimulatedDistortion)
+        figure = new_figure(8.0 if known else 6.0)
+        panels = figure.subplots(2 + known, 1, sharex=True, height_ratios=(1.25, 1.0, 1.0)[: 2 + known])
+        field = np.degrees(run.compensated.fit.angle)
+        if isinstance(run, SimulatedDistortion):
+            panels[0].plot(field, 1e6 * run.true_distortion, color=INK, lw=1.0, label="exact chief rays")
+            panels[2].set_title("Measured − true, with the total sigma", loc="left")
+        series = [(run.raw, RAW, ORANGE, "s", -0.005), (run.compensated, COMPENSATED, BLUE, "o", 0.005)]
+        for one, name, colour, marker, shift in series if run.compensation is not None else series[:1]:
+            style = {"fmt": marker, "color": colour, "ms": 3.5, "lw": 0.8, "label": name}
+            panels[0].errorbar(field + shift, 1e6 * one.distortion, 1e6 * one.sigma, **style)
+            panels[1].errorbar(field + shift, 1e6 * one.smooth.residual, 1e6 * one.means.sigma, **style)
+            if isinstance(run, SimulatedDistortion):
+                panels[2].errorbar(field + shift, 1e6 * run.error(one), 1e6 * one.sigma, **style)
+        panels[0].set_title("Distortion D = L − c − f tan W + p tan² W, with its total sigma", loc="left")
+        panels[1].set_title("Distance from the smooth curve, with the sigma of the sets", loc="left")
+        panels[-1].set_xlabel("field angle W [deg]")
+        for axes in panels:
+            axes.set_ylabel("µm")
+            _dress(axes)
+        for axes in panels[1:]:
+            axes.axhline(0.0, color=GREY, lw=0.8)
+        return to_svg(figure)
+
+
+def _spot_svg(run: SimulatedDistortion) -> str:
+    """The spot in the middle of the field, and the row through its centre."""
+    with look("distortion-spot"):
+        figure = new_figure(3.6)
+        picture, profile = figure.subplots(1, 2, width_ratios=(1.0, 1.5))
+        point = len(run.record.column) // 2
+        image = mean_frames(run.record.frames[point, 0])
+        pitch = run.bench.ccd.band.pitch
+        column = run.spots.position[point, 0] + run.bench.design_offset[point]
+        column = column / pitch + run.bench.middle_column - run.record.column[point, 0]
+        row = run.spots.row[point, 0]
+        shown = picture.imshow(image, cmap="gray", interpolation="nearest", origin="upper")
+        picture.plot(column, row, "+", color=VERMILION, ms=12, mew=1.4)
+        angle = np.linspace(0.0, 2.0 * np.pi, 181)
+        radius = run.bench.radius
+        picture.plot(column + radius * np.cos(angle), row + radius * np.sin(angle), color=BLUE, lw=0.9)
+        picture.set(xlabel="column, along the line", ylabel="row, along the track")
+        figure.colorbar(shown, ax=picture, label="DN")
+        values = image[round(row)]
+        profile.step(np.arange(len(values)), values, where="mid", color=BLUE, lw=1.0, label="row through the centre")
+        profile.axvline(column, color=VERMILION, lw=0.9, label="energy centroid")
+        profile.set(xlabel="column", ylabel="DN")
+        _dress(profile, columns=1)
+        return to_svg(figure)
+
+
+def _dress(axes: Axes, columns: int = 3) -> None:
+    """A light grid, a legend and room for it; columns: of the legend."""
+    low, high = axes.get_ylim()
+    # room for the legend above the data
+    axes.set_ylim(low, high + 0.18 * (high - low))
+    axes.grid(axis="y", color=LIGHT, lw=0.6)
+    axes.set_axisbelow(True)
+    axes.legend(loc="upper right" if columns == 1 else "upper center", ncols=columns)
+    plain_axes(axes)

@@ -16,23 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.orientation import interior, measurement
 from analysis.orientation.distortion_model import OrientationError, distortion, principal_distance, principal_point
 from analysis.orientation.distortion_model import principal_distance_and_point as distance_and_point
-from analysis.orientation.interior import (
-    InteriorOrientation,
-    LineOrientation,
-    fit_interior_orientation,
-    line_orientation,
-)
-from analysis.orientation.measurement import (
-    CALIBRATED,
-    SMOOTH,
-    Distortion,
-    PointMeans,
-    Spots,
-    locate_spots,
-    reduce_sets,
-)
 from analysis.spots.spot_positions import SpotError
 from analysis.turntable.angle_fits import FITS
 from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, choose, compensate
@@ -57,35 +43,21 @@ _EXACT = 1e-9
 """Metres: stands for the noise of the truth, whose estimates do not depend on it."""
 
 
-@dataclass(frozen=True)
-class FoundEstimate:
+@dataclass(frozen=True, eq=False)
+class Estimate:
     """One way to f, p and distortion.
 
     Attributes:
-        f, p: as measured, metres; p is zero where it is not fitted.
-        f_sigma, p_sigma: metres, None where the equation gives none.
-        rms: of the distortion, metres.
+        f, p: metres; p is zero where it is not fitted.
+        distortion: of the points, (N,), metres.
+        f_sigma, p_sigma: metres, None where an equation gives none.
     """
 
     f: float
     p: float
-    f_sigma: float | None
-    p_sigma: float | None
-    rms: float
-
-
-@dataclass(frozen=True)
-class Estimate(FoundEstimate):
-    """The same beside its truth.
-
-    Attributes:
-        f_true, p_true: from the exact chief rays, metres.
-        error: RMS of measured minus true distortion by this estimate, metres.
-    """
-
-    f_true: float
-    p_true: float
-    error: float
+    distortion: Array
+    f_sigma: float | None = None
+    p_sigma: float | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -102,7 +74,6 @@ class DistortionRun:
         compensation: of its dividing error; None likewise.
         spots: as located.
         means: how sets are reduced.
-        common: covariance of the mean angles, the same in all sets, (N, N), rad^2.
         raw, compensated: with angles as read, and freed from the dividing error; without a calibration the same.
         stated: the smooth model's fit with nothing but the stated noise, for its chi-square.
         readings: the table of spots as read from files; None for a simulated bench.
@@ -116,12 +87,11 @@ class DistortionRun:
     present: NDArray[np.bool_]
     calibration: CalibrationSeries | None
     compensation: DividingCompensation | None
-    spots: Spots
-    means: PointMeans
-    common: Array
-    raw: Distortion
-    compensated: Distortion
-    stated: InteriorOrientation
+    spots: measurement.Spots
+    means: measurement.PointMeans
+    raw: measurement.Distortion
+    compensated: measurement.Distortion
+    stated: interior.InteriorOrientation
     readings: SpotReadings | None = None
     tables: tuple[Comparisons, ...] = ()
 
@@ -131,22 +101,14 @@ class DistortionRun:
         return self.present & ~self.means.keep
 
     @cached_property
-    def line(self) -> LineOrientation:
+    def line(self) -> interior.LineOrientation:
         """The joint model with compensated angles in the terms of a payload's line."""
-        return line_orientation(self.compensated.smooth)
+        return interior.line_orientation(self.compensated.smooth)
 
     @cached_property
-    def found_estimates(self) -> Mapping[str, FoundEstimate]:
+    def estimates(self) -> Mapping[str, Estimate]:
         """The printed equations and the fits with a constant, all with compensated angles."""
-        fit = self.compensated.fit
-        where, turned = fit.position, fit.angle
-        out = {name: _printed_found(n, where, turned) for name, n in (("eq2", 2), ("eq3", 3), ("eq4", 4))}
-        out["eq2_zero_from_constant"] = _printed_found(2, where, turned - self.compensated.zero)
-        for name, own in (("constant", fit), ("constant_radial3", self.compensated.smooth)):
-            f, p = "principal_distance", "principal_point"
-            left = rms(own.position - fit_part(own))
-            out[name] = FoundEstimate(own.value(f), own.value(p), own.sigma(f), own.sigma(p), left)
-        return out
+        return _estimates(self.compensated.fit, self.compensated.smooth, self.compensated.zero)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -173,81 +135,54 @@ class SimulatedDistortion(DistortionRun):
         """The test with all it refers to."""
         return self.bench.setup
 
-    def true_fit(self, terms: Sequence[str] = CALIBRATED) -> InteriorOrientation:
+    def true_fit(self, terms: Sequence[str] = measurement.CALIBRATED) -> interior.InteriorOrientation:
         """The same fit of the exact chief rays at the true angles, averaged over the same exposures."""
         where, turned = self.means.mean(self.truth.place[..., 0]), self.means.mean(self.truth.turn)
-        return fit_interior_orientation(where, turned, _EXACT, terms)
+        return interior.fit_interior_orientation(where, turned, _EXACT, terms)
 
     @cached_property
     def true_distortion(self) -> Array:
         """D of the chief rays, (N,), metres."""
         return self.true_fit().residual
 
-    def error(self, measured: Distortion) -> Array:
+    def error(self, measured: measurement.Distortion) -> Array:
         """Measured minus true distortion, (N,), metres."""
         return np.asarray(measured.distortion - self.true_distortion)
 
     @cached_property
-    def estimates(self) -> Mapping[str, Estimate]:
-        """The printed equations and the fits with a constant, all with compensated angles."""
-        fit, smooth = self.compensated.fit, self.compensated.smooth
-        where, turned = fit.position, fit.angle
-        exact = self.true_fit()
-        zeroed = turned - self.compensated.zero
-        out = {
-            "eq2": _printed(2, (where, turned), (exact.position, exact.angle)),
-            "eq3": _printed(3, (where, turned), (exact.position, exact.angle)),
-            "eq4": _printed(4, (where, turned), (exact.position, exact.angle)),
-            "eq2_zero_from_constant": _printed(2, (where, zeroed), (exact.position, exact.angle)),
-        }
-        for name, own, terms in (("constant", fit, CALIBRATED), ("constant_radial3", smooth, SMOOTH)):
-            true = self.true_fit(terms)
-            # distortion is what is left after the calibrated terms of the model
-            parts = [fit.position - fit_part(one) for one in (own, true)]
-            parts[1] = true.position - fit_part(true)
-            out[name] = Estimate(
-                f=own.value("principal_distance"),
-                p=own.value("principal_point"),
-                f_true=true.value("principal_distance"),
-                p_true=true.value("principal_point"),
-                f_sigma=own.sigma("principal_distance"),
-                p_sigma=own.sigma("principal_point"),
-                rms=rms(parts[0]),
-                error=rms(parts[0] - parts[1]),
-            )
-        return out
+    def true_estimates(self) -> Mapping[str, Estimate]:
+        """The same `estimates` from exact chief rays at the true angles."""
+        return _estimates(self.true_fit(), self.true_fit(measurement.SMOOTH), 0.0)
 
 
-def fit_part(fit: InteriorOrientation) -> Array:
+def _estimates(
+    fit: interior.InteriorOrientation, smooth: interior.InteriorOrientation, zero: float
+) -> dict[str, Estimate]:
+    """Equations (2), (3) and (4), and the fits; of (4) with f of (3), and of (2) once more with angles from `zero`."""
+    where, turned = fit.position, fit.angle
+
+    def printed(f: Array | float, p: Array | float, angle: Array) -> Estimate:
+        return Estimate(float(f), float(p), distortion(where, angle, f, p))
+
+    alone = principal_distance(where, turned)
+    out = {
+        "eq2": printed(*distance_and_point(where, turned), turned),
+        "eq3": printed(alone, 0.0, turned),
+        "eq4": printed(alone, principal_point(where, turned, alone), turned),
+        "eq2_zero_from_constant": printed(*distance_and_point(where, turned - zero), turned - zero),
+    }
+    f, p = "principal_distance", "principal_point"
+    for name, own in (("constant", fit), ("constant_radial3", smooth)):
+        left = own.position - _calibrated(own)
+        out[name] = Estimate(own.value(f), own.value(p), left, own.sigma(f), own.sigma(p))
+    return out
+
+
+def _calibrated(fit: interior.InteriorOrientation) -> Array:
     """What distortion is counted from: c + f tan W - p tan^2 W of a fit at its angles, (N,), metres."""
     tangent = np.tan(fit.angle)
-    c, f, p = (fit.value(term) for term in CALIBRATED)
+    c, f, p = (fit.value(term) for term in measurement.CALIBRATED)
     return np.asarray(c + f * tangent - p * tangent**2)
-
-
-def _printed(number: int, measured: tuple[Array, Array], true: tuple[Array, Array]) -> Estimate:
-    """Equation (2), (3), or (4) with f of (3), on measured and on true (L, W)."""
-    found = []
-    for where, turned in (measured, true):
-        if number == 2:
-            f, p = (float(value) for value in distance_and_point(where, turned))
-        else:
-            f = float(principal_distance(where, turned))
-            p = float(principal_point(where, turned, f)) if number == 4 else 0.0
-        found.append((f, p, distortion(where, turned, f, p)))
-    (f, p, own), (f_true, p_true, exact) = found
-    return Estimate(f, p, None, None, rms(own), f_true, p_true, rms(own - exact))
-
-
-def _printed_found(number: int, where: Array, turned: Array) -> FoundEstimate:
-    """Equation (2), (3), or (4) with f of (3), on measured (L, W)."""
-    one = _printed(number, (where, turned), (where, turned))
-    return FoundEstimate(one.f, one.p, None, None, one.rms)
-
-
-def rms(values: Array) -> float:
-    """Root of the mean square."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> SimulatedDistortion:
@@ -279,15 +214,17 @@ def measure(bench: DistortionBench, seed: int, advance: Advance = silent) -> Sim
             record=record,
             truth=truth,
             table=table,
-            **_reduced(*args, compensation),
+            **reduce(*args, compensation),
         )
     except OrientationError as error:
-        raise BenchError(str(error), ("points",), f"{len(SMOOTH) + 1} or more, over the whole field") from error
+        raise BenchError(
+            str(error), ("points",), f"{len(measurement.SMOOTH) + 1} or more, over the whole field"
+        ) from error
 
 
-def _reduced(
+def reduce(
     reading: Array,
-    spots: Spots,
+    spots: measurement.Spots,
     zero: float,
     about: float,
     compensation: DividingCompensation | None,
@@ -295,32 +232,6 @@ def _reduced(
     reverse: bool = False,
     present: NDArray[np.bool_] | None = None,
 ) -> dict[str, Any]:
-    """What every run has of its readings and spots, as `reduce` and the fit with the stated noise alone make it."""
-    means, common, raw, compensated = reduce(reading, spots, zero, about, compensation, angle_sigma, reverse, present)
-    fit = compensated.fit
-    return {
-        "reading": reading,
-        "spots": spots,
-        "about": about,
-        "present": np.ones(reading.shape, bool) if present is None else present,
-        "means": means,
-        "common": common,
-        "raw": raw,
-        "compensated": compensated,
-        "stated": fit_interior_orientation(fit.position, fit.angle, means.sigma, SMOOTH, angle_covariance=common),
-    }
-
-
-def reduce(
-    reading: Array,
-    spots: Spots,
-    zero: float,
-    about: float,
-    compensation: DividingCompensation | None,
-    angle_sigma: float = 0.0,
-    reverse: bool = False,
-    present: NDArray[np.bool_] | None = None,
-) -> tuple[PointMeans, Array, Distortion, Distortion]:
     """Readings and spots to interior orientation and distortion, whichever bench they come from.
 
     Args:
@@ -334,24 +245,39 @@ def reduce(
         present: which exposures there are, (N, S); None for all.
 
     Returns:
-        How sets are reduced; covariance of the mean angles, (N, N), rad^2; raw and compensated.
+        The attributes of a `DistortionRun` that follow from readings and spots.
 
     Raises:
         OrientationError: fewer points than unknowns, or angles that do not determine them.
     """
     sense = -1.0 if reverse else 1.0
-    raw = sense * (reading - zero)
+    read = sense * (reading - zero)
     if compensation is None:
-        means = reduce_sets(raw, spots, about, 0.0, present)
+        means = measurement.reduce_sets(read, spots, about, 0.0, present)
         common = angle_sigma**2 * np.eye(len(reading))
-        found = Distortion.measure(raw, spots, means, common)
-        return means, common, found, found
-    corrected = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
-    means = reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
-    # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
-    common = replace(compensation, white=0.0).covariance(means.mean(reading))
-    measured = Distortion.measure(raw, spots, means), Distortion.measure(corrected, spots, means, common)
-    return means, common, *measured
+        raw = compensated = measurement.Distortion.measure(read, spots, means, common)
+    else:
+        corrected = sense * (compensation.correct(reading) - float(compensation.correct(zero)))
+        means = measurement.reduce_sets(corrected, spots, about, about * compensation.repeatability, present)
+        # the white part is left to the test's own residuals, which see it at more angles than the calibration's did
+        common = replace(compensation, white=0.0).covariance(means.mean(reading))
+        raw, compensated = (
+            measurement.Distortion.measure(read, spots, means),
+            measurement.Distortion.measure(corrected, spots, means, common),
+        )
+    fit = compensated.fit
+    return {
+        "reading": reading,
+        "spots": spots,
+        "about": about,
+        "present": np.ones(reading.shape, bool) if present is None else present,
+        "means": means,
+        "raw": raw,
+        "compensated": compensated,
+        "stated": interior.fit_interior_orientation(
+            fit.position, fit.angle, means.sigma, measurement.SMOOTH, angle_covariance=common
+        ),
+    }
 
 
 def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
@@ -375,7 +301,7 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     _check_angles(files, found)
     scatter = files.angle_sigma or 0.0, files.reversed, found.present
     try:
-        reduced = _reduced(found.reading, found.spots, files.zero, spec.focal_length, compensation, *scatter)
+        reduced = reduce(found.reading, found.spots, files.zero, spec.focal_length, compensation, *scatter)
     except OrientationError as error:
         text = str(error).removeprefix("interior orientation: ")
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None
@@ -403,9 +329,8 @@ def _check_region(files: DistortionFiles, found: SpotReadings, series: Calibrati
         place = np.argwhere(beyond)[0]
         shown = f"{np.degrees(found.reading[tuple(place)]):.9g} deg"
         line = int(found.lines[tuple(place)])
-        raise InputError(
-            Issue("outside of the calibrated readings", found.file.file, line, (found.head,), shown, allowed)
-        )
+        text = "outside of the calibrated readings"
+        raise InputError(Issue(text, found.file.file, line, (found.head,), shown, allowed))
 
 
 def _check_angles(files: DistortionFiles, found: SpotReadings) -> None:
@@ -419,9 +344,9 @@ def _check_angles(files: DistortionFiles, found: SpotReadings) -> None:
         raise InputError(Issue("an angle beyond any field", found.file.file, line, (found.head,), shown, allowed))
 
 
-def _locate(bench: DistortionBench, record: DistortionRecord) -> Spots:
+def _locate(bench: DistortionBench, record: DistortionRecord) -> measurement.Spots:
     try:
-        return locate_spots(
+        return measurement.locate_spots(
             record.frames,
             record.column,
             bench.middle_column,

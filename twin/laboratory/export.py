@@ -14,19 +14,12 @@ import numpy as np
 
 from analysis.turntable.dividing_error import CalibrationSeries
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.camera_tests import (
-    DistortionFiles,
-    FocusFiles,
-    LevelSpec,
-    MeasuredDistortionSpec,
-    MeasuredFocusSpec,
-    NoiseSpec,
-)
+from scenes.specs import camera_tests
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.spec import Spec
 from scenes.yaml.yaml_file import dump_yaml
 from twin.laboratory.distortion_run import SimulatedDistortion
-from twin.laboratory.focus_alignment import Alignment, State, recorder_of
+from twin.laboratory.focus_run import SimulatedFocus, SimulatedState, recorder_of
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.data_files import FrameFacts, csv_table, tiff
 
@@ -70,10 +63,10 @@ def export_distortion(run: SimulatedDistortion) -> Files:
         for i, s in np.ndindex(*reading.shape)
     )
     out[SPOTS] = csv_table([heads, *rows])
-    files = DistortionFiles.model_construct(
+    files = camera_tests.DistortionFiles.model_construct(
         spots=SPOTS, zero=setup.turntable.camera_angle, turntable=turntable, line=None, angle_sigma=None, reversed=False
     )
-    test = MeasuredDistortionSpec.model_construct(
+    test = camera_tests.MeasuredDistortionSpec.model_construct(
         name="distortion",
         description=setup.test.description,
         focal_length=run.bench.path.model.line_focal_length,
@@ -83,7 +76,7 @@ def export_distortion(run: SimulatedDistortion) -> Files:
     return {**out, "distortion.yaml": _text(test)}
 
 
-def export_focus(run: Alignment) -> Files:
+def export_focus(run: SimulatedFocus) -> Files:
     """Every standing of the assembly, before and after each round: frames of all edges, a table of them and of their
     MTF, and a test's file for each table.
     """
@@ -97,14 +90,12 @@ def export_focus(run: Alignment) -> Files:
             out[table] = csv_table(rows)
             out[f"focus_{stem}_{name}.yaml"] = _text(_focus_test(run, state, {name: table}, shims))
         if number < len(run.shimmings):
-            thickness = run.shimmings[number].plan.thickness
-            assert thickness is not None
-            shims = tuple(float(one) for one in thickness)
+            shims = tuple(float(one) for one in run.shimmings[number].plan.thickness)
     return out
 
 
 def _focus_tables(
-    run: Alignment, state: State, number: int, stem: str, out: dict[str, str | bytes]
+    run: SimulatedFocus, state: SimulatedState, number: int, stem: str, out: dict[str, str | bytes]
 ) -> tuple[list[Sequence[Any]], list[Sequence[Any]]]:
     """Tables of images and of MTF values; the images are put into ``out``."""
     bench = run.bench
@@ -128,30 +119,34 @@ def _focus_tables(
     return images, values
 
 
-def _focus_test(run: Alignment, state: State, table: dict[str, str], shims: tuple[float, ...]) -> MeasuredFocusSpec:
+def _focus_test(
+    run: SimulatedFocus, state: SimulatedState, table: dict[str, str], shims: tuple[float, ...]
+) -> camera_tests.MeasuredFocusSpec:
     noise = {}
     for name, ccd in run.bench.ccds.items():
         # noise beyond EMVA 1288's model has no place in the file: it is then estimated from the images
         if not ccd.noise.further:
-            numbers: dict[str, Any] = {field: float(getattr(ccd.noise, field)) for field in NoiseSpec.model_fields}
-            noise[name] = NoiseSpec.model_construct(**numbers)
+            numbers: dict[str, Any] = {
+                field: float(getattr(ccd.noise, field)) for field in camera_tests.NoiseSpec.model_fields
+            }
+            noise[name] = camera_tests.NoiseSpec.model_construct(**numbers)
     given: dict[str, Any] = {"mtf": None, "images": None, **table}
-    files = FocusFiles.model_construct(
+    files = camera_tests.FocusFiles.model_construct(
         **given,
         moved="image",
         per_shift=None,
         frequency=0.5,
         noise=FrozenMap(noise if "images" in table else {}),
-        level=LevelSpec.model_construct(angle=state.level.angle, sigma=state.level.sigma),
+        level=camera_tests.LevelSpec.model_construct(angle=state.level.angle, sigma=state.level.sigma),
     )
-    return MeasuredFocusSpec.model_construct(
+    return camera_tests.MeasuredFocusSpec.model_construct(
         name="focus",
         description=run.bench.setup.test.description,
         measured=files,
         mount=run.bench.setup.test.mount,
         shims=shims,
-        vertex_error=MeasuredFocusSpec.model_fields["vertex_error"].default,
-        vertex_trend=MeasuredFocusSpec.model_fields["vertex_trend"].default,
+        vertex_error=camera_tests.MeasuredFocusSpec.model_fields["vertex_error"].default,
+        vertex_trend=camera_tests.MeasuredFocusSpec.model_fields["vertex_trend"].default,
         seed=run.seed,
     )
 

@@ -2,402 +2,200 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from analysis.focal_plane.through_focus import FocusVertex
-from analysis.units import ARCMIN, ARCSEC
 from analysis.units import UM_PER_M as UM
 from optics.geometry.pose import rotation_vector
-from twin.laboratory.focus_alignment import Alignment, Shimming, State
+from twin.laboratory.focus_bench import BudgetLine
+from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus, SimulatedState
 from twin.laboratory.focus_scan import VERTEX_ERROR
-from twin.laboratory.measured_focus import MeasuredAlignment
-from twin.laboratory.turntable_numbers import FileNumbers
-from twin.run.plain_data import plain_data
+from twin.laboratory.measured_focus import NoEdge
+from twin.laboratory.turntable_numbers import DATA_FILE
+from twin.run.quantity import Quantity, Record
 from twin.targets.target_images import ALONG, TRACK
 
 
-@dataclass(frozen=True)
-class SiteNumbers:
-    """One band's CCD in one field; positive where it stands downstream of best focus."""
-
-    band: str
-    field: float
-    defocus_um: float
-    defocus_um_sigma: float
-
-    @classmethod
-    def of(cls, alignment: Alignment, state: State) -> tuple[SiteNumbers, ...]:
-        """Of all sites."""
-        return tuple(
-            cls(site.band, site.field, UM * float(defocus), UM * float(sigma))
-            for site, defocus, sigma in zip(alignment.bench.sites, state.defocus, state.defocus_sigma, strict=True)
-        )
+def _holes(values: Iterable[Any]) -> dict[str, Any]:
+    """Values of the mounting holes, (H, ...), by the holes' names."""
+    return {f"hole_{k + 1}": value for k, value in enumerate(values)}
 
 
-@dataclass(frozen=True)
-class StateNumbers:
-    """The assembly as it was measured; ``confocal``: the largest distance from best focus."""
-
-    confocal_um_max: float
-    confocal_um_sigma: float
-    line_level_arcmin: float
-    line_level_arcmin_sigma: float
-    sites: tuple[SiteNumbers, ...]
-
-    @classmethod
-    def of(cls, alignment: Alignment, state: State) -> StateNumbers:
-        """Of one state."""
-        return cls(**_measured(alignment, state))
+def _ground(metres: Any) -> Any:
+    """Whole steps of the workshop in micrometres; beyond picometres there is only rounding."""
+    return np.round(UM * np.asarray(metres), 6)
 
 
-@dataclass(frozen=True)
-class CorrectionNumbers:
-    """Motion that the measurement asks for, with sigmas of the fitted plane."""
-
-    rotation_arcmin: Sequence[float]
-    shift_um: Sequence[float]
-    piston_um_sigma: float
-    slope_x_arcsec_sigma: float
-    slope_y_arcsec_sigma: float
+def _mtf(state: SimulatedState, edge: str, which: int) -> dict[str, float]:
+    return {band: pair[which] for band, pair in state.mtf(edge).items()}
 
 
-@dataclass(frozen=True)
-class RoundNumbers(StateNumbers):
-    """The assembly on new shims: MTF by band, shims by hole, and how they were decided."""
-
-    mtf_nyquist: Mapping[str, float]
-    mtf_nyquist_sigma: Mapping[str, float]
-    mtf_nyquist_along_line: Mapping[str, float]
-    mtf_nyquist_along_line_sigma: Mapping[str, float]
-    shims_um: Mapping[str, float]
-    shim_changes_um: Mapping[str, float]
-    slides_mm: Mapping[str, Sequence[float]]
-    turn_by_hand_arcmin: float
-    line_level_without_turn_arcmin: float
-    correction: CorrectionNumbers
-    chips_um_rms: float
-
-    @classmethod
-    def after(cls, alignment: Alignment, state: State, done: Shimming) -> RoundNumbers:
-        """The state after the shims ``done``."""
-        plan = done.plan
-        assert plan.thickness is not None
-        names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
-        across, along = (_by_band(alignment, state, edge) for edge in (TRACK, ALONG))
-        return cls(
-            **_measured(alignment, state),
-            mtf_nyquist={band: value for band, (value, _) in across.items()},
-            mtf_nyquist_sigma={band: sigma for band, (_, sigma) in across.items()},
-            mtf_nyquist_along_line={band: value for band, (value, _) in along.items()},
-            mtf_nyquist_along_line_sigma={band: sigma for band, (_, sigma) in along.items()},
-            # whole steps of the workshop; beyond picometres there is only rounding
-            shims_um={n: round(UM * float(t), 6) for n, t in zip(names, plan.thickness, strict=True)},
-            shim_changes_um={n: round(UM * float(t), 6) for n, t in zip(names, plan.rounded_change, strict=True)},
-            slides_mm={n: [1e3 * float(x) for x in s] for n, s in zip(names, plan.slide, strict=True)},
-            turn_by_hand_arcmin=plan.turn / ARCMIN,
-            line_level_without_turn_arcmin=plan.level_coupling / ARCMIN,
-            correction=_correction(done),
-            chips_um_rms=UM * done.plane.extra_sigma,
-        )
+def _shims(state: SimulatedState) -> Shimming:
+    assert state.shims is not None
+    return state.shims
 
 
-def _correction(done: Shimming) -> CorrectionNumbers:
-    wanted = done.plan.wanted
-    piston, slope_x, slope_y = np.sqrt(np.diag(done.covariance))
-    return CorrectionNumbers(
-        rotation_arcmin=[float(v) / ARCMIN for v in wanted.rotation],
-        shift_um=[UM * float(v) for v in wanted.shift],
-        piston_um_sigma=UM * float(piston),
-        slope_x_arcsec_sigma=float(slope_x) / ARCSEC,
-        slope_y_arcsec_sigma=float(slope_y) / ARCSEC,
-    )
+SITES: Record[SimulatedState] = Record(
+    "One band's CCD in one field.",
+    Quantity("band", lambda s: [site.band for site in s.bench.sites], "name of the band"),
+    Quantity("field", lambda s: [site.field for site in s.bench.sites], "share of half the line"),
+    Quantity("defocus_um", lambda s: s.defocus, "how far the CCD stands downstream of best focus"),
+    Quantity("defocus_um_sigma", lambda s: s.defocus_sigma, "standard deviation by noise"),
+)
+CORRECTION: Record[Shimming] = Record(
+    "Motion that the measurement asks for. Its sigmas hold noise and the error that all vertices share.",
+    Quantity("rotation_arcmin", lambda s: s.plan.wanted.rotation, "rotation vector about X', Y', Z'"),
+    Quantity("shift_um", lambda s: s.plan.wanted.shift, "shift along X', Y', Z'"),
+    Quantity("piston_um_sigma", lambda s: np.sqrt(s.covariance[0, 0]), "of the shift along Z'"),
+    Quantity("slope_x_arcsec_sigma", lambda s: np.sqrt(s.covariance[1, 1]), "of the rise of best focus along X'"),
+    Quantity("slope_y_arcsec_sigma", lambda s: np.sqrt(s.covariance[2, 2]), "of the rise of best focus along Y'"),
+)
+STATE: Record[SimulatedState] = Record(
+    "The assembly as it was measured.",
+    Quantity("confocal_um_max", lambda s: UM * s.confocal[0], "largest distance of a CCD from best focus"),
+    Quantity("confocal_um_sigma", lambda s: np.hypot(s.confocal[1], VERTEX_ERROR), "noise and error of the vertices"),
+    Quantity("line_level_arcmin", lambda s: s.level.angle, "turn of the line about Z', by the theodolite"),
+    Quantity("line_level_arcmin_sigma", lambda s: s.level.sigma, "standard deviation of the theodolite"),
+    Quantity("sites", SITES.rows, "all bands in all fields"),
+)
+ROUND: Record[SimulatedState] = Record(
+    "The assembly on new shims, and how they were decided.",
+    *STATE,
+    Quantity("mtf_nyquist", lambda s: _mtf(s, TRACK, 0), "band -> MTF along the track, mean of the fields"),
+    Quantity("mtf_nyquist_sigma", lambda s: _mtf(s, TRACK, 1), "band -> its standard deviation by noise"),
+    Quantity("mtf_nyquist_along_line", lambda s: _mtf(s, ALONG, 0), "band -> MTF along the line, mean of the fields"),
+    Quantity("mtf_nyquist_along_line_sigma", lambda s: _mtf(s, ALONG, 1), "band -> its standard deviation by noise"),
+    Quantity("shims_um", lambda s: _holes(_ground(_shims(s).plan.thickness)), "thickness by hole", converted=False),
+    Quantity(
+        "shim_changes_um", lambda s: _holes(_ground(_shims(s).plan.rounded_change)), "thicker by hole", converted=False
+    ),
+    Quantity("slides_mm", lambda s: _holes(_shims(s).plan.slide), "displacement in the mounting surface, by hole"),
+    Quantity("turn_by_hand_arcmin", lambda s: _shims(s).plan.turn, "rotation about the normal of the mounting surface"),
+    Quantity("line_level_without_turn_arcmin", lambda s: _shims(s).plan.level_coupling, "error of level without it"),
+    Quantity("correction", _shims, "motion that was asked for", record=CORRECTION),
+    Quantity("chips_um_rms", lambda s: UM * _shims(s).plane.extra_sigma, "scatter of the CCDs about one plane"),
+)
+BUDGET: Record[BudgetLine] = Record(
+    "What makes one band's MTF at the Nyquist frequency in one direction.",
+    Quantity("band", lambda line: line.band, "name of the band"),
+    Quantity("direction", lambda line: line.edge, "along the line or the track"),
+    Quantity("factors", lambda line: line.factors, "effect -> its transfer"),
+    Quantity("total", lambda line: line.total, "product of the factors"),
+)
+TRUE_STATE: Record[SimulatedState] = Record(
+    "The assembly as it stands, by the exact trace.",
+    Quantity("confocal_um_max", lambda s: UM * np.max(np.abs(s.true_defocus)), "largest distance from best focus"),
+    Quantity("line_level_arcmin", lambda s: s.true_level, "turn of the line about Z'"),
+    Quantity("mtf_nyquist", lambda s: s.true_mtf, "band -> MTF along the track, mean of the fields"),
+    Quantity("rotation_arcmin", lambda s: rotation_vector(s.standing.pose.rotation), "of the assembly"),
+    Quantity("shift_um", lambda s: s.standing.pose.translation, "of the assembly"),
+    Quantity("chip_height_um", lambda s: s.standing.heights, "band -> height of its chip above the assembly"),
+    Quantity("defocus_um", lambda s: s.true_defocus, "of the sites, in the order of `sites`"),
+)
+TRUTH: Record[SimulatedFocus] = Record(
+    "What the analysis does not know.",
+    Quantity("initial", lambda r: r.states[0], "as the assembly was mis-set", record=TRUE_STATE),
+    Quantity("rounds", lambda r: r.states[1:], "after each round", record=TRUE_STATE),
+)
+SIMULATED: Record[SimulatedFocus] = Record(
+    "focus.json of a simulated bench.",
+    Quantity("camera", lambda r: r.bench.setup.camera.name, "name of the camera"),
+    Quantity("seed", lambda r: r.seed, "seed of all that was drawn"),
+    Quantity("initial", lambda r: r.states[0], "before the first round", record=STATE),
+    Quantity("rounds", lambda r: r.states[1:], "after each round", record=ROUND),
+    Quantity("mtf_budget", lambda r: r.budget, "in the middle of the field", record=BUDGET),
+    Quantity("truth", lambda r: r, "by the exact trace", record=TRUTH),
+)
+CURVE: Record[FocusVertex] = Record(
+    "A curve through focus.",
+    Quantity("vertex_um", lambda v: v.position, "best focus as a move of the image", "vertex", 2),
+    Quantity("vertex_um_sigma", lambda v: v.sigma, "standard deviation by noise", "sigma", 2),
+    Quantity("peak_mtf", lambda v: v.peak, "MTF in best focus"),
+    Quantity("peak_mtf_sigma", lambda v: v.peak_sigma, "standard deviation by noise"),
+    Quantity("chi_square", lambda v: v.chi_square, "of the fitted curve", "χ²"),
+    Quantity("degrees_of_freedom", lambda v: v.degrees_of_freedom, "points used minus three unknowns", "ν"),
+    Quantity("positions", lambda v: len(v.used), "points of the curve"),
+    Quantity("positions_used", lambda v: np.sum(v.used), "points near the peak that the fit uses", "used"),
+)
+_Standing: TypeAlias = tuple[FocusRun, FocusState, Shimming]
+PLACES: Record[_Standing] = Record(
+    "One place of the focal plane, before the shims are changed.",
+    Quantity("band", lambda s: list(s[0].bands), "name of the band"),
+    Quantity("x_mm", lambda s: s[0].places[:, 0], "X', in the flight direction", "x", 3),
+    Quantity("y_mm", lambda s: s[0].places[:, 1], "Y', along the line", "y", 3),
+    Quantity("defocus_um", lambda s: s[1].defocus, "from best focus to the CCD", "CCD downstream of focus", 2),
+    Quantity("defocus_um_sigma", lambda s: s[1].defocus_sigma, "standard deviation by noise", "sigma", 2),
+    Quantity("residual_um", lambda s: s[2].plane.residual, "best focus minus the fitted plane", "from the plane", 2),
+    Quantity(
+        "curves", lambda s: [{e: CURVE(v) for e, v in scan.vertex.items()} for scan in s[1].scans], "by direction"
+    ),
+)
+PLANE: Record[Shimming] = Record(
+    "The weighted plane of best focus minus CCD. Its sigmas hold the error that all vertices share.",
+    Quantity("piston_um", lambda s: s.plane.piston, "height in the middle of the line"),
+    Quantity("piston_um_sigma", lambda s: np.sqrt(s.plane_covariance[0, 0]), "standard deviation"),
+    Quantity("slope_x_arcsec", lambda s: s.plane.slope_x, "rise along X'"),
+    Quantity("slope_x_arcsec_sigma", lambda s: np.sqrt(s.plane_covariance[1, 1]), "standard deviation"),
+    Quantity("slope_y_arcsec", lambda s: s.plane.slope_y, "rise along Y'"),
+    Quantity("slope_y_arcsec_sigma", lambda s: np.sqrt(s.plane_covariance[2, 2]), "standard deviation"),
+    Quantity("covariance", lambda s: s.plane_covariance, "of piston and slopes, metres and radians"),
+    Quantity("chi_square", lambda s: s.plane.chi_square, "of the places about the plane with their own sigmas"),
+    Quantity("degrees_of_freedom", lambda s: s.plane.degrees_of_freedom, "places minus three unknowns"),
+    Quantity("probability", lambda s: s.plane.p_value, "of such a chi-square or a larger one"),
+    Quantity("chips_um_rms", lambda s: UM * s.plane.extra_sigma, "scatter of the CCDs about one plane"),
+)
+SHIMS: Record[Shimming] = Record(
+    "The shim of one mounting hole.",
+    Quantity("change_um", lambda s: s.plan.change, "exact change of thickness", "change", 1),
+    Quantity("change_um_sigma", lambda s: s.change_sigma, "standard deviation", "sigma", 1),
+    Quantity(
+        "ground_um", lambda s: _ground(s.plan.rounded_change), "change that is ground", "ground", 1, converted=False
+    ),
+    Quantity("shim_um", lambda s: _ground(s.plan.thickness), "new thickness", "new shim", 1, converted=False),
+    Quantity("slide_mm", lambda s: s.plan.slide, "displacement in the mounting surface, by hand"),
+)
+NO_EDGE: Record[NoEdge] = Record(
+    "An image without a measurable edge.",
+    Quantity("file", lambda one: one.file, "the table that names it"),
+    Quantity("line", lambda one: one.line, "line of the table"),
+    Quantity("reason", lambda one: one.reason, "why it has no edge"),
+)
 
 
-def _measured(alignment: Alignment, state: State) -> dict[str, Any]:
-    """Fields of `StateNumbers`."""
-    return {
-        "confocal_um_max": UM * float(np.max(np.abs(state.defocus))),
-        "confocal_um_sigma": UM * float(np.hypot(np.max(state.defocus_sigma), VERTEX_ERROR)),
-        "line_level_arcmin": state.level.angle / ARCMIN,
-        "line_level_arcmin_sigma": state.level.sigma / ARCMIN,
-        "sites": SiteNumbers.of(alignment, state),
-    }
+def _standing(run: FocusRun) -> _Standing:
+    return run, run.states[0], run.shimmings[0]
 
 
-def _by_band(alignment: Alignment, state: State, edge: str) -> dict[str, tuple[float, float]]:
-    """Mean over the fields of the measured MTF at Nyquist, and its sigma."""
-    out = {}
-    for band in alignment.bench.ccds:
-        pairs = [f.by_edge[edge] for f, s in zip(state.focus, alignment.bench.sites, strict=True) if s.band == band]
-        values, sigmas = np.array(pairs).T
-        out[band] = float(np.mean(values)), float(np.sqrt(np.sum(sigmas**2)) / len(sigmas))
-    return out
+MEASURED: Record[FocusRun] = Record(
+    "focus.json of a measured series. Expected: on the new shims, after rounding, where places are best predicted.",
+    Quantity("name", lambda r: r.test.name, "name of the test"),
+    Quantity("seed", lambda r: r.seed, "of the command; nothing is drawn"),
+    Quantity("confocal_um_max", lambda r: UM * r.states[0].confocal[0], "largest distance of a CCD from best focus"),
+    Quantity(
+        "confocal_um_sigma",
+        lambda r: np.hypot(r.states[0].confocal[1], r.shimmings[0].vertex_error),
+        "noise and error of the vertices",
+    ),
+    Quantity("line_level_arcmin", lambda r: r.states[0].level and r.states[0].level.angle, "turn about Z'"),
+    Quantity("line_level_arcmin_sigma", lambda r: r.states[0].level and r.states[0].level.sigma, "standard deviation"),
+    Quantity("plane", lambda r: r.shimmings[0], "that the shims take away", record=PLANE),
+    Quantity("correction", lambda r: r.shimmings[0], "motion that is asked for", record=CORRECTION),
+    Quantity("shims", lambda r: _holes(SHIMS.rows(r.shimmings[0])), "by hole"),
+    Quantity("turn_by_hand_arcmin", lambda r: r.shimmings[0].plan.turn, "rotation in the mounting surface"),
+    Quantity("line_level_without_turn_arcmin", lambda r: r.shimmings[0].plan.level_coupling, "error without it"),
+    Quantity("expected_confocal_um_max", lambda r: UM * r.shimmings[0].expected[0], "largest expected distance"),
+    Quantity("expected_confocal_um_sigma", lambda r: r.shimmings[0].expected[1], "standard deviation"),
+    Quantity("curves_chi_square", lambda r: r.chi_square[0], "of all curves through focus together"),
+    Quantity("curves_degrees_of_freedom", lambda r: r.chi_square[1], "of all curves through focus together"),
+    Quantity("sites", lambda r: PLACES.rows(_standing(r)), "all places"),
+    Quantity("images_without_edge", lambda r: r.readings and r.readings.no_edge, "not measured", record=NO_EDGE),
+    Quantity("files", lambda r: r.readings and [r.readings.file], "that were read", record=DATA_FILE),
+)
 
 
-@dataclass(frozen=True)
-class BudgetNumbers:
-    """What makes one band's MTF at Nyquist in one direction."""
-
-    band: str
-    direction: str
-    factors: Mapping[str, float]
-    total: float
-
-
-@dataclass(frozen=True)
-class TrueStateNumbers:
-    """The assembly as it stands, by the exact trace."""
-
-    confocal_um_max: float
-    line_level_arcmin: float
-    mtf_nyquist: Mapping[str, float]
-    rotation_arcmin: Sequence[float]
-    shift_um: Sequence[float]
-    chip_height_um: Mapping[str, float]
-    defocus_um: Sequence[float]
-
-    @classmethod
-    def of(cls, alignment: Alignment, state: State) -> TrueStateNumbers:
-        """Of one state."""
-        bench, standing = alignment.bench, state.standing
-        mtf = {}
-        for band in bench.ccds:
-            values = [
-                s.imagers[TRACK].mtf(float(s.crossing(standing.pose, standing.heights[band])[2]), s.nyquist)
-                for s in bench.sites
-                if s.band == band
-            ]
-            mtf[band] = float(np.mean(values))
-        return cls(
-            confocal_um_max=UM * float(np.max(np.abs(state.true_defocus))),
-            line_level_arcmin=state.true_level / ARCMIN,
-            mtf_nyquist=mtf,
-            rotation_arcmin=[float(v) / ARCMIN for v in rotation_vector(standing.pose.rotation)],
-            shift_um=[UM * float(v) for v in standing.pose.translation],
-            chip_height_um={band: UM * height for band, height in standing.heights.items()},
-            defocus_um=[UM * float(v) for v in state.true_defocus],
-        )
-
-
-@dataclass(frozen=True)
-class FocusTruth:
-    """What the analysis does not know."""
-
-    initial: TrueStateNumbers
-    rounds: tuple[TrueStateNumbers, ...]
-
-
-@dataclass(frozen=True)
-class FocusNumbers:
-    """focus.json."""
-
-    camera: str
-    seed: int
-    initial: StateNumbers
-    rounds: tuple[RoundNumbers, ...]
-    mtf_budget: tuple[BudgetNumbers, ...]
-    truth: FocusTruth
-
-    @classmethod
-    def of(cls, alignment: Alignment) -> FocusNumbers:
-        """Of an alignment."""
-        first, *after = alignment.states
-        return cls(
-            camera=alignment.bench.setup.camera.name,
-            seed=alignment.seed,
-            initial=StateNumbers.of(alignment, first),
-            rounds=tuple(
-                RoundNumbers.after(alignment, state, done)
-                for state, done in zip(after, alignment.shimmings, strict=True)
-            ),
-            mtf_budget=tuple(
-                BudgetNumbers(line.band, line.edge, line.factors, line.total) for line in alignment.budget
-            ),
-            truth=FocusTruth(
-                TrueStateNumbers.of(alignment, first),
-                tuple(TrueStateNumbers.of(alignment, state) for state in after),
-            ),
-        )
-
-
-@dataclass(frozen=True)
-class CurveNumbers:
-    """A curve through focus: its vertex as a move of the image, peak, and the fit."""
-
-    vertex_um: float
-    vertex_um_sigma: float
-    peak_mtf: float
-    peak_mtf_sigma: float
-    chi_square: float
-    degrees_of_freedom: int
-    positions: int
-    positions_used: int
-
-    @classmethod
-    def of(cls, vertex: FocusVertex) -> CurveNumbers:
-        """Of a vertex."""
-        return cls(
-            vertex_um=UM * vertex.position,
-            vertex_um_sigma=UM * vertex.sigma,
-            peak_mtf=vertex.peak,
-            peak_mtf_sigma=vertex.peak_sigma,
-            chi_square=vertex.chi_square,
-            degrees_of_freedom=vertex.degrees_of_freedom,
-            positions=len(vertex.used),
-            positions_used=int(np.sum(vertex.used)),
-        )
-
-
-@dataclass(frozen=True)
-class MeasuredSiteNumbers:
-    """One place; defocus is positive where the CCD stands downstream of best focus; residual: from the plane."""
-
-    band: str
-    x_mm: float
-    y_mm: float
-    defocus_um: float
-    defocus_um_sigma: float
-    residual_um: float
-    curves: Mapping[str, CurveNumbers]
-
-
-@dataclass(frozen=True)
-class PlaneNumbers:
-    """The weighted plane of best focus minus CCD. Covariance of piston and slopes: metres and radians. Its sigmas hold
-    the error that all vertices share; chi-square is that of the places about the plane with their own sigmas.
-    """
-
-    piston_um: float
-    piston_um_sigma: float
-    slope_x_arcsec: float
-    slope_x_arcsec_sigma: float
-    slope_y_arcsec: float
-    slope_y_arcsec_sigma: float
-    covariance: np.ndarray
-    chi_square: float
-    degrees_of_freedom: int
-    probability: float
-    chips_um_rms: float
-
-
-@dataclass(frozen=True)
-class ShimNumbers:
-    """The shim of one hole: exact change of thickness, what is ground, the new shim, and the slide by hand."""
-
-    change_um: float
-    change_um_sigma: float
-    ground_um: float
-    shim_um: float
-    slide_mm: Sequence[float]
-
-
-@dataclass(frozen=True)
-class NoEdgeNumbers:
-    """An image without a measurable edge."""
-
-    file: str
-    line: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class MeasuredFocusNumbers:
-    """focus.json of measurements. Expected: largest distance from best focus on the new shims, after rounding, where
-    the places are best predicted.
-    """
-
-    name: str
-    seed: int
-    confocal_um_max: float
-    confocal_um_sigma: float
-    line_level_arcmin: float | None
-    line_level_arcmin_sigma: float | None
-    plane: PlaneNumbers
-    correction: CorrectionNumbers
-    shims: Mapping[str, ShimNumbers]
-    turn_by_hand_arcmin: float
-    line_level_without_turn_arcmin: float
-    expected_confocal_um_max: float
-    expected_confocal_um_sigma: float
-    curves_chi_square: float
-    curves_degrees_of_freedom: int
-    sites: tuple[MeasuredSiteNumbers, ...]
-    images_without_edge: tuple[NoEdgeNumbers, ...]
-    files: tuple[FileNumbers, ...]
-
-    @classmethod
-    def of(cls, run: MeasuredAlignment) -> MeasuredFocusNumbers:
-        """Of an alignment."""
-        plane, plan, level = run.shimming.plane, run.shimming.plan, run.level
-        assert plan.thickness is not None
-        covariance = plane.covariance + np.diag(run.shimming.systematic**2)
-        piston, slope_x, slope_y = (float(v) for v in np.sqrt(np.diag(covariance)))
-        left, spread = plane.predicted_defocus()
-        expected = left + plan.focus_error(plane.place)
-        worst = int(np.argmax(np.abs(expected)))
-        names = [f"hole_{k + 1}" for k in range(len(plan.thickness))]
-        square, freedom = run.chi_square
-        changes = np.sqrt(np.diag(plan.change_covariance + run.shimming.systematic_changes))
-        return cls(
-            name=run.spec.name,
-            seed=run.seed,
-            confocal_um_max=UM * float(np.max(np.abs(run.defocus))),
-            confocal_um_sigma=UM * float(np.hypot(np.max(run.defocus_sigma), run.spec.vertex_error)),
-            line_level_arcmin=None if level is None else level.angle / ARCMIN,
-            line_level_arcmin_sigma=None if level is None else level.sigma / ARCMIN,
-            plane=PlaneNumbers(
-                piston_um=UM * plane.piston,
-                piston_um_sigma=UM * piston,
-                slope_x_arcsec=plane.slope_x / ARCSEC,
-                slope_x_arcsec_sigma=slope_x / ARCSEC,
-                slope_y_arcsec=plane.slope_y / ARCSEC,
-                slope_y_arcsec_sigma=slope_y / ARCSEC,
-                covariance=covariance,
-                chi_square=plane.chi_square,
-                degrees_of_freedom=plane.degrees_of_freedom,
-                probability=plane.p_value,
-                chips_um_rms=UM * plane.extra_sigma,
-            ),
-            correction=_correction(run.shimming),
-            shims={
-                name: ShimNumbers(
-                    change_um=UM * float(plan.change[k]),
-                    change_um_sigma=UM * float(changes[k]),
-                    ground_um=round(UM * float(plan.rounded_change[k]), 6),
-                    shim_um=round(UM * float(plan.thickness[k]), 6),
-                    slide_mm=[1e3 * float(v) for v in plan.slide[k]],
-                )
-                for k, name in enumerate(names)
-            },
-            turn_by_hand_arcmin=plan.turn / ARCMIN,
-            line_level_without_turn_arcmin=plan.level_coupling / ARCMIN,
-            expected_confocal_um_max=UM * float(np.abs(expected[worst])),
-            expected_confocal_um_sigma=UM * float(np.hypot(np.sqrt(spread[worst, worst]), run.spec.vertex_error)),
-            curves_chi_square=square,
-            curves_degrees_of_freedom=freedom,
-            sites=tuple(
-                MeasuredSiteNumbers(
-                    band=site.band,
-                    x_mm=1e3 * float(site.place[0]),
-                    y_mm=1e3 * float(site.place[1]),
-                    defocus_um=UM * float(run.defocus[k]),
-                    defocus_um_sigma=UM * float(run.defocus_sigma[k]),
-                    residual_um=UM * float(plane.residual[k]),
-                    curves={edge: CurveNumbers.of(vertex) for edge, vertex in run.scans[k].vertex.items()},
-                )
-                for k, site in enumerate(run.sites)
-            ),
-            images_without_edge=tuple(NoEdgeNumbers(one.file, one.line, one.reason) for one in run.no_edge),
-            files=(FileNumbers(**asdict(run.file)),),
-        )
-
-
-def focus_numbers(alignment: Alignment | MeasuredAlignment) -> dict[str, Any]:
+def focus_numbers(run: FocusRun) -> dict[str, Any]:
     """Contents of focus.json without its frames."""
-    if isinstance(alignment, MeasuredAlignment):
-        return dict(plain_data(MeasuredFocusNumbers.of(alignment)))
-    return dict(plain_data(FocusNumbers.of(alignment)))
+    return SIMULATED(run) if isinstance(run, SimulatedFocus) else MEASURED(run)

@@ -1,56 +1,97 @@
-"""Report of a focal-plane alignment: the main table, sections."""
+"""Report of a focal-plane alignment: what was found, how well, and what limits it; of a simulated bench also beside its
+truth.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
-from analysis.units import ARCMIN
-from analysis.units import UM_PER_M as UM
-from twin.laboratory.focus_alignment import Alignment
-from twin.laboratory.focus_numbers import focus_numbers
-from twin.laboratory.focus_plots import defocus_svg, edges_svg, mtf_svg, through_focus_svg
-from twin.run.artefact import SvgFigure, Table, fixed
+from analysis.units import ARCMIN, UM_PER_M
+from scenes.specs.camera_tests import MeasuredFocusSpec
+from scenes.yaml.units import LENGTH, format_quantity
+from twin.laboratory import focus_plots
+from twin.laboratory.focus_numbers import NO_EDGE, PLACES, SHIMS, focus_numbers
+from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
+from twin.laboratory.turntable_report import DOUBTFUL
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
+MOVED = {
+    "image": "image, along the light",
+    "target": "target, along the light",
+    "focal_plane": "CCD, along the light",
+}
 
-def focus_report(alignment: Alignment) -> Report:
+
+def focus_report(run: FocusRun) -> Report:
     """Report of an alignment."""
-    first, last = alignment.states[0], alignment.states[-1]
-    bench = alignment.bench
-    data = focus_numbers(alignment)
+    data = focus_numbers(run)
+    sections = (_shims(run), _plane(run), _curves(run))
+    if isinstance(run, SimulatedFocus):
+        return Report(
+            f"Focal-plane alignment of {run.bench.setup.camera.name}",
+            _alignment_verdict(run, data),
+            (),
+            _bench_facts(run),
+            _rounds(data),
+            (*sections, _mtf_section(run, data)),
+            _edge_frames(run),
+        )
+    assert isinstance(run.test, MeasuredFocusSpec)
+    summary, warnings = _summary(data), _warnings(run, data)
+    return Report(
+        "Focal-plane alignment", _verdict(run, data), (), _facts(run, run.test), summary, sections, warnings=warnings
+    )
+
+
+def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> str:
     end = data["rounds"][-1]
     true, chips = data["truth"]["rounds"][-1]["confocal_um_max"], end["chips_um_rms"]
-    verdict = one_sentence(
-        f"{_number(len(alignment.shimmings))} of shims brought the CCDs from "
-        f"{UM * np.max(np.abs(first.defocus)):.0f} µm to {end['confocal_um_max']:.1f} ± "
+    rounds = len(run.shimmings)
+    return one_sentence(
+        f"{'One round' if rounds == 1 else f'{rounds} rounds'} of shims brought the CCDs from "
+        f"{data['initial']['confocal_um_max']:.0f} µm to {end['confocal_um_max']:.1f} ± "
         f"{end['confocal_um_sigma']:.1f} µm from best focus (truly {true:.1f} µm), in every "
         f"field and band, and the line to {abs(end['line_level_arcmin']):.2f} arcmin of level",
         f"the CCDs do not stand in one plane, by {chips:.1f} µm rms, which no shim takes away" if chips > 0.0 else "",
         "see the rounds of the alignment and the MTF",
     )
-    images = {
-        f"{bench.sites[i].band}_field{k}_{edge}": scan.frames[edge]
-        for i, scan in enumerate(last.focus)
+
+
+def _edge_frames(run: SimulatedFocus) -> dict[str, np.ndarray]:
+    """Frames of all edges after the alignment."""
+    fields = run.bench.setup.test.fields
+    return {
+        f"{site.band}_field{fields.index(site.field) + 1}_{edge}": scan.frames[edge]
+        for site, scan in zip(run.bench.sites, run.states[-1].focus, strict=True)
         for edge in DIRECTIONS
-        for k in [bench.setup.test.fields.index(bench.sites[i].field) + 1]
     }
-    return Report(
-        f"Focal-plane alignment of {bench.setup.camera.name}",
-        verdict,
-        (),
-        _facts(alignment),
-        _summary(data),
-        (_alignment_section(alignment), _mtf_section(alignment, data), _shim_section(alignment)),
-        images,
+
+
+def _facts(run: FocusRun, test: MeasuredFocusSpec) -> tuple[tuple[str, str], ...]:
+    mount, level, file = test.mount, run.states[0].level, run.readings and run.readings.file
+    edges = " and ".join(DIRECTION_NAMES[edge] for edge in run.edges)
+    return (
+        ("Places", f"{len(run.places)} of {len(set(run.bands))} bands, MTF {edges}"),
+        ("Moved", MOVED[test.measured.moved]),
+        (
+            "Level of the line",
+            "not read: the turn about Z′ stays" if level is None else f"{level.angle / ARCMIN:.3f} arcmin",
+        ),
+        (
+            "Mount",
+            f"{len(mount.holes)} holes, surface inclined by {np.degrees(mount.tilt):g}°, shims of "
+            f"{format_quantity(mount.thickness, LENGTH)} ground in steps of {format_quantity(mount.step, LENGTH)}",
+        ),
+        ("File", f"{file.file}, {file.rows} rows" if file else ""),
+        ("Description", test.description),
     )
-
-
-def _number(rounds: int) -> str:
-    return "One round" if rounds == 1 else f"{rounds} rounds"
 
 
 def _thousands(value: float) -> str:
@@ -58,21 +99,21 @@ def _thousands(value: float) -> str:
     return f"{value:,.0f}".replace(",", "\u202f")
 
 
-def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
-    setup = alignment.bench.setup
+def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
+    setup = run.bench.setup
     test, camera = setup.test, setup.camera
     bands = ", ".join(
-        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM * b.pitch:g} µm"
+        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM_PER_M * b.pitch:g} µm"
         for name, b in camera.bands.items()
     )
     level = test.white
     electrons = ", ".join(
-        f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in alignment.bench.ccds.items()
+        f"{name} {_thousands(level * ccd.detector.full_well_e)} e" for name, ccd in run.bench.ccds.items()
     )
     return (
         (
             "Camera",
-            f"{camera.name}: f {alignment.bench.focal_length:.3f} m (geometric mean of both directions), pupil "
+            f"{camera.name}: f {run.bench.focal_length:.3f} m (geometric mean of both directions), pupil "
             f"{camera.entrance_pupil:g} m; {bands}",
         ),
         (
@@ -85,12 +126,12 @@ def _facts(alignment: Alignment) -> tuple[tuple[str, str], ...]:
         (
             "Mount",
             f"{len(test.mount.holes)} holes, surface inclined by {np.degrees(test.mount.tilt):g}° against the focal "
-            f"plane, shims ground in steps of {UM * test.mount.step:g} µm",
+            f"plane, shims ground in steps of {UM_PER_M * test.mount.step:g} µm",
         ),
     )
 
 
-def _summary(data: Mapping[str, Any]) -> Table:
+def _rounds(data: Mapping[str, Any]) -> Table:
     stages = [("before", data["initial"], data["truth"]["initial"])]
     for k, (measured, true) in enumerate(zip(data["rounds"], data["truth"]["rounds"], strict=True)):
         stages.append((f"after round {k + 1}", measured, true))
@@ -114,37 +155,168 @@ def _summary(data: Mapping[str, Any]) -> Table:
     )
 
 
-def _alignment_section(alignment: Alignment) -> Section:
+def _verdict(run: FocusRun, data: Mapping[str, Any]) -> str:
+    plane = data["plane"]
+    chips, noise = plane["chips_um_rms"], UM_PER_M * float(np.sqrt(np.mean(run.states[0].defocus_sigma ** 2)))
+    limit = (
+        f"by the CCDs, which do not stand in one plane by {chips:.1f} µm rms, and no shim takes that away"
+        if chips > noise
+        else f"by the noise of each place, {noise:.1f} µm rms"
+    )
+    gone = len(data["images_without_edge"])
+    return one_sentence(
+        f"The CCDs stand up to {data['confocal_um_max']:.1f} ± {data['confocal_um_sigma']:.1f} µm from best focus",
+        f"new shims will bring them within {data['expected_confocal_um_max']:.1f} ± "
+        f"{data['expected_confocal_um_sigma']:.1f} µm, limited {limit}",
+        f"chi-square of the plane {plane['chi_square']:.1f} for {plane['degrees_of_freedom']} degrees of freedom, of "
+        f"the curves through focus {data['curves_chi_square']:.0f} for {data['curves_degrees_of_freedom']}",
+        f"{gone} images without a measurable edge" if gone else "",
+        "see the shims",
+    )
+
+
+def _warnings(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, ...]:
+    out = []
+    square, freedom = run.chi_square
+    if freedom and chi2.sf(square, freedom) < DOUBTFUL:
+        out.append(
+            f"the curves through focus scatter more than their sigmas allow, chi-square {square:.0f} for {freedom} "
+            "degrees of freedom: sigmas of the MTF are too small, or the curves have another form; sigmas of the "
+            f"places are too small by about {np.sqrt(square / freedom):.1f}; those of plane and shims hold what places "
+            "scatter"
+        )
+    if len(run.edges) == 1:
+        out.append(
+            f"one direction only, {DIRECTION_NAMES[run.edges[0]]}: with astigmatism best focus is midway between two"
+        )
+    if run.states[0].level is None:
+        out.append("the line's level was not read: shims that tilt the assembly can turn the line, see the shims")
+    if not data["plane"]["degrees_of_freedom"]:
+        out.append("three places give a plane and nothing to judge it by: no sigma knows of CCDs off one plane")
+    return tuple(out)
+
+
+def _summary(data: Mapping[str, Any]) -> Table:
+    plane = data["plane"]
+    rows: list[tuple[Cell, ...]] = [
+        ("largest distance from best focus [µm]", data["confocal_um_max"], data["confocal_um_sigma"]),
+        ("piston of the plane [µm]", plane["piston_um"], plane["piston_um_sigma"]),
+        ("slope along X′ [arcsec]", plane["slope_x_arcsec"], plane["slope_x_arcsec_sigma"]),
+        ("slope along Y′ [arcsec]", plane["slope_y_arcsec"], plane["slope_y_arcsec_sigma"]),
+        ("CCDs off one plane [µm rms]", plane["chips_um_rms"], None),
+    ]
+    rows += [
+        (f"change of shim {name.removeprefix('hole_')} [µm]", one["change_um"], one["change_um_sigma"])
+        for name, one in data["shims"].items()
+    ]
+    caption = "Plane: best focus minus CCD. Sigmas hold noise, CCDs off one plane, and an error common to all vertices."
+    return Table("alignment", "Result", caption, ("", "measured", "sigma"), rows, (None, 2, 2))
+
+
+def _shims(run: FocusRun) -> Section:
+    """The shims of every round."""
+    tables = []
+    for number, done in enumerate(run.shimmings, 1):
+        rows = [
+            (
+                f"{hole}",
+                f"{fixed(one['change_um'], 1)} ± {one['change_um_sigma']:.1f}",
+                *(fixed(one[key], 1) for key in ("ground_um", "shim_um")),
+                fixed(float(np.linalg.norm(one["slide_mm"])), 3),
+            )
+            for hole, one in enumerate(SHIMS.rows(done), 1)
+        ]
+        title = "Shims" if len(run.shimmings) == 1 else f"Shims of round {number}"
+        caption = (
+            "Changes of thickness under each hole; their sigma holds noise, the error that all vertices share, and "
+            f"that the CCDs do not stand in one plane ({UM_PER_M * done.plane.extra_sigma:.1f} µm rms: chips, "
+            "curvature of field). The turn in the mounting surface of "
+            f"{fixed(done.plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off its wanted "
+            f"level by {fixed(done.plan.level_coupling / ARCMIN, 2)} arcmin, as the mounting surface is not parallel "
+            "to the focal plane."
+        )
+        heads = ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]")
+        tables.append(Table(f"shims-{number}", title, caption, heads, rows))
+    return Section("Shims", (), tuple(tables))
+
+
+def _last(run: FocusRun) -> tuple[FocusRun, FocusState, Shimming]:
+    """The last standing of which a plane was made, and this plane."""
+    number = len(run.shimmings) - 1
+    return run, run.states[number], run.shimmings[number]
+
+
+def _plane(run: FocusRun) -> Section:
+    """The plane from which the last shims are."""
+    *_, done = last = _last(run)
+    plane = done.plane
     text = (
-        "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
-        "directions, and its MTF at the band's Nyquist frequency is fitted by its main peak. The image moves along the "
-        "line's direction with f² of that direction over the collimator's f², which differ by "
-        f"{100 * _anamorphism(alignment):.1f}% in this camera; each direction is reduced with its own.",
-        "Best focus is midway between those of the two directions, which astigmatism moves apart.",
+        f"Chi-square of the plane is {plane.chi_square:.1f} for {plane.degrees_of_freedom} degrees of freedom "
+        "with the places' own sigmas. What the places scatter beyond them, "
+        f"{UM_PER_M * plane.extra_sigma:.1f} µm rms, is in the weights and in all sigmas of plane and shims: CCDs that "
+        "are not in one plane, curvature of the field, sigmas that are too small.",
+        f"All vertices share an error of {UM_PER_M * done.vertex_error:.2g} µm by the form of the curve; "
+        f"{UM_PER_M * done.vertex_trend:.2g} µm of it change from the middle to the ends; both are in the sigmas.",
     )
-    figures = (
-        SvgFigure(
-            "through-focus",
-            "Through focus",
-            "Measured MTF at Nyquist with one sigma; dotted, the fitted best focus of each field. Black: the CCD.",
-            through_focus_svg(alignment),
-        ),
-        SvgFigure(
-            "defocus",
-            "Where the CCDs stand",
-            "Points: measured with one sigma. Dashes: truth from the traced pupils.",
-            defocus_svg(alignment),
-        ),
+    keys = ("band", "x_mm", "y_mm", "defocus_um", "defocus_um_sigma", "residual_um")
+    caption = "Measured with one sigma by noise; lines: the plane that the shims take away."
+    if isinstance(run, SimulatedFocus):
+        caption += " Dashes: truth from the traced pupils."
+    artefacts: tuple[Artefact, ...] = (
+        SvgFigure("defocus", "Where the CCDs stand", caption, focus_plots.defocus_svg(run)),
+        PLACES.table("places", "Places", "Before the last shims.", PLACES.rows(last), keys),
     )
-    return Section("Alignment", text, figures)
+    return Section("Plane", text, artefacts, folded=1)
 
 
-def _anamorphism(alignment: Alignment) -> float:
-    site = alignment.bench.sites[0]
-    return float(abs(site.nominal_per_shift[TRACK] / site.nominal_per_shift[ALONG] - 1.0))
+def _curves(run: FocusRun) -> Section:
+    """Curves through focus, of the last standing of which a plane was made as a table."""
+    rows: list[tuple[Cell, ...]] = [
+        (
+            one["band"],
+            one["x_mm"],
+            one["y_mm"],
+            DIRECTION_NAMES[edge],
+            curve["vertex_um"],
+            curve["vertex_um_sigma"],
+            f"{curve['peak_mtf']:.4f} ± {curve['peak_mtf_sigma']:.4f}",
+            curve["chi_square"],
+            curve["degrees_of_freedom"],
+            f"{curve['positions_used']} of {curve['positions']}",
+        )
+        for one in PLACES.rows(_last(run))
+        for edge, curve in one["curves"].items()
+    ]
+    heads = ("band", "x [mm]", "y [mm]", "direction", "vertex [µm]", "sigma [µm]", "peak", "χ²", "ν", "positions")
+    caption, digits = "Vertices as moves of the image.", (None, 3, 3, None, 2, 2)
+    drawn = "MTF with one sigma and the fitted curve, by band; black: the CCD."
+    artefacts: list[Artefact] = [
+        SvgFigure("through-focus", "Through focus", drawn, focus_plots.through_focus_svg(run)),
+        Table("curves", "Curves through focus", caption, heads, rows, digits),
+    ]
+    if run.readings and run.readings.no_edge:
+        gone = [{**NO_EDGE(one), "file": Path(one.file).name} for one in run.readings.no_edge]
+        note = "They have no weight."
+        artefacts.insert(1, NO_EDGE.table("no-edge", "Images without a measurable edge", note, gone))
+    text = [
+        "The main peak of every curve is fitted by v = p (1 − u + 0.3 u²), u = a (z − z₀)², over the positions where "
+        "it is above half of its peak; best focus of a place is midway between its directions, which astigmatism moves "
+        "apart.",
+    ]
+    if isinstance(run, SimulatedFocus):
+        ratio = run.bench.sites[0].nominal_per_shift
+        text.insert(
+            0,
+            "The target is moved through the collimator's focus; a slanted edge is recorded at every position in both "
+            "directions, and its MTF at the band's Nyquist frequency is fitted. The image moves along the line's "
+            "direction with f² of that direction over the collimator's f², which differ by "
+            f"{100 * abs(ratio[TRACK] / ratio[ALONG] - 1.0):.1f}% in this camera; each direction is reduced with its "
+            "own.",
+        )
+    return Section("Through focus", tuple(text), tuple(artefacts), folded=1)
 
 
-def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
+def _mtf_section(run: SimulatedFocus, data: Mapping[str, Any]) -> Section:
     end, true = data["rounds"][-1], data["truth"]["rounds"][-1]
     rows = [
         (
@@ -153,7 +325,7 @@ def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
             f"{true['mtf_nyquist'][band]:.4f}",
             f"{end['mtf_nyquist_along_line'][band]:.4f} ± {end['mtf_nyquist_along_line_sigma'][band]:.4f}",
         )
-        for band in alignment.bench.ccds
+        for band in run.bench.ccds
     ]
     names = list(data["mtf_budget"][0]["factors"])
     budget = [
@@ -196,39 +368,8 @@ def _mtf_section(alignment: Alignment, data: Mapping[str, Any]) -> Section:
                 "MTF curves in the middle of the field, after the alignment",
                 "Measured from the slanted edge, with two sigma; dashed: the traced pupil times the detector's "
                 "factors. Dotted: Nyquist frequency.",
-                mtf_svg(alignment),
+                focus_plots.mtf_svg(run),
             ),
-            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", edges_svg(alignment)),
+            SvgFigure("edges", "Recorded edges", "First frame in the middle of the field.", focus_plots.edges_svg(run)),
         ),
     )
-
-
-def _shim_section(alignment: Alignment) -> Section:
-    tables = []
-    for number, shimming in enumerate(alignment.shimmings):
-        plan = shimming.plan
-        assert plan.thickness is not None
-        rows = [
-            (
-                f"{k + 1}",
-                f"{fixed(UM * float(plan.change[k]), 1)} ± {UM * float(plan.change_sigma[k]):.1f}",
-                fixed(UM * float(plan.rounded_change[k]), 0),
-                fixed(UM * float(plan.thickness[k]), 0),
-                fixed(1e3 * float(np.linalg.norm(plan.slide[k])), 3),
-            )
-            for k in range(len(plan.thickness))
-        ]
-        tables.append(
-            Table(
-                f"shims-{number + 1}",
-                f"Shims of round {number + 1}",
-                "Changes of thickness under each hole; their sigma has in it that the sites do not lie on one plane "
-                f"({UM * shimming.plane.extra_sigma:.1f} µm rms: chips, curvature of field). The turn in the mounting "
-                f"surface of {fixed(plan.turn / ARCMIN, 2)} arcmin is set by hand; without it the line would be off "
-                f"level by {fixed(plan.level_coupling / ARCMIN, 2)} arcmin, "
-                "since the mounting surface is not parallel to the focal plane.",
-                ("hole", "change [µm]", "ground [µm]", "new shim [µm]", "slide [mm]"),
-                rows,
-            )
-        )
-    return Section("Shims", (), tuple(tables))

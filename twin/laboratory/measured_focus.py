@@ -1,7 +1,5 @@
-"""Focal-plane alignment from a measured through-focus series: a table of MTF values, or images of a slanted knife edge,
-to vertices, a weighted plane and shims.
-
-Everything from the MTF values on is what the simulated bench's images go through.
+"""A measured through-focus series, from a table of MTF values or from images of a slanted knife edge to best focus at
+every place.
 """
 
 from __future__ import annotations
@@ -9,33 +7,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.focal_plane.plane_fit import LineLevel, ObservabilityError
 from analysis.focal_plane.through_focus import LEAST_POINTS, FocusError, focus_vertex
 from analysis.images.image_file import ImageError, ImageFile, Region
 from analysis.mtf.edge_location import EdgeError
 from analysis.spots.noise import NoiseModel
-from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.threads import cores, one_blas_thread
-from scenes.specs.camera_tests import FocusFiles, MeasuredFocusSpec, NoiseSpec
-from scenes.specs.resolved import ExperimentSetup, FocusSetup, MeasuredFocusSetup
+from scenes.specs.camera_tests import FocusFiles, NoiseSpec
 from scenes.yaml.csv_table import Column, Table, read_table
-from scenes.yaml.errors import InputError, Issue, names_text, nearest
+from scenes.yaml.errors import names_text, nearest
 from scenes.yaml.units import LENGTH
-from twin.laboratory.focus_alignment import Alignment, Shimming, decide, mount_of, run_focus
 from twin.laboratory.focus_scan import SiteScan, edge_mtf
 from twin.laboratory.measured_readings import DataFile
 from twin.run.procedure import Advance, silent
 from twin.targets.target_images import ALONG, DIRECTIONS
-
-__all__ = ["MeasuredAlignment", "MeasuredSite", "align_measured", "run_focus_test"]
 
 Array = NDArray[np.float64]
 MOST_SITES = 3000
@@ -60,7 +50,7 @@ _REGION = ("row", "column", "height", "width")
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredSite:
+class _Place:
     """One place of the focal plane with its rows of the table.
 
     Attributes:
@@ -88,95 +78,49 @@ class NoEdge:
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredAlignment:
-    """One measured standing of the assembly, and what to do about it.
+class FocusReadings:
+    """A measured through-focus series of N sites.
 
     Attributes:
-        spec: of the test.
-        seed: of the command; nothing is drawn.
-        sites: with their rows.
-        scans: of each site.
+        table: as read.
+        bands: of the sites; empty names if the table does not say.
+        places: (X', Y') of the sites, (N, 2), metres.
+        scans: curves through focus of the sites.
         no_edge: images that could not be measured.
-        level: of the line; None if nobody read it.
-        shimming: plane and shims.
-        file: the table.
+        file: the table's.
     """
 
-    spec: MeasuredFocusSpec
-    seed: int
-    sites: tuple[MeasuredSite, ...]
+    table: Table
+    bands: tuple[str, ...]
+    places: Array
     scans: tuple[SiteScan, ...]
     no_edge: tuple[NoEdge, ...]
-    level: LineLevel | None
-    shimming: Shimming
     file: DataFile
 
-    @cached_property
-    def defocus(self) -> Array:
-        """Measured, (N,), metres, positive where the CCD stands downstream of best focus."""
-        return np.array([scan.defocus for scan in self.scans])
 
-    @cached_property
-    def defocus_sigma(self) -> Array:
-        """Its sigma by noise, (N,), metres."""
-        return np.array([scan.defocus_sigma for scan in self.scans])
+def read_focus(files: FocusFiles, advance: Advance = silent) -> FocusReadings:
+    """Read a through-focus series and find best focus at every place.
 
-    @property
-    def edges(self) -> tuple[str, ...]:
-        """Directions that were measured."""
-        return tuple(self.scans[0].vertex)
-
-    @property
-    def chi_square(self) -> tuple[float, int]:
-        """Of all curves through focus together, and their degrees of freedom."""
-        every = [vertex for scan in self.scans for vertex in scan.vertex.values()]
-        return sum(v.chi_square for v in every), sum(v.degrees_of_freedom for v in every)
-
-
-def run_focus_test(
-    setup: ExperimentSetup[Any], backend: Backend, seed: int, advance: Advance = silent
-) -> Alignment | MeasuredAlignment:
-    """``python -m twin.lab focus``. Raises InputError, BenchError."""
-    if isinstance(setup, MeasuredFocusSetup):
-        return align_measured(setup.test, seed, advance)
-    assert isinstance(setup, FocusSetup)
-    return run_focus(setup, backend, seed, advance)
-
-
-def align_measured(spec: MeasuredFocusSpec, seed: int = 0, advance: Advance = silent) -> MeasuredAlignment:
-    """Read the series, find best focus at every place, fit the plane and decide on shims.
+    Args:
+        files: the section of the test's file.
+        advance: told of the progress.
 
     Raises:
         InputError: a table or an image cannot be used, or no best focus can be told from it.
-        BenchError: the mount does not allow the motion.
     """
-    files = spec.measured
     advance("read the series", 0, 1)
     images = files.images is not None
     table = read_table(str(files.images or files.mtf), IMAGE_COLUMNS if images else MTF_COLUMNS, 5)
     sites = _sites(table)
     mtf, sigma, reasons = _from_images(table, files, advance) if images else (table["mtf"], table["sigma"], {})
     shift = table["shift"] * _per_shift(table, files)
-    scans = tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites)
-    level = None if files.level is None else LineLevel(files.level.angle, files.level.sigma, np.zeros(2), 0.0, 0)
-    mount = mount_of(spec)
-    places, defocus = np.array([site.place for site in sites]), np.array([scan.defocus for scan in scans])
-    noise = np.array([scan.defocus_sigma for scan in scans])
-    present = np.array(spec.shims or [spec.mount.thickness] * len(spec.mount.holes))
-    try:
-        shimming = decide(places, defocus, noise, level, mount, present, (spec.vertex_error, spec.vertex_trend))
-    except ObservabilityError as error:
-        text = str(error).removeprefix("focal plane: ")
-        raise InputError(Issue(text, table.file, int(table.lines[0]), ("x",))) from error
-    return MeasuredAlignment(
-        spec=spec,
-        seed=seed,
-        sites=sites,
-        scans=scans,
-        no_edge=tuple(NoEdge(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons)),
-        level=level,
-        shimming=shimming,
-        file=DataFile.of(table),
+    return FocusReadings(
+        table,
+        tuple(site.band for site in sites),
+        np.array([site.place for site in sites]),
+        tuple(_scan(table, site, shift, mtf, sigma, reasons) for site in sites),
+        tuple(NoEdge(table.file, int(table.lines[row]), reasons[row]) for row in sorted(reasons)),
+        DataFile.of(table),
     )
 
 
@@ -198,7 +142,7 @@ def _per_shift(table: Table, files: FocusFiles) -> Array | float:
     return files.per_shift
 
 
-def _sites(table: Table) -> tuple[MeasuredSite, ...]:
+def _sites(table: Table) -> tuple[_Place, ...]:
     """Places in the order of bands as they are named and of their places, each with its rows."""
     band = table["band"] if "band" in table else np.full(len(table), "", dtype=object)
     edge = table["edge"] if "edge" in table else np.full(len(table), ALONG, dtype=object)
@@ -212,7 +156,7 @@ def _sites(table: Table) -> tuple[MeasuredSite, ...]:
     keys, group = np.unique(np.column_stack([of_band, spots]), axis=0, return_inverse=True)
     if len(keys) > MOST_SITES:
         allowed = f"at most {MOST_SITES} places; x and y are those of the field, the same in all rows of a place"
-        raise InputError(Issue("too many places", table.file, int(table.lines[0]), ("x",), str(len(keys)), allowed))
+        raise table.error(0, "x", "too many places", str(len(keys)), allowed)
     columns = [table[name] for name in ("sigma", "mtf") if name in table]
     names = [np.unique(table["file"].astype(str), return_inverse=True)[1]] if "file" in table else []
     pages = [table["page"]] if "page" in table else []
@@ -223,7 +167,7 @@ def _sites(table: Table) -> tuple[MeasuredSite, ...]:
     for k in range(len(keys)):
         rows = order[starts[k] : starts[k + 1]]
         own = {one: rows[edge[rows] == one] for one in directions}
-        site = MeasuredSite(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(own))
+        site = _Place(str(bands[int(keys[k][0])]), table.stacked("x", "y")[rows[0]], FrozenMap(own))
         empty = next((one for one, some in own.items() if not some.size), None)
         if empty is not None:
             text = f"{site} has no row of the edge {empty!r}, which other places have"
@@ -232,9 +176,7 @@ def _sites(table: Table) -> tuple[MeasuredSite, ...]:
     return tuple(out)
 
 
-def _scan(
-    table: Table, site: MeasuredSite, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]
-) -> SiteScan:
+def _scan(table: Table, site: _Place, shift: Array, mtf: Array, sigma: Array, reasons: Mapping[int, str]) -> SiteScan:
     """The place's curves and their vertices."""
     vertex = {}
     for edge, rows in site.rows.items():

@@ -20,8 +20,6 @@ from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import digest_of
 from scenes.yaml.units import ANGLE, LENGTH
 
-__all__ = ["Comparisons", "DataFile", "SpotReadings", "read_comparisons", "read_spots", "read_turntable"]
-
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 MOST_ANGLES = 3000
@@ -126,10 +124,8 @@ def read_turntable(files: TurntableFiles) -> tuple[Comparisons, ...]:
         found = f"{np.degrees(held_out.series.angle[k]):.9g} deg"
         allowed = f"{np.degrees(first):.9g} to {np.degrees(last):.9g} deg, as {files.comparisons} has it"
         line = int(held_out.lines[k].max())
-        issue = Issue(
-            "a held-out reading beyond the calibrated ones", held_out.file.file, line, (held_out.head,), found, allowed
-        )
-        raise InputError(issue)
+        text = "a held-out reading beyond the calibrated ones"
+        raise InputError(Issue(text, held_out.file.file, line, (held_out.head,), found, allowed))
     return series, held_out
 
 
@@ -163,18 +159,16 @@ def read_comparisons(path: str, reference_sigma: float, fewest: int = 4) -> Comp
     if "repeat" in table:
         cells.refuse_twice(table["repeat"], "repeat")
     angle = cells.centre(reading)
-    _check_angles(cells, angle, path, fewest)
+    _check_angles(cells, angle, fewest)
     _check_positions(cells, reading, angle)
     few = cells.count < 2
     if np.any(few):
-        row = int(cells.first[int(np.argmax(few))])
-        text = "one repeat only of this reading, which does not tell its noise"
         remedy = (
-            "2 or more of each, 5 for Chauvenet's criterion to reject any; where the table does not come back to the"
+            "2 or more of each, 5 for Chauvenet's criterion to reject any; where the table does not come back to the "
+            "same reading, a column 'position' that numbers the stops"
         )
-        raise table.error(
-            row, "reading", text, allowed=f"{remedy} same reading, a column 'position' that numbers the stops"
-        )
+        text = "one repeat only of this reading, which does not tell its noise"
+        raise table.error(int(cells.first[int(np.argmax(few))]), "reading", text, allowed=remedy)
     matrix = cells.matrix(value)
     present = cells.present
     mean = np.sum(matrix, axis=1) / cells.count
@@ -277,7 +271,7 @@ def _few_points(table: Table, cells: _Cells, sets: Array | None) -> None:
         remedy = (
             f"{need} or more, over the whole field" if count < need else f"at most {MOST_ANGLES}; 'point' numbers them"
         )
-        raise InputError(Issue(few, table.file, int(table.lines[0]), (), str(count), remedy))
+        raise table.error(0, "", few, str(count), remedy)
     own = cells.present.sum(axis=0)
     if np.min(own) < need:
         k = int(np.argmin(own))
@@ -323,7 +317,7 @@ class _Cells:
         width = int(self.slot.max()) + 1
         if len(self.count) * width > MOST_CELLS:
             text = f"{len(self.count)} angles with up to {width} repeats each"
-            raise InputError(Issue("too many to hold", table.file, int(table.lines[0]), (), text, "fewer repeats"))
+            raise table.error(0, "", "too many to hold", text, "fewer repeats")
         self.present = np.zeros((len(self.count), width), bool)
         self.present[self.group, self.slot] = True
 
@@ -359,32 +353,17 @@ class _Cells:
             raise self.table.error(again, name, text, f"{own[k]:g}", "every number once for each angle")
 
 
-def _check_angles(cells: _Cells, angle: Array, path: str, fewest: int) -> None:
+def _check_angles(cells: _Cells, angle: Array, fewest: int) -> None:
+    """InputError unless there are as many different readings as are needed, and not more than fit into memory."""
     count = len(angle)
-    if count < fewest:
-        remedy = f"{fewest} or more; where the table does not come back to the same reading, a column 'position'"
-        raise InputError(
-            Issue(
-                "too few different readings",
-                path,
-                int(cells.table.lines[0]),
-                (cells.table.heads[READING.name],),
-                str(count),
-                remedy,
-            )
-        )
-    if count > MOST_ANGLES:
-        remedy = f"at most {MOST_ANGLES}; a column 'position' numbers the stops of the table"
-        raise InputError(
-            Issue(
-                "too many different readings",
-                path,
-                int(cells.table.lines[0]),
-                (cells.table.heads[READING.name],),
-                str(count),
-                remedy,
-            )
-        )
+    if fewest <= count <= MOST_ANGLES:
+        return
+    text, remedy = (
+        ("few", f"{fewest} or more; where the table does not come back to the same reading, a column 'position'")
+        if count < fewest
+        else ("many", f"at most {MOST_ANGLES}; a column 'position' numbers the stops of the table")
+    )
+    raise cells.table.error(0, READING.name, f"too {text} different readings", str(count), remedy)
 
 
 def _check_positions(cells: _Cells, reading: Array, angle: Array) -> None:

@@ -2,223 +2,121 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.turntable.angle_fits import AngleFit
-from analysis.turntable.dividing_error import CalibrationSeries, expected_rejections
-from analysis.units import ARCSEC
-from twin.laboratory.measured_readings import Comparisons
-from twin.laboratory.turntable_bench import TurntableModel
+from analysis.turntable.dividing_error import CalibrationSeries, DividingCompensation, expected_rejections
+from twin.laboratory.measured_readings import Comparisons, DataFile
 from twin.laboratory.turntable_run import TurntableRun, rms
-from twin.run.plain_data import WHERE_KNOWN, plain_data
+from twin.run.quantity import Quantity, Record
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class FitNumbers:
-    """One fit: RMS at the held-out readings, at the calibrated ones, and by cross-validation."""
-
-    heldout_rms_arcsec: float | None
-    train_rms_arcsec: float
-    cross_validation_rms_arcsec: float
-    effective_parameters: float
-    settings: Mapping[str, Any]
-
-    @classmethod
-    def of(cls, run: TurntableRun, name: str) -> FitNumbers:
-        """Of one fit by name."""
-        series, fit, validation = run.series, run.fits[name], run.choice[name].validation
-        assert validation is not None
-        return cls(
-            heldout_rms_arcsec=None if run.held_out is None else rms(run.held_out_residual(name)) / ARCSEC,
-            train_rms_arcsec=rms(series.mean - fit(series.angle)) / ARCSEC,
-            cross_validation_rms_arcsec=validation.rms / ARCSEC,
-            effective_parameters=fit.effective_parameters,
-            settings=fit.settings,
-        )
-
-
-@dataclass(frozen=True)
-class CompensationNumbers:
-    """Sigma of a compensated angle: common to all, along the curve, of each reading by itself."""
-
-    common_arcsec: float
-    smooth_arcsec: float
-    white_arcsec: float
-
-
-@dataclass(frozen=True)
-class PointNumbers:
-    """One angle, for figures of one's own."""
-
-    reading_deg: float
-    mean_arcsec: float
-    sigma_arcsec: float
-    rms_before_arcsec: float
-    rms_after_arcsec: float
-    comparisons_arcsec: Array
-    kept: np.ndarray
-    fitted_arcsec: Mapping[str, float]
-
-    @classmethod
-    def of(cls, series: CalibrationSeries, fits: Mapping[str, AngleFit]) -> tuple[PointNumbers, ...]:
-        """Of all angles."""
-        fitted = {name: fit(series.angle) / ARCSEC for name, fit in fits.items()}
-        return tuple(
-            cls(
-                reading_deg=float(np.degrees(series.angle[i])),
-                mean_arcsec=float(series.mean[i]) / ARCSEC,
-                sigma_arcsec=float(series.sigma[i]) / ARCSEC,
-                rms_before_arcsec=float(series.rms_before[i]) / ARCSEC,
-                rms_after_arcsec=float(series.rms_after[i]) / ARCSEC,
-                comparisons_arcsec=series.comparisons[i][series.taken[i]] / ARCSEC,
-                kept=series.keep[i][series.taken[i]],
-                fitted_arcsec={name: float(values[i]) for name, values in fitted.items()},
-            )
-            for i in range(len(series.angle))
-        )
+DATA_FILE: Record[DataFile] = Record(
+    "A file of measurements.",
+    Quantity("file", lambda f: f.file, "path as given"),
+    Quantity("rows", lambda f: f.rows, "rows below its heads"),
+    Quantity("sha256", lambda f: f.sha256, "SHA-256 of its contents"),
+)
+REJECTED: Record[Comparisons] = Record(
+    "A comparison that Chauvenet's criterion takes out, and where it stands.",
+    Quantity("file", lambda c: [c.file.file] * c.series.rejected, "path of its table"),
+    Quantity("line", lambda c: c.lines[c.series.gone], "line in this file"),
+    Quantity("reading_deg", lambda c: c.series.angle[np.nonzero(c.series.gone)[0]], "reading", decimals=6),
+    Quantity("from_mean_arcsec", lambda c: c.series.from_mean[c.series.gone], "minus the mean", "from the mean", 3),
+)
+FIT: Record[tuple[TurntableRun, str]] = Record(
+    "One fit of the dividing error; the source is the run and the fit's name.",
+    Quantity("heldout_rms_arcsec", lambda s: s[0].held_out_rms(s[1]), "RMS residual at the held-out readings"),
+    Quantity("train_rms_arcsec", lambda s: rms(s[0].residual(s[1])), "RMS residual at the calibrated readings"),
+    Quantity("cross_validation_rms_arcsec", lambda s: s[0].choice[s[1]].validation.rms, "RMS at readings left out"),
+    Quantity("effective_parameters", lambda s: s[0].fits[s[1]].effective_parameters, "trace of the smoothing matrix"),
+    Quantity("settings", lambda s: s[0].fits[s[1]].settings, "what was selected: order, period, smoothing, trainings"),
+)
+COMPENSATION: Record[DividingCompensation] = Record(
+    "What a compensated angle is wrong by beside the calibration's noise: one sigma of each part.",
+    Quantity("common_arcsec", lambda c: c.common, "a constant, the same at all readings"),
+    Quantity("smooth_arcsec", lambda c: c.smooth, "misfit along the curve, correlated over one step"),
+    Quantity("white_arcsec", lambda c: c.white, "misfit of each reading by itself"),
+)
+TRUE_FIT: Record[Any] = Record(
+    "A fit minus the true curve.",
+    Quantity("true_rms_arcsec", rms, "RMS difference"),
+    Quantity("true_spread_arcsec", np.std, "RMS difference without a constant, which differences of angles do not see"),
+)
+TRUTH: Record[TurntableRun] = Record(
+    "What no test in a laboratory has.",
+    Quantity("fits", lambda r: {n: r.true_residual(n) for n in r.fits}, "name -> fit minus truth", record=TRUE_FIT),
+    Quantity("dividing_error_spread_arcsec", lambda r: np.std(r.true_error), "RMS of the true curve about its mean"),
+    Quantity("part_rms_full_circle_arcsec", lambda r: _parts(r), "cause -> RMS of its error over the full circle"),
+)
+_Points: TypeAlias = tuple[TurntableRun, CalibrationSeries]
+POINTS: Record[_Points] = Record(
+    "One reading and its comparisons with the reference, reading minus reference.",
+    Quantity("reading_deg", lambda s: s[1].angle, "reading of the table"),
+    Quantity("mean_arcsec", lambda s: s[1].mean, "mean of the comparisons that are kept"),
+    Quantity("sigma_arcsec", lambda s: s[1].sigma, "standard deviation of this mean"),
+    Quantity("rms_before_arcsec", lambda s: s[1].rms_before, "RMS scatter of all comparisons"),
+    Quantity("rms_after_arcsec", lambda s: s[1].rms_after, "RMS scatter of the comparisons that are kept"),
+    Quantity("comparisons_arcsec", lambda s: _each(s[1], s[1].comparisons), "all comparisons"),
+    Quantity("kept", lambda s: _each(s[1], s[1].keep), "whether Chauvenet's criterion keeps each comparison"),
+    Quantity("fitted_arcsec", lambda s: _fitted(*s), "fit -> dividing error by it"),
+)
 
 
-@dataclass(frozen=True)
-class TrueFitNumbers:
-    """A fit against the true curve; ``spread``: without a constant, which differences of angles do not see."""
-
-    true_rms_arcsec: float
-    true_spread_arcsec: float
+def _each(series: CalibrationSeries, values: Any) -> list[Any]:
+    """Values (N, repeats) of a series, reading by reading, without those of comparisons that were not made."""
+    return [row[taken] for row, taken in zip(values, series.taken, strict=True)]
 
 
-@dataclass(frozen=True)
-class TurntableTruth:
-    """What no test in a laboratory has."""
-
-    fits: Mapping[str, TrueFitNumbers]
-    dividing_error_spread_arcsec: float
-    part_rms_full_circle_arcsec: Mapping[str, float]
-
-    @classmethod
-    def of(cls, run: TurntableRun, model: TurntableModel) -> TurntableTruth:
-        """Of a run on a simulated table."""
-        fits = {}
-        for name, fit in run.fits.items():
-            left = fit(run.truth_readings) - run.true_error
-            fits[name] = TrueFitNumbers(rms(left) / ARCSEC, float(np.std(left)) / ARCSEC)
-        return cls(
-            fits=fits,
-            dividing_error_spread_arcsec=float(np.std(run.true_error)) / ARCSEC,
-            part_rms_full_circle_arcsec={name: p.rms / ARCSEC for name, p in model.error.parts.items()},
-        )
+def _fitted(run: TurntableRun, series: CalibrationSeries) -> list[dict[str, float]]:
+    """Fit -> dividing error, at every reading of a series, radians."""
+    values = {name: fit(series.angle) for name, fit in run.fits.items()}
+    return [dict(zip(values, row, strict=True)) for row in zip(*values.values(), strict=True)]
 
 
-@dataclass(frozen=True)
-class FileNumbers:
-    """A file of measurements: rows below its heads, SHA-256 of its contents."""
-
-    file: str
-    rows: int
-    sha256: str
+def _parts(run: TurntableRun) -> dict[str, float]:
+    return {} if run.model is None else {name: part.rms for name, part in run.model.error.parts.items()}
 
 
-@dataclass(frozen=True)
-class RejectedNumbers:
-    """A comparison that Chauvenet's criterion takes out, and where it stands."""
-
-    file: str
-    line: int
-    reading_deg: float
-    from_mean_arcsec: float
-
-    @classmethod
-    def of(cls, comparisons: Comparisons) -> tuple[RejectedNumbers, ...]:
-        """All of a series."""
-        series = comparisons.series
-        return tuple(
-            cls(
-                comparisons.file.file,
-                int(comparisons.lines[i, k]),
-                float(np.degrees(series.angle[i])),
-                float(series.comparisons[i, k] - series.mean[i]) / ARCSEC,
-            )
-            for i, k in np.argwhere(series.taken & ~series.keep)
-        )
+def rejected_rows(tables: tuple[Comparisons, ...]) -> list[dict[str, Any]]:
+    """Rows of `REJECTED` of all tables that were read."""
+    return [row for table in tables for row in REJECTED.rows(table)]
 
 
-@dataclass(frozen=True)
-class TurntableNumbers:
-    """turntable.json. The four RMS at the top are the largest of any angle. Chi-square of the chosen fit: against the
-    sigmas of the calibrated means; at the held-out readings against all that the compensation states.
-    """
-
-    name: str
-    seed: int
-    repeat_rms_arcsec: float
-    chauvenet_rms_arcsec: float
-    averaging_alone_rms_arcsec: float
-    mean_rms_arcsec: float
-    repeatability_arcsec: float
-    rejected: int
-    rejected_expected_of_good: float
-    suspect_angles: int
-    heldout_sigma_arcsec: float | None
-    fits: Mapping[str, FitNumbers]
-    failed: Mapping[str, str | None]
-    chosen: str
-    ranking: Sequence[str]
-    compensation: CompensationNumbers
-    points: tuple[PointNumbers, ...]
-    heldout_points: tuple[PointNumbers, ...]
-    fit_chi_square: float
-    fit_degrees_of_freedom: float
-    heldout_chi_square: float | None
-    heldout_degrees_of_freedom: int | None
-    rejected_readings: tuple[RejectedNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
-    too_few_angles_for: Sequence[str] | None = field(default=None, metadata=WHERE_KNOWN)
-    files: tuple[FileNumbers, ...] | None = field(default=None, metadata=WHERE_KNOWN)
-    truth: TurntableTruth | None = field(default=None, metadata=WHERE_KNOWN)
-
-    @classmethod
-    def of(cls, run: TurntableRun) -> TurntableNumbers:
-        """Of a run."""
-        series, compensation, tables = run.series, run.compensation, run.tables
-        square, freedom = run.chi_square
-        held, held_freedom = run.held_out_chi_square or (None, None)
-        return cls(
-            name=run.spec.name,
-            seed=run.seed,
-            repeat_rms_arcsec=float(np.max(series.rms_before)) / ARCSEC,
-            chauvenet_rms_arcsec=float(np.max(series.rms_after)) / ARCSEC,
-            averaging_alone_rms_arcsec=series.averaging_alone / ARCSEC,
-            mean_rms_arcsec=series.mean_rms / ARCSEC,
-            repeatability_arcsec=series.repeatability / ARCSEC,
-            rejected=series.rejected,
-            rejected_expected_of_good=expected_rejections(series.counts),
-            suspect_angles=int(np.sum(series.suspect)),
-            heldout_sigma_arcsec=None if run.held_out is None else rms(run.held_out.sigma) / ARCSEC,
-            fits={name: FitNumbers.of(run, name) for name in run.fits},
-            failed={trial.name: trial.failure for trial in run.choice.trials if trial.fit is None},
-            chosen=run.choice.chosen,
-            ranking=run.ranking,
-            compensation=CompensationNumbers(
-                compensation.common / ARCSEC, compensation.smooth / ARCSEC, compensation.white / ARCSEC
-            ),
-            points=PointNumbers.of(series, run.fits),
-            heldout_points=() if run.held_out is None else PointNumbers.of(run.held_out, run.fits),
-            fit_chi_square=square,
-            fit_degrees_of_freedom=freedom,
-            heldout_chi_square=held,
-            heldout_degrees_of_freedom=held_freedom,
-            rejected_readings=tuple(one for table in tables for one in RejectedNumbers.of(table)) if tables else None,
-            too_few_angles_for=run.too_few if tables else None,
-            files=tuple(FileNumbers(**asdict(table.file)) for table in tables) or None,
-            truth=None if run.model is None else TurntableTruth.of(run, run.model),
-        )
-
-
-def turntable_numbers(run: TurntableRun) -> dict[str, Any]:
-    """Contents of turntable.json without its frames."""
-    return dict(plain_data(TurntableNumbers.of(run)))
+TURNTABLE: Record[TurntableRun] = Record(
+    "turntable.json.",
+    Quantity("name", lambda r: r.spec.name, "name of the test"),
+    Quantity("seed", lambda r: r.seed, "seed of all that was drawn"),
+    Quantity("repeat_rms_arcsec", lambda r: np.max(r.series.rms_before), "largest RMS of the repeats at a reading"),
+    Quantity("chauvenet_rms_arcsec", lambda r: np.max(r.series.rms_after), "the largest of those that are kept"),
+    Quantity("averaging_alone_rms_arcsec", lambda r: r.series.averaging_alone, "largest RMS of a mean of all"),
+    Quantity("mean_rms_arcsec", lambda r: r.series.mean_rms, "largest RMS of a mean of what is kept"),
+    Quantity(
+        "repeatability_arcsec", lambda r: r.series.repeatability, "sigma of one comparison, all readings together"
+    ),
+    Quantity("rejected", lambda r: r.series.rejected, "comparisons that Chauvenet's criterion takes out"),
+    Quantity("rejected_expected_of_good", lambda r: expected_rejections(r.series.counts), "average if all were good"),
+    Quantity("suspect_angles", lambda r: np.sum(r.series.suspect), "readings that still scatter after the criterion"),
+    Quantity("heldout_sigma_arcsec", lambda r: r.held_out and rms(r.held_out.sigma), "RMS sigma of the held-out means"),
+    Quantity("fits", lambda r: {n: (r, n) for n in r.fits}, "name -> fit", record=FIT),
+    Quantity("failed", lambda r: r.choice.failed, "name of a fit -> why it failed"),
+    Quantity("chosen", lambda r: r.choice.chosen, "fit that cross-validation chooses"),
+    Quantity("ranking", lambda r: r.ranking, "fits by their RMS at held-out readings or cross-validation, best first"),
+    Quantity("compensation", lambda r: r.compensation, "of the chosen fit", record=COMPENSATION),
+    Quantity("points", lambda r: POINTS.rows((r, r.series)), "calibrated readings"),
+    Quantity("heldout_points", lambda r: POINTS.rows((r, r.held_out)) if r.held_out else [], "held-out readings"),
+    Quantity("fit_chi_square", lambda r: r.chi_square[0], "of the chosen fit against the sigmas of the means"),
+    Quantity("fit_degrees_of_freedom", lambda r: r.chi_square[1], "means minus effective parameters"),
+    Quantity("heldout_chi_square", lambda r: r.held_out_chi_square[0], "against all that the compensation states"),
+    Quantity("heldout_degrees_of_freedom", lambda r: r.held_out_chi_square[1], "number of held-out readings"),
+    Quantity(
+        "rejected_readings", lambda r: rejected_rows(r.tables) if r.tables else None, "in files", where_known=True
+    ),
+    Quantity(
+        "too_few_angles_for", lambda r: r.too_few if r.tables else None, "fits that were left out", where_known=True
+    ),
+    Quantity(
+        "files", lambda r: [t.file for t in r.tables] or None, "that were read", record=DATA_FILE, where_known=True
+    ),
+    Quantity("truth", lambda r: r.model and r, "of a simulated table", record=TRUTH, where_known=True),
+)

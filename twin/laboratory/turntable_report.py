@@ -15,7 +15,7 @@ from analysis.units import ARCSEC
 from scenes.specs.turntable import MeasuredTurntableSpec
 from scenes.yaml.units import ANGLE, format_quantity
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_numbers import turntable_numbers
+from twin.laboratory.turntable_numbers import REJECTED, TURNTABLE
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import Artefact, SvgFigure, Table, fixed
 from twin.run.report import Report, Section, one_sentence
@@ -49,14 +49,14 @@ def comparison_figure(run: TurntableRun) -> Figure:
     """All comparisons about the mean of those that are kept, and the RMS at each angle before and after rejection."""
     series = run.series
     angle = np.degrees(series.angle)
-    off = (series.comparisons - series.mean[:, None]) / ARCSEC
+    off = series.from_mean / ARCSEC
     spread = np.linspace(-0.12, 0.12, series.repeats) * np.degrees(series.step)
     places = angle[:, None] + spread
     keep = series.keep
     figure = new_figure(5.2)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
     top.plot(places[keep], off[keep], ".", color=BLUE, ms=3.5, label=f"kept, {np.sum(keep)}")
-    gone = series.taken & ~keep
+    gone = series.gone
     top.plot(places[gone], off[gone], "x", color=VERMILION, ms=5.5, label=f"rejected, {series.rejected}")
     top.set(title="Comparisons, minus the mean of those kept at their angle", ylabel="arcsec")
     top.margins(y=0.18)
@@ -192,7 +192,7 @@ def _comparison(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         "averaging_alone_rms_arcsec": "mean of all repeats, nothing rejected",
         "mean_rms_arcsec": "mean of the kept repeats",
     }
-    rows = [(text_, result[key]) for key, text_ in names.items()]
+    rows = [(said, result[key]) for key, said in names.items()]
     table = Table(
         "turntable-repeats",
         "Repeats: the largest RMS of any angle",
@@ -258,17 +258,12 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
     artefacts += [_ranking(result), _left(run, result), _chi_square(run, result)]
     gone = result.get("rejected_readings")
     if gone:
-        lines = [(Path(one["file"]).name, one["line"], one["reading_deg"], one["from_mean_arcsec"]) for one in gone]
-        artefacts.append(
-            Table(
-                "turntable-rejected",
-                "Comparisons that Chauvenet's criterion takes out",
-                "Difference from the mean of those that stay.",
-                ("file", "line", "reading [deg]", "from the mean [arcsec]"),
-                lines,
-                (None, None, 6, 3),
-            )
+        note, lines = (
+            "Difference from the mean of those that stay.",
+            [{**one, "file": Path(one["file"]).name} for one in gone],
         )
+        title = "Comparisons that Chauvenet's criterion takes out"
+        artefacts.append(REJECTED.table("turntable-rejected", title, note, lines))
     return Section("Fits of the dividing error", tuple(text), tuple(artefacts), folded=1 if gone else 0)
 
 
@@ -335,7 +330,7 @@ def _chi_square(run: TurntableRun, result: Mapping[str, Any]) -> Table:
 
 def turntable_report(run: TurntableRun) -> Report:
     """Report of a turntable test."""
-    data, spec = turntable_numbers(run), run.spec
+    data, spec = TURNTABLE(run), run.spec
     chosen, parts, truth = data["chosen"], data["compensation"], data.get("truth")
     sigma = float(np.sqrt(np.mean(run.compensation.sigma(run.series.angle) ** 2))) / ARCSEC
     names = {"common": "an offset common to all readings", "smooth": "what the fit misses between its points"}

@@ -60,40 +60,49 @@ class TurntableRun:
     @property
     def fits(self) -> dict[str, AngleFit]:
         """The fits that succeeded, in the order in which they were made."""
-        return {trial.name: trial.fit for trial in self.choice.trials if trial.fit is not None}
+        return {name: trial.fit for name, trial in self.choice.trials.items()}
+
+    def residual(self, name: str) -> Array:
+        """Measured - fitted dividing error at the calibrated readings, (N,), radians."""
+        return self.series.mean - self.fits[name](self.series.angle)
+
+    def true_residual(self, name: str) -> Array:
+        """Fitted - true dividing error of a simulated table at `truth_readings`, radians."""
+        return self.fits[name](self.truth_readings) - self.true_error
 
     def held_out_residual(self, name: str) -> Array:
         """Measured - fitted dividing error at the held-out readings, radians."""
         assert self.held_out is not None
         return self.held_out.mean - self.fits[name](self.held_out.angle)
 
+    def held_out_rms(self, name: str) -> float | None:
+        """RMS of `held_out_residual`, radians; None without held-out readings."""
+        return None if self.held_out is None else rms(self.held_out_residual(name))
+
+    def _judged(self, name: str) -> float:
+        held_out = self.held_out_rms(name)
+        return self.choice[name].validation.rms if held_out is None else held_out
+
     @cached_property
     def ranking(self) -> tuple[str, ...]:
         """Names of the fits by their RMS at the held-out readings, the best first; without such readings by
         cross-validation.
         """
-
-        def judged(name: str) -> float:
-            if self.held_out is not None:
-                return rms(self.held_out_residual(name))
-            validation = self.choice[name].validation
-            assert validation is not None
-            return validation.rms
-
-        return tuple(sorted(self.fits, key=judged))
+        return tuple(sorted(self.fits, key=self._judged))
 
     @cached_property
     def chi_square(self) -> tuple[float, float]:
         """Chi-square of the chosen fit at the calibrated readings, against their sigmas, and its degrees of freedom."""
-        fit, series = self.compensation.fit, self.series
-        square = float(np.sum(((series.mean - fit(series.angle)) / series.sigma) ** 2))
-        return square, len(series.angle) - fit.effective_parameters
+        square = float(np.sum((self.residual(self.choice.chosen) / self.series.sigma) ** 2))
+        return square, len(self.series.angle) - self.compensation.fit.effective_parameters
 
     @cached_property
-    def held_out_chi_square(self) -> tuple[float, int] | None:
-        """Chi-square at the held-out readings, against all that the compensation states, and its degrees of freedom."""
+    def held_out_chi_square(self) -> tuple[float, int] | tuple[None, None]:
+        """Chi-square at the held-out readings, against all that the compensation states, and its degrees of freedom;
+        None without such readings.
+        """
         if self.held_out is None:
-            return None
+            return None, None
         held, fit = self.held_out, self.compensation
         rest = held.mean - fit.error(held.angle)
         spread = np.diag(held.sigma**2) + fit.covariance(held.angle)

@@ -7,20 +7,15 @@ from matplotlib.figure import Figure
 
 from optics.geometry.tree import State
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.shadow import imaging_shadows
-from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
-from scenes.specs.resolved import ResolvedJob, resolve_job, target_band
+from scenes.specs.resolved import ResolvedJob, resolve_job
 from scenes.yaml.errors import InputError
 from twin.camera.camera_view import CameraView, draw_mtf, draw_spot, draw_wavefront, field_text
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.random_streams import stream
 from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, VERMILION, look, to_svg
-from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import DIRECTIONS, TargetCamera
-from twin.targets.target_measurement import read_edge
-from twin.targets.target_path import TargetPath
-from twin.targets.target_result import EdgeReading
+from twin.targets.target_measurement import EdgeReading, read_edge, target_camera
 
 SIZE = (7.6, 3.5)
 """Inches."""
@@ -28,7 +23,7 @@ FOCUS = 150e-6
 """Defocus to either side of the picture through focus, metres."""
 STEPS = 49
 PLACE = "centre"
-"""Of the line, where the knife edge stands."""
+"""Place on the line where the knife edge stands."""
 UM = "\N{MICRO SIGN}m"
 
 
@@ -109,16 +104,8 @@ class CameraPictures:
         if camera not in self._benches:
             experiment = self.experiment
             instrument, resolved = experiment.instrument, _with_targets(experiment.resolved)
-            model = instrument.cameras[camera]
-            reference = resolved.instrument.cameras[camera].camera
-            band = target_band(resolved.cameras[reference])
-            assert resolved.line_detectors is not None
-            ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
-            shadows = imaging_shadows(instrument, camera, experiment.backend)
-            path = TargetPath(
-                instrument.assembly, camera, f"{BASE}/{camera}", model, experiment.backend, shadows=shadows
-            )
-            self._benches[camera] = TargetCamera(path, ccd, resolved.targets.region), resolved.targets
+            bench = target_camera(resolved, instrument, camera, experiment.backend)
+            self._benches[camera] = bench, resolved.targets
         return self._benches[camera]
 
 

@@ -17,20 +17,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from twin.live.computer import BeforeKey, Computer, ComputerLost
-from twin.live.messages import (
-    LARGEST_SEED,
-    AskedState,
-    AskedView,
-    BadMessage,
-    Blind,
-    BlindState,
-    Factors,
-    Message,
-    Record,
-    Save,
-    read_message,
-)
+from twin.live import messages
+from twin.live.computer import BeforeKey, Computer, ComputerLost, Kind
 
 MOST_CLIENTS = 8
 RATE, BURST = 400.0, 2000
@@ -72,7 +60,7 @@ class Goodbye(Exception):
 
 
 @dataclass(frozen=True, eq=False)
-class Wish:
+class _Wish:
     """Something that a page wants.
 
     Attributes:
@@ -94,15 +82,15 @@ class Client:
         before: for which noise, frames and seed it has the images before.
     """
 
-    state: AskedState | None = None
-    view: AskedView | None = None
-    saves: deque[Save] = field(default_factory=lambda: deque(maxlen=4))
-    factors: Factors | None = None
-    reveal: BlindState | None = None
-    shown: AskedState | None = None
+    state: messages.AskedState | None = None
+    view: messages.AskedView | None = None
+    saves: deque[messages.Save] = field(default_factory=lambda: deque(maxlen=4))
+    factors: messages.Factors | None = None
+    reveal: messages.BlindState | None = None
+    shown: messages.AskedState | None = None
     before: BeforeKey | None = None
     blind: int | None = None
-    recorded: deque[tuple[float, AskedState]] | None = None
+    recorded: deque[tuple[float, messages.AskedState]] | None = None
     record_began: float = 0.0
     bad: int = 0
     _tokens: float = BURST
@@ -117,22 +105,22 @@ class Client:
         """Whether it waits for something."""
         return bool(self.state or self.view or self.factors or self.saves or self.reveal)
 
-    def next_wish(self) -> Wish:
+    def next_wish(self) -> _Wish:
         """What it wants next, which it then no longer wants. It has to want something."""
         if self.factors is not None:
-            wish, self.factors = Wish("factors", self.factors), None
+            wish, self.factors = _Wish("factors", self.factors), None
         elif self.state is not None:
-            wish, self.state = Wish("state", self.state), None
+            wish, self.state = _Wish("state", self.state), None
         elif self.reveal is not None:
-            wish, self.reveal = Wish("reveal", self.reveal), None
+            wish, self.reveal = _Wish("reveal", self.reveal), None
         elif self.saves:
-            wish = Wish("save", self.saves.popleft())
+            wish = _Wish("save", self.saves.popleft())
         else:
-            wish, self.view = Wish("view", self.view), None
+            wish, self.view = _Wish("view", self.view), None
         return wish
 
-    def put_back(self, wish: Wish) -> None:
-        """It could not be served; what was asked for since goes before it."""
+    def put_back(self, wish: _Wish) -> None:
+        """Keep a wish that could not be served; a later wish of the same kind goes before it."""
         if wish.kind == "save":
             self.saves.appendleft(wish.asked)
         elif getattr(self, wish.kind) is None:
@@ -150,8 +138,8 @@ class Client:
         if self._tokens < 0.0:
             raise Goodbye(POLICY_VIOLATION, "too many messages")
         try:
-            message = read_message(text)
-        except BadMessage as error:
+            message = messages.read_message(text)
+        except messages.BadMessage as error:
             self.bad += 1
             if self.bad > BAD_MESSAGES:
                 raise Goodbye(POLICY_VIOLATION, "too many messages that are none") from None
@@ -159,24 +147,24 @@ class Client:
             return
         self._do(message, now)
 
-    def _do(self, message: Message, now: float) -> None:
+    def _do(self, message: messages.Message, now: float) -> None:
         match message:
-            case AskedState():
+            case messages.AskedState():
                 self.state = self._own(message)
-            case AskedView():
+            case messages.AskedView():
                 self.view = message
-            case Factors():
+            case messages.Factors():
                 self.factors = message
-            case Save():
+            case messages.Save():
                 self.saves.append(message)
-            case Blind():
+            case messages.Blind():
                 if message.on:
-                    self.blind = secrets.randbelow(LARGEST_SEED)
+                    self.blind = secrets.randbelow(messages.LARGEST_SEED)
                 elif self.blind is not None:
-                    self.reveal = _hiding(self.shown or AskedState(n=0), self.blind)
+                    self.reveal = _hiding(self.shown or messages.AskedState(n=0), self.blind)
                     self.blind = None
                 self.tell({"type": "blind", "on": self.blind is not None})
-            case Record():
+            case messages.Record():
                 if message.on:
                     self.recorded, self.record_began = deque(maxlen=MOST_RECORDED), now
                     if self.shown is not None:
@@ -185,14 +173,14 @@ class Client:
                 if not message.on:
                     self.record_began = 0.0
 
-    def _own(self, state: AskedState) -> AskedState:
+    def _own(self, state: messages.AskedState) -> messages.AskedState:
         """With what is hidden from the page."""
         return state if self.blind is None else _hiding(state, self.blind)
 
-    def kept(self, state: AskedState) -> None:
+    def kept(self, state: messages.AskedState) -> None:
         """A state was computed."""
         self.shown = state
-        if self.recorded is not None and self.record_began and not isinstance(state, BlindState):
+        if self.recorded is not None and self.record_began and not isinstance(state, messages.BlindState):
             self.recorded.append((time.monotonic() - self.record_began, state))
 
     def answer(self, message: bytes, before: BeforeKey) -> None:
@@ -240,8 +228,8 @@ class Client:
                 raise Goodbye(TRY_AGAIN, "the line is too slow") from None
 
 
-def _hiding(state: AskedState, seed: int) -> BlindState:
-    return BlindState.model_validate({**state.model_dump(), "blind": seed})
+def _hiding(state: messages.AskedState, seed: int) -> messages.BlindState:
+    return messages.BlindState.model_validate({**state.model_dump(), "blind": seed})
 
 
 class Desk:
@@ -317,8 +305,25 @@ class Desk:
                 self._tell_of("stopped", HALTED.format(pid=self.computer.pid, seconds=STOPPED))
             elif condition == "stopped" and time.monotonic() - since > STOPPED:
                 self.computer.kill()
-            elif condition == "runs" and known == "stopped":
-                self._tell_of("runs")
+            elif condition == "runs":
+                self._goes_on()
+
+    async def _ask(self, kind: Kind, question: Any) -> Any:
+        """The computer's answer. An answer that comes while the pages still believe the process stopped shows that it
+        goes on, and they are told so before they get it, however long the next look at the process is away.
+
+        Raises:
+            ComputerLost: the process ended.
+        """
+        answer = await self.computer.ask(kind, question)
+        if self.trouble and self.computer.condition == "runs":
+            self._goes_on()
+        return answer
+
+    def _goes_on(self) -> None:
+        """Tell the pages that the process runs, if what they know is that it was stopped."""
+        if self.trouble.get("state") == "stopped":
+            self._tell_of("runs")
 
     def _tell_of(self, state: str, problem: str = "") -> None:
         """Tell all pages, those that come later too, how it is with the process that computes; each news once."""
@@ -329,7 +334,7 @@ class Desk:
         for one in self.clients:
             one.tell(told)
 
-    def _lost(self, client: Client, wish: Wish, problem: str) -> None:
+    def _lost(self, client: Client, wish: _Wish, problem: str) -> None:
         """The process ended over a wish. It is kept, unless the process has ended over it before."""
         self._tell_of("ended", AGAIN.format(problem))
         if wish.asked is self._suspect:
@@ -359,10 +364,10 @@ class Desk:
                     return client
         return None
 
-    async def _build(self, client: Client, asked: Factors) -> None:
+    async def _build(self, client: Client, asked: messages.Factors) -> None:
         for one in self.clients:
             one.tell({"type": "building"})
-        found = await self.computer.ask("factors", asked.values)
+        found = await self._ask("factors", asked.values)
         if isinstance(found, str):
             client.tell({"type": "refused", "problem": found})
         else:
@@ -371,21 +376,21 @@ class Desk:
         for one in self.clients:
             one.tell({"type": "hello", **self.computer.opened.greeting})
 
-    async def _serve(self, client: Client, wish: Wish) -> None:
+    async def _serve(self, client: Client, wish: _Wish) -> None:
         asked = wish.asked
-        if isinstance(asked, Factors):
+        if isinstance(asked, messages.Factors):
             await self._build(client, asked)
         elif wish.kind == "state":
             key = (asked.noise, asked.frames, asked.seed)
-            client.answer(await self.computer.ask("state", (asked, client.before)), key)
+            client.answer(await self._ask("state", (asked, client.before)), key)
             client.kept(asked)
             self.states += 1
         elif wish.kind == "reveal":
-            client.letter(await self.computer.ask("hidden", asked))
-        elif isinstance(asked, Save):
+            client.letter(await self._ask("hidden", asked))
+        elif isinstance(asked, messages.Save):
             if asked.what == "job":
-                client.letter(await self.computer.ask("job", asked.state))
+                client.letter(await self._ask("job", asked.state))
             else:
-                client.letter(await self.computer.ask("course", list(client.recorded or ())))
+                client.letter(await self._ask("course", list(client.recorded or ())))
         else:
-            client.picture(await self.computer.ask("view", asked))
+            client.picture(await self._ask("view", asked))

@@ -21,6 +21,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
+from optics.numerics.backend import BackendUnavailable
+from optics.numerics.llvm import LibraryMissing
+from optics.numerics.threads import cores, kernel_threads, one_blas_thread
 from scenes.yaml.errors import InputError
 from twin.live.camera_pictures import CameraPictures
 from twin.live.live_bench import LOST, LiveBench
@@ -114,12 +117,7 @@ class Answers:
         try:
             state = self.bench.states(asked.state)
             told["svg"] = self.pictures.draw(
-                asked.view,
-                asked.camera,
-                asked.field,
-                state,
-                asked.state.frames,
-                self.bench.seed_of(asked.state.seed),
+                asked.view, asked.camera, asked.field, state, asked.state.frames, self.bench.seed_of(asked.state.seed)
             )
         except LOST as error:
             told["problem"] = str(error)[:1000]
@@ -198,7 +196,7 @@ class Computer:
             raise CannotStart(str(error)) from error
 
     def _start(self, advance: Callable[[str], None] = lambda part: None) -> None:
-        """Likewise.
+        """Start the process once and wait until it is ready, as `start` says.
 
         Raises:
             CannotStart: the instrument cannot be built.
@@ -302,7 +300,7 @@ class Computer:
 
     @property
     def pid(self) -> int | None:
-        """Of the process."""
+        """Number of the process; None before it was started."""
         return None if self._process is None else self._process.pid
 
     @property
@@ -357,11 +355,6 @@ def compute(pipe: Connection, what: str, backend: str, run: int | None) -> None:
     # Ctrl-C goes to the whole group of the terminal; the server ends this process by closing the pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with(os.getppid())
-    from optics.numerics.backend import BackendUnavailable
-    from optics.numerics.llvm import LibraryMissing
-    from optics.numerics.threads import cores, kernel_threads, one_blas_thread
-    from scenes.yaml.errors import InputError
-
     with one_blas_thread():
         try:
             answers = Answers(what, backend, lambda part: pipe.send(("part", part)), run)

@@ -49,7 +49,7 @@ HEADERS: Mapping[str, str] = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Of every answer."""
+"""Headers of every answer."""
 
 
 class BadToken(ValueError):
@@ -86,7 +86,7 @@ class Guard:
 
     @classmethod
     def of(cls, token: str, host: str, port: int) -> Guard:
-        """That of a server that listens on a host and a port."""
+        """The guard of a server that listens on a host and a port."""
         named = f"[{host}]" if ":" in host else host.lower()
         names = LOOPBACK if host in ("127.0.0.1", "localhost", "::1") else (named, *LOOPBACK)
         if host in EVERYWHERE:
@@ -95,7 +95,7 @@ class Guard:
 
     @property
     def cookie_name(self) -> str:
-        """Of the cookie with the token."""
+        """Name of the cookie with the token."""
         return COOKIE.format(port=self.port)
 
     @property
@@ -220,7 +220,7 @@ class Connections:
             self._cut(count.most_common(1)[0][0])
 
     def is_known(self, one: Connection) -> None:
-        """It showed the token."""
+        """Count a stranger that showed the token among the known; the oldest of these makes room."""
         if self._strangers.pop(one, None) is None:
             return
         self._known[one] = None
@@ -230,7 +230,7 @@ class Connections:
             first.cut()
 
     def went(self, one: Connection) -> None:
-        """It is closed, or carries a WebSocket from now on."""
+        """Forget a connection that is closed, or carries a WebSocket from now on."""
         self._strangers.pop(one, None)
         self._known.pop(one, None)
 
@@ -292,13 +292,13 @@ class Connection(H11Protocol):
         self.cut()
 
     def handle_websocket_upgrade(self, event: Any) -> None:
-        """It becomes a page's WebSocket, or is refused at once; either is no longer counted here."""
+        """Stop counting a connection that becomes a page's WebSocket, or is refused at once."""
         self._within(None)
         self.all.went(self)
         super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """It is closed."""
+        """Forget a connection that is closed."""
         self._within(None)
         self.all.went(self)
         super().connection_lost(exc)
@@ -339,7 +339,7 @@ class PageSocket(WebSocketsSansIOProtocol):
         self._end_soon()
 
     def keepalive_timeout(self) -> None:
-        """It does not answer, and may not read either."""
+        """End a page that does not answer, and may not read either."""
         super().keepalive_timeout()
         self._end_soon()
 

@@ -15,7 +15,7 @@ from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
-from twin.study.runs.config_tree import Tree, leaf, with_values
+from twin.study.runs.base_job import Tree, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 
@@ -26,7 +26,7 @@ are rigid motions."""
 
 
 @dataclass(frozen=True)
-class KnobKind:
+class _KnobKind:
     """What all knobs of one kind have in common.
 
     Attributes:
@@ -42,13 +42,13 @@ class KnobKind:
     limit: float
 
 
-KINDS: Mapping[str, KnobKind] = {
-    "rotate": KnobKind("rotate", "arcsec", 10.0, 18_000.0),
-    "shift": KnobKind("shift", "um", 10.0, 100_000.0),
-    "figure": KnobKind("figure", "nm", 50.0, 100_000.0),
-    "scale": KnobKind("scale", "ppm", 20.0, 10_000.0),
-    "temperature": KnobKind("temperature", "K", 1.0, 1000.0),
-    "gradient": KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
+KINDS: Mapping[str, _KnobKind] = {
+    "rotate": _KnobKind("rotate", "arcsec", 10.0, 18_000.0),
+    "shift": _KnobKind("shift", "um", 10.0, 100_000.0),
+    "figure": _KnobKind("figure", "nm", 50.0, 100_000.0),
+    "scale": _KnobKind("scale", "ppm", 20.0, 10_000.0),
+    "temperature": _KnobKind("temperature", "K", 1.0, 1000.0),
+    "gradient": _KnobKind("temperature", "mK/m", 50.0, 1_000_000.0),
 }
 """By name. Limits are those of a job's file."""
 
@@ -78,7 +78,7 @@ class Knob:
     limit: float
 
     def plain(self) -> dict[str, Any]:
-        """As the page gets it."""
+        """Plain data for the page."""
         return asdict(self)
 
 
@@ -236,7 +236,7 @@ class FactorKnob:
     knobs: Mapping[str, float]
 
     def plain(self) -> dict[str, Any]:
-        """As the page gets it."""
+        """Plain data for the page."""
         return asdict(self)
 
     def scalar(self, value: float) -> Any:
@@ -245,13 +245,13 @@ class FactorKnob:
         return with_unit(number, self.unit) if self.unit else number
 
     def beginning(self, scalar: Any) -> FactorKnob:
-        """The same where it begins at a value of a run, which a distribution may have drawn from beyond the range."""
+        """Begin the factor at a value of a run, which a distribution may have drawn from beyond the range."""
         value = _number(scalar, self.unit, self.value)
         return replace(self, value=value, low=min(self.low, value), high=max(self.high, value))
 
 
 def factor_knobs(setup: StudySetup) -> tuple[FactorKnob, ...]:
-    """Of all of a study's factors that are numbers."""
+    """Knobs of those of a study's factors that are numbers."""
     turned = (_factor(name, factor, setup) for name, factor in setup.study.factors.items())
     return tuple(factor for factor in turned if factor is not None)
 

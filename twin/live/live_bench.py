@@ -19,10 +19,10 @@ from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
 from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
-from scenes.specs.course import DEFAULT_PIVOT, moment
+from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
 from scenes.specs.job import check_nodes
 from twin.live.knobs import Knob, knobs_of, perturbation
-from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState, Course
+from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.assumptions import contradiction, doubted
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT
@@ -32,7 +32,7 @@ from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
 from twin.scripting.instrument_twin import InstrumentTwin
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.study.runs.base_job import PHYSICS
 
 BLIND = 7
@@ -73,14 +73,14 @@ class LiveBench:
     @cached_property
     def at_rest(self) -> AskedState:
         """The state in which the knobs begin."""
-        job, course = self.twin.resolved.job, self.course
+        job = self.twin.resolved.job
         return AskedState(
             n=0,
             knobs={knob.name: knob.value for knob in self.knobs.values() if knob.value},
             pivots={path: what.pivot for path, what in job.perturb.items() if what.pivot != DEFAULT_PIVOT},
             frames=min(self.twin.resolved.frames, MOST_FRAMES),
             seed=job.render.seed & LARGEST_SEED,
-            time=None if course is None else course.shown,
+            time=None if job.course is None else job.course.shown,
         )
 
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
@@ -133,14 +133,8 @@ class LiveBench:
             "angle": _label(parameters.ANGLE) if len(twin.cameras) == 2 else None,
             "ground": [_label(p) for p in parameters.GROUND] if experiment.ground is not None else [],
             "disturbances": "" if stated_motion is None else stated_motion.name,
-            "course": self.course.plain() if self.course is not None else None,
+            "course": None if job.course is None else _played(job.course),
         }
-
-    @property
-    def course(self) -> Course | None:
-        """Times of the job's course; None without."""
-        course = self.twin.resolved.job.course
-        return None if course is None else Course(tuple(course.times), tuple(map(moment, course.times)), course.shown)
 
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
         """The instrument as the knobs stand.
@@ -223,11 +217,6 @@ class LiveBench:
         stated = self.twin.experiment.stated
         assert stated is not None
         return stated.draw(np.random.default_rng(stream(asked.blind, BLIND)), 1)[0]
-
-    def hidden_amounts(self, asked: BlindState) -> list[float]:
-        """What was drawn for a blind guess, each over its sigma; correlated where that is stated."""
-        parts = self._components
-        return [float(value / part.sigma) for value, part in zip(self._drawn(asked), parts, strict=True) if part.sigma]
 
     def hidden(self, asked: BlindState) -> dict[str, Any]:
         """What was drawn for a blind guess, the largest in its sigma first, and what it truly did."""
@@ -336,10 +325,10 @@ def _ms(began: float) -> float:
     return 1e3 * (time.perf_counter() - began)
 
 
+def _played(course: CourseSpec) -> dict[str, Any]:
+    """Times of a course in seconds, as a file writes them, and the number of the one that the job shows in full."""
+    return {"times": list(course.times), "names": list(map(moment, course.times)), "shown": course.shown}
+
+
 def _label(parameter: Parameter) -> Mapping[str, str]:
-    return {
-        "key": parameter.key,
-        "symbol": parameter.symbol,
-        "unit": parameter.unit,
-        "meaning": parameter.meaning,
-    }
+    return {"key": parameter.key, "symbol": parameter.symbol, "unit": parameter.unit, "meaning": parameter.meaning}

@@ -59,7 +59,7 @@ class AskedState(_Said):
 
 
 class BlindState(AskedState):
-    """The same while something is hidden; made by the program, never read from a page.
+    """A state of the knobs while something is hidden. The program makes it; it is never read from a page.
 
     Attributes:
         blind: seed of what is drawn.
@@ -182,22 +182,3 @@ class Opened:
 
     greeting: dict[str, Any]
     scene: bytes
-
-
-@dataclass(frozen=True)
-class Course:
-    """Times that can be played.
-
-    Attributes:
-        times: seconds.
-        names: as a file writes them.
-        shown: number of the one that the job shows in full.
-    """
-
-    times: tuple[float, ...]
-    names: tuple[str, ...]
-    shown: int
-
-    def plain(self) -> dict[str, Any]:
-        """As the page gets it."""
-        return {"times": list(self.times), "names": list(self.names), "shown": self.shown}

@@ -69,10 +69,7 @@ def course_text(bench: LiveBench, kept: Sequence[tuple[float, AskedState]]) -> s
     plain = resolved.plain()
     job = plain["job"]
     job["perturb"] = perturbation(fixed, first.pivots, knobs, job.get("perturb", {}))
-    job["course"] = {
-        "times": [f"{time!r} s" for time, _ in steps],
-        **_courses(moving, first.pivots, knobs, len(steps)),
-    }
+    job["course"] = {"times": [f"{time!r} s" for time, _ in steps], **_courses(moving, first.pivots, knobs, len(steps))}
     validate(JobSpec, YamlFile("", job, {}))
     return _head() + dump_yaml(plain)
 

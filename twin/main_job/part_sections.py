@@ -15,7 +15,7 @@ from twin.path_tracing.path_result import Family
 from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
 from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
-from twin.targets.target_result import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
+from twin.targets.target_measurement import NYQUIST, BarReading, CameraTargets, EdgeReading, TargetRun
 
 _WHEN = ("before", "after")
 FREE = "the pupils are free: `obstruction: ignore`"
@@ -207,21 +207,17 @@ def _mtf_rows(name: str, camera: CameraTargets) -> list[list[Cell]]:
             for when, shots in targets.shots.items():
                 for kind, reading in (("edge", shots.edges.get(direction)), ("bars", shots.bars.get(direction))):
                     if reading is not None:
-                        value, sigma = _reading(reading) or (None, None)
+                        value, sigma = reading.nyquist or (None, None)
                         where: list[Cell] = [name, camera.band, place, DIRECTION_NAMES[direction], when, kind]
                         true: list[Cell] = [reading.true_nyquist, *reading.at_nyquist, reading.true_axis]
                         rows.append([*where, value, sigma, *true])
     return rows
 
 
-def _reading(reading: EdgeReading | BarReading) -> tuple[float, float] | None:
-    return reading.nyquist if isinstance(reading, EdgeReading) else reading.reading
-
-
 def _mtf_cells(key: str, reading: EdgeReading | BarReading) -> tuple[Marked, Marked]:
     """One measured value and its truth."""
     true = Marked(fixed(reading.true_nyquist, _DECIMALS), "", "truth", f"{key}.true")
-    found = _reading(reading)
+    found = reading.nyquist
     if found is None:
         return Marked("not measurable", "", "number", key), true
     value, sigma = found

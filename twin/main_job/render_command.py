@@ -23,7 +23,7 @@ from twin.run.procedure import Session
 from twin.run.reference_frames import described
 from twin.run.second_process import SecondProcess
 from twin.targets.target_images import DIRECTIONS, PLACES
-from twin.targets.target_result import EdgeReading, TargetRun
+from twin.targets.target_measurement import EdgeReading, TargetRun
 
 NUMBER = 7
 """Width of most numbers there."""

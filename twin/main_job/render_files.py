@@ -17,7 +17,7 @@ from twin.monitor.time_series import TimeSeries
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
 from twin.run.run_folder import RunFolder
-from twin.targets.target_result import TargetRun
+from twin.targets.target_measurement import TargetRun
 from twin.uncertainty.uncertainty_numbers import LIMITS
 
 if TYPE_CHECKING:

@@ -27,13 +27,11 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
 from twin.monitor.observation import LOST, Observing, light_of, read
 from twin.monitor.time_series import run_series, series_states, too_large
-from twin.path_tracing.stray_light import ghost_warnings, stray_light
-from twin.path_tracing.stray_rays import NominalPathLost
+from twin.path_tracing.stray_light import NominalPathLost, ghost_warnings, stray_light
 from twin.run.procedure import Advance, silent
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.targets.target_images import TargetLostError
-from twin.targets.target_measurement import check_targets, render_targets, target_pixels
-from twin.targets.target_result import TargetRun
+from twin.targets.target_measurement import TargetRun, check_targets, render_targets, target_pixels
 
 STAGES = (
     "build the instrument",

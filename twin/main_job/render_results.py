@@ -24,7 +24,7 @@ from twin.monitor.time_series import TimeSeries
 from twin.monitor.truth import Truth
 from twin.path_tracing.stray_light import StrayLight
 from twin.run.provenance import SelfCheck
-from twin.targets.target_result import TargetRun
+from twin.targets.target_measurement import TargetRun
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits
 
 PROGRAM = "twin.render"

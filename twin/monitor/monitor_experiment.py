@@ -23,12 +23,11 @@ from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import NodalDeformation
 from optics.waves.pixel_response import UnsampledImageError
-from scenes.models.deformed_faces import deformed_face
 from scenes.models.disturbances import StatedMotions, check_heat, stated_motions
-from scenes.models.heated_bodies import HeatedBody, heated_body, with_heat
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import job_state, motions_of, on_deformed
+from scenes.models.nodal_bodies import HeatedBody, deformed_face, heated_body, with_heat
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.course import NO_MOTION
 from scenes.specs.instrument import SIDES

@@ -12,7 +12,7 @@ from analysis.monitor.ground_error import GroundGeometry
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
-from optics.raytrace.line_of_sight import LineChange, aim_chief_rays, chief_directions, line_change
+from optics.raytrace.line_of_sight import LineChange, aim_chief_rays, chief_rays, line_change
 from optics.raytrace.system import SystemBatch, assemble
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
@@ -152,7 +152,7 @@ class LineSight:
         to_stop, points, guess = self._from_the_image(states, placed)
         to_object = assemble(instrument.assembly, [f"{n}/image_to_object" for n in names], states, placed=placed)
         start = [np.repeat(a, len(states), axis=0) for a in self._aimed]
-        sight = chief_directions(self.backend, to_stop, to_object, points, guess, ACROSS, (start[0], start[1]))
+        _, sight = chief_rays(self.backend, to_stop, to_object, points, guess, ACROSS, (start[0], start[1]))
         return sight.reshape(len(names), len(states), LINE_POINTS, 3)
 
     def truth(self, states: Sequence[State], placed: PlacedBodies | None = None) -> Truth:

@@ -15,9 +15,8 @@ import typer
 from scenes.yaml.errors import Problem
 from scenes.yaml.units import DISTANCE, parse_quantity
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet, Seed
-from twin.run.command import Result, add_tests, print_report, run_command
+from twin.run.command import Result, add_tests, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 
 if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource
@@ -96,9 +95,8 @@ def export(
 
     def work(given: tuple[ExportSource, tuple[float, float] | None], session: Session) -> Result:
         from scenes.yaml.errors import InputError
-        from twin.orbit.export.export_report import export_files, export_numbers, export_report
+        from twin.orbit.export import export_report
         from twin.orbit.export.export_run import run_export
-        from twin.run.page import RunFacts, write_test
         from twin.run.procedure import BenchError
 
         read, heights = given
@@ -106,18 +104,15 @@ def export(
             run = run_export(read, session.backend, heights, truth, session.advance)
         except BenchError as error:
             raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
-        shown = export_report(run)
-        numbers = {**export_numbers(run), "verdict": shown.verdict}
-        for name, content in export_files(run).items():
+        for name, content in export_report.export_files(run).items():
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
         options = (*ends, *(("--truth",) if truth else ()), "--seed", str(read.seed))
         again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
-        times = session.started, session.seconds
-        facts = RunFacts(*(read.config, str(source), name, read.seed, *times, PROGRAM, "", again), given=(source,))
-        write_test("export", numbers, shown, facts, session.folder)
-        return Result(described("export", numbers), lambda console: print_report(shown, console))
+        facts = {"config": read.config, "seed": read.seed, "again": again, "given": (source,)}
+        shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if source.is_dir() else source.stem
     run_command(f"{stem}-export", Options(out, seed, backend, force, as_json, quiet), resolve, work)

@@ -54,13 +54,7 @@ def signature(codes: Iterable[int]) -> int:
     return value
 
 
-MARKS = {
-    Event.REFLECT: "",
-    Event.TRANSMIT: ">",
-    Event.DIFFUSE: "~",
-    Event.SCATTER: "*",
-    Event.SCATTER_THROUGH: ">*",
-}
+MARKS = {Event.REFLECT: "", Event.TRANSMIT: ">", Event.DIFFUSE: "~", Event.SCATTER: "*", Event.SCATTER_THROUGH: ">*"}
 """What follows a part's name in a family's text: nothing for a reflection."""
 
 

@@ -17,23 +17,14 @@ from typing import Any
 from optics.geometry.surface import along, level, newton_step
 from optics.materials import finish, scatter
 from optics.numerics.backend import Backend
+from twin.path_tracing import tables as layout
 from twin.path_tracing.families import BITS, FACTOR, OUTSIDE, START, Event
 from twin.path_tracing.sinks import Arrival, Sinks, record
-from twin.path_tracing.tables import (
-    APERTURE,
-    APERTURES,
-    CLEARANCE,
-    INDEX,
-    PART,
-    ROWS_PER_SURFACE,
-    Kind,
-    SceneTables,
-    SurfaceForm,
-    within,
-)
 
 
-def nearest_face(backend: Backend, tables: SceneTables, p: Any, d: Any, body: Any, inside: Any) -> tuple[Any, Any]:
+def _nearest_face(
+    backend: Backend, tables: layout.SceneTables, p: Any, d: Any, body: Any, inside: Any
+) -> tuple[Any, Any]:
     """Distance to and number of the face through which a path leaves its convex glass body, exactly.
 
     The distance may come out negative by a rounding, where a path meets an edge.
@@ -194,7 +185,7 @@ class Features:
         log: the events of every path are written down.
     """
 
-    form: SurfaceForm
+    form: layout.SurfaceForm
     glass: bool
     branching: bool
     measured: bool = False
@@ -240,7 +231,7 @@ class PreparedScene:
     backend: Backend
     mi: Any
     scene: Any
-    tables: SceneTables
+    tables: layout.SceneTables
 
 
 def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: Launch, sinks: Sinks) -> None:
@@ -267,20 +258,7 @@ def follow(prepared: PreparedScene, features: Features, limits: Limits, launch: 
         dr.zeros(backend.Float, n),  # escaped
         launch.rng,
     )
-    labels = (
-        "position",
-        "direction",
-        "weight",
-        "length",
-        "body",
-        "ahead",
-        "signature",
-        "stray",
-        "steps",
-        "active",
-        "escaped",
-        "rng",
-    )
+    labels = tuple("position direction weight length body ahead signature stray steps active escaped rng".split())
     body = _step(prepared, features, limits, launch.path, sinks)
     out = dr.while_loop(state, lambda *s: s[9], body, labels=labels, label="paths", mode="symbolic")
     alive = (out[8] >= limits.steps) & (out[10] == 0.0)
@@ -311,7 +289,7 @@ def _step(
         near = Float(found.t) + ahead
         if glass:
             inside &= active
-            t, face = nearest_face(backend, tables, p, d, medium, inside)
+            t, face = _nearest_face(backend, tables, p, d, medium, inside)
             near, surface, hit = dr.select(inside, t, near), dr.select(inside, face, surface), hit | inside
         escaped = dr.select(active & ~hit, weight, escaped)
         active = hit
@@ -338,31 +316,32 @@ def _step(
             cosine = dr.fma(nx, toward.x, dr.fma(ny, toward.y, nz * toward.z))
             normal = Vector3(*(dr.fma(g[a], nx, dr.fma(g[3 + a], ny, g[6 + a] * nz)) for a in range(3)))
         front = cosine < 0.0
-        clear = within(x, y, g[APERTURES : APERTURES + APERTURE])
+        first, size = layout.APERTURES, layout.APERTURE
+        clear = layout.within(x, y, g[first : first + size])
         if glass:
-            clear |= within(x, y, g[APERTURES + APERTURE : APERTURES + 2 * APERTURE])
+            clear |= layout.within(x, y, g[first + size : first + 2 * size])
         # what is there only by rounding and faceting
-        skip = ~clear & (kind & Kind.ENDS != 0)
+        skip = ~clear & (kind & layout.Kind.ENDS != 0)
         again = t <= 0.5 * ahead
         if glass:
-            skip |= (again | (~front & (kind & Kind.SOLID != 0))) & ~inside
+            skip |= (again | (~front & (kind & layout.Kind.SOLID != 0))) & ~inside
         else:
             skip |= again
         met = active & ~skip
-        ahead = dr.select(met, g[CLEARANCE], near + STEP_BACK)
+        ahead = dr.select(met, g[layout.CLEARANCE], near + STEP_BACK)
 
         flown = dr.select(met, t, 0.0)
-        before = dr.select(inside, g[INDEX], 1.0) if glass else Float(1.0)
+        before = dr.select(inside, g[layout.INDEX], 1.0) if glass else Float(1.0)
         p = dr.fma(d, flown, p)
         length = dr.fma(flown, before, length)
 
         # how the light is shared out
-        row = ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
+        row = layout.ROWS_PER_SURFACE * surface + dr.select(clear, dr.select(front, UInt(0), 1), 2)
         f = tables.finish(row, met)
         reflected, transmitted, diffused = f[0], f[1], f[3]
         incidence = dr.abs(cosine)
         if glass:
-            after = dr.select(inside, 1.0, g[INDEX])
+            after = dr.select(inside, 1.0, g[layout.INDEX])
             bent = finish.cosine_after(incidence, before, after)
         marks: list[Any] = []
         if features.measured:
@@ -403,9 +382,7 @@ def _step(
             chance = dr.select(reflecting, chances[0], dr.select(through, chances[1], chances[2]))
             onward = dr.select(chance > 0.0, weight * share * every / chance, 0.0)
             event = dr.select(
-                reflecting,
-                UInt(int(Event.REFLECT)),
-                dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE)),
+                reflecting, UInt(int(Event.REFLECT)), dr.select(through, UInt(int(Event.TRANSMIT)), int(Event.DIFFUSE))
             )
             out_index = Float(1.0)
             if glass:
@@ -413,9 +390,9 @@ def _step(
                 cosine_after = dr.copysign(bent, cosine)
                 refracted = dr.fma(normal, cosine_after - ratio * cosine, ratio * d)
                 turned = dr.select(through, refracted, turned)
-                own = kind >> Kind.BODY_SHIFT & Kind.BODY_MASK
+                own = kind >> layout.Kind.BODY_SHIFT & layout.Kind.BODY_MASK
                 medium = dr.select(met & through, dr.select(inside, 0, own), medium)
-                out_index = dr.select(medium != 0, g[INDEX], 1.0)
+                out_index = dr.select(medium != 0, g[layout.INDEX], 1.0)
             leaving = Leaving(turned, normal, out_index, event, onward, cosine, diffusing)
             drawn = None if not marks else TableDraw(tables.measured, marks, incidence)
             turned, event, onward, rng = spread(backend, rng, met, f[4:8], limits.scatter_floor, leaving, drawn)
@@ -424,7 +401,7 @@ def _step(
             onward = weight * going_on
         d = dr.select(met, turned, d)
         weight = dr.select(met, onward, weight)
-        code = UInt(g[PART]) << BITS | (event + dr.select(clear, UInt(0), OUTSIDE))
+        code = UInt(g[layout.PART]) << BITS | (event + dr.select(clear, UInt(0), OUTSIDE))
         signature = dr.select(met, (signature ^ UInt64(code)) * UInt64(FACTOR), signature)
         if features.log:
             dr.scatter(sinks.log, dr.select(met, code, 0), index * limits.steps + steps, active)

@@ -1,14 +1,18 @@
-"""What came out of a path-traced run: families of paths at the detectors, images, and where all the light went."""
+"""What comes out of a path-traced run: families of paths at the detectors, images, and where all the light went; and
+how the launches of a run are added up to it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from scenes.models.scenery import Scenery
 from twin.path_tracing.families import Touch
-from twin.path_tracing.sinks import GHOST, NOMINAL, STRAY
+from twin.path_tracing.sinks import CLASSES, GHOST, NOMINAL, STRAY, Sinks
+from twin.path_tracing.tables import NOMINAL_SUMS, ROWS_PER_SURFACE
 
 
 @dataclass(frozen=True)
@@ -118,3 +122,127 @@ class PathResult:
         if not found:
             raise LookupError(f"no path reached {detector} by its nominal way")
         return found[0]
+
+
+SUMS = 7
+"""Count, weight, its square, weighted x, y, x^2, y^2."""
+
+
+@dataclass(frozen=True)
+class Key:
+    """A family before it is looked up: index of the detector, signature, kind."""
+
+    detector: int
+    signature: int
+    kind: int
+
+
+class Collector:
+    """Adds up what launches have written; one per run.
+
+    Args:
+        scenery: the scene.
+        nominal: signature of the nominal family of each detector, 0 for none.
+        keep: whether to keep single detections.
+    """
+
+    def __init__(self, scenery: Scenery, nominal: Sequence[int], keep: bool = False) -> None:
+        self.keep = keep
+        self.scenery = scenery
+        self.nominal = tuple(nominal)
+        self.absorbed = np.zeros((len(scenery.surfaces), ROWS_PER_SURFACE))
+        self.left = np.zeros(3)
+        self.images = np.zeros((CLASSES, sum(d.columns * d.rows for d in scenery.detectors)))
+        self.sums: dict[Key, np.ndarray] = {}
+        self.examples: dict[Key, int] = {}
+        self.emitted = 0.0
+        self.paths = 0
+        self._kept: list[dict[str, np.ndarray]] = []
+
+    def add(self, sinks: Sinks, emitted: float, paths: int) -> None:
+        """Add one launch."""
+        self.absorbed += sinks.absorbed.numpy().reshape(self.absorbed.shape)
+        self.left += sinks.left.numpy()
+        if self.images.size:
+            self.images += sinks.images.numpy().reshape(self.images.shape)
+        self.emitted += emitted
+        self.paths += paths
+        sums = sinks.sums.numpy().reshape(-1, NOMINAL_SUMS)
+        for detector, signature in enumerate(self.nominal):
+            if sums[detector, 0] > 0.0:
+                self._put(Key(detector, signature, NOMINAL), sums[detector, :SUMS], -1)
+        count = int(sinks.counter.numpy()[0])
+        if count:
+            records = {name: array.numpy()[:count] for name, array in sinks.records.items()}
+            # threads write in any order
+            order = np.lexsort((records["length"], records["path"]))
+            records = {name: values[order] for name, values in records.items()}
+            if self.keep:
+                self._kept.append(records)
+            self._sort_in(records)
+
+    def _put(self, key: Key, sums: np.ndarray, example: int) -> None:
+        self.sums[key] = self.sums.get(key, 0.0) + sums
+        self.examples.setdefault(key, example)
+
+    def _sort_in(self, records: dict[str, np.ndarray]) -> None:
+        others = records["kind"] != NOMINAL
+        r = {name: values[others] for name, values in records.items()}
+        label = np.stack([r["signature"], r["detector"].astype(np.uint64), r["kind"].astype(np.uint64)], axis=-1)
+        keys, first, family = np.unique(label, axis=0, return_index=True, return_inverse=True)
+        family = family.ravel()
+        w, x, y = r["weight"], r["x"], r["y"]
+        columns = (np.ones_like(w), w, w * w, w * x, w * y, w * x * x, w * y * y)
+        sums = np.stack([np.bincount(family, c, len(keys)) for c in columns], axis=-1)
+        for k, (signature, detector, kind) in enumerate(keys.tolist()):
+            self._put(Key(detector, signature, kind), sums[k], int(r["path"][first[k]]))
+
+    def strongest(self, most: int) -> list[Key]:
+        """The families that carry most energy and whose ways are not known beforehand."""
+        keys = [k for k in self.sums if k.kind != NOMINAL]
+        return sorted(keys, key=lambda k: -self.sums[k][1])[:most]
+
+    def result(self, ways: dict[Key, tuple[Touch, ...]]) -> PathResult:
+        """The run's outcome; ``ways`` names the events of the families that were looked up."""
+        surfaces, detectors = self.scenery.surfaces, self.scenery.detectors
+        absorbed: dict[str, float] = {}
+        detected = {d.name: 0.0 for d in detectors}
+        for surface, rows in zip(surfaces, self.absorbed, strict=True):
+            seen = float(rows[0]) if surface.detector is not None else 0.0
+            if surface.detector is not None:
+                detected[surface.detector] += seen
+            stays = float(rows.sum()) - seen
+            if stays:
+                absorbed[surface.part] = absorbed.get(surface.part, 0.0) + stays
+        images = {}
+        place = 0
+        for d in detectors:
+            size = d.columns * d.rows
+            images[d.name] = self.images[:, place : place + size].reshape(CLASSES, *d.shape)
+            place += size
+        balance = Balance(self.emitted, absorbed, detected, float(self.left[0]), float(self.left[1]))
+        families = [self._family(key, ways.get(key, ())) for key in self.sums]
+        families.sort(key=lambda f: (f.kind != "nominal", -f.energy))
+        return PathResult(tuple(families), images, balance, self.paths, self._detections())
+
+    def _family(self, key: Key, way: tuple[Touch, ...]) -> Family:
+        count, w, w2, wx, wy, wxx, wyy = self.sums[key].tolist()
+        x, y = wx / w, wy / w
+        rms = tuple(float(np.sqrt(max(second / w - mean * mean, 0.0))) for second, mean in ((wxx, x), (wyy, y)))
+        # of a sum of independent weights, most of them 0
+        error = float(np.sqrt(max(w2 - w * w / self.paths, 0.0)))
+        name = self.scenery.detectors[key.detector].name
+        return Family(name, way, KINDS[key.kind], w, error, round(count), (x, y), (rms[0], rms[1]))
+
+    def _detections(self) -> Detections:
+        def joined(name: str) -> np.ndarray:
+            return np.concatenate([k[name] for k in self._kept]) if self._kept else np.empty(0)
+
+        names = ("path", "detector", "weight", "length", "signature", "kind")
+        place = np.stack([joined("x"), joined("y")], axis=-1)
+        return Detections(place=place, **{name: joined(name) for name in names})
+
+
+def event_lists(log: np.ndarray, paths: int) -> Iterable[tuple[int, ...]]:
+    """Codes of each path's events, steps that passed over something left out; ``log`` as the kernel writes it."""
+    return [tuple(int(c) for c in row if c) for row in log.reshape(paths, -1)]

@@ -52,16 +52,8 @@ def make_sinks(backend: Backend, rows: int, detectors: int, pixels: int, room: i
 
     Float, UInt = backend.Float, backend.UInt
     UInt64 = dr.uint64_array_t(Float)
-    kinds = {
-        "signature": UInt64,
-        "path": UInt,
-        "detector": UInt,
-        "x": Float,
-        "y": Float,
-        "weight": Float,
-        "length": Float,
-        "kind": UInt,
-    }
+    kinds = {"signature": UInt64, **dict.fromkeys(("path", "detector", "kind"), UInt)}
+    kinds |= dict.fromkeys(("x", "y", "weight", "length"), Float)
     out = Sinks(
         dr.zeros(Float, rows),
         dr.zeros(Float, 3),
@@ -123,16 +115,8 @@ def record(
         wanted = detected if keep_nominal else detected & ~nominal
         slot = dr.scatter_inc(sinks.counter, UInt(0), wanted)
         fits = wanted & (slot < room)
-        values = {
-            "signature": at.signature,
-            "path": at.path,
-            "detector": number,
-            "x": at.x,
-            "y": at.y,
-            "weight": at.weight,
-            "length": at.length,
-            "kind": what,
-        }
+        values = {name: getattr(at, name) for name in ("signature", "path", "x", "y", "weight", "length")}
+        values |= {"detector": number, "kind": what}
         for name, value in values.items():
             dr.scatter(sinks.records[name], value, slot, fits)
         return (unused,)

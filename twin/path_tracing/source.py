@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import Any
 
@@ -60,7 +60,7 @@ class DiskSource:
         return cls(np.asarray(centre, np.float64), axis, transverse_axes(axis, helper), radius, cone)
 
     def aimed_at(self, directions: np.ndarray, room: float = 1.05, share: float = 0.5) -> DiskSource:
-        """The same source with a narrow cone around given directions (N, 3).
+        """Give the source a narrow cone around given directions (N, 3).
 
         Args:
             directions: unit vectors.
@@ -70,15 +70,7 @@ class DiskSource:
         place = np.asarray(directions) @ self.across.T
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0))
         reach = room * float(np.max(np.linalg.norm(place - middle, axis=-1)))
-        return DiskSource(
-            self.centre,
-            self.axis,
-            self.across,
-            self.radius,
-            self.cone,
-            (float(middle[0]), float(middle[1]), reach),
-            share,
-        )
+        return replace(self, narrow=(float(middle[0]), float(middle[1]), reach), share=share)
 
     @property
     def numbers(self) -> np.ndarray:
@@ -86,22 +78,8 @@ class DiskSource:
         x, y, r = self.narrow or (0.0, 0.0, self.cone)
         share = self.share if self.narrow else 0.0
         gain = (self.cone / r) ** 2 if r > 0.0 else 1.0
-        return np.array(
-            [
-                *self.centre,
-                *self.axis,
-                *self.across[0],
-                *self.across[1],
-                self.radius,
-                self.cone,
-                x,
-                y,
-                r,
-                share,
-                gain,
-                0.0,
-            ]
-        )
+        rest = (self.radius, self.cone, x, y, r, share, gain, 0.0)
+        return np.concatenate([self.centre, self.axis, *self.across, rest])
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +116,32 @@ def random_streams(backend: Backend, numbers: Any, seed: int) -> Any:
     return rng
 
 
-def draw(backend: Backend, source: DiskSource, numbers: Any, total: int, seed: int) -> Launch:
+def start(backend: Backend, source: Source, chosen: np.ndarray, total: int, seed: int) -> Launch:
+    """Light at the start of some paths of a run.
+
+    Args:
+        backend: where to trace.
+        source: where the paths start.
+        chosen: their numbers in the run, (N,).
+        total: paths of the run.
+        seed: of the random numbers.
+    """
+    import drjit as dr
+
+    numbers = backend.UInt(np.ascontiguousarray(chosen, np.uint32))
+    dr.make_opaque(numbers)
+    if isinstance(source, DiskSource):
+        return _drawn(backend, source, numbers, total, seed)
+    return Launch(
+        backend.vector(source.position[chosen]),
+        backend.vector(source.direction[chosen]),
+        backend.opaque(source.weight[chosen]),
+        numbers,
+        random_streams(backend, numbers, seed),
+    )
+
+
+def _drawn(backend: Backend, source: DiskSource, numbers: Any, total: int, seed: int) -> Launch:
     """Draw the paths of the given numbers (``UInt``) of a run of ``total`` paths."""
     import drjit as dr
 
@@ -160,21 +163,6 @@ def draw(backend: Backend, source: DiskSource, numbers: Any, total: int, seed: i
     density = dr.select(inside & (share > 0.0), 1.0 - share + share * gain, 1.0 - share)
     weight = dr.opaque(backend.Float, 1.0 / total) / density
     return Launch(position, direction, weight, numbers, rng)
-
-
-def take(backend: Backend, source: RaySource, chosen: np.ndarray, seed: int) -> Launch:
-    """The rays of the given numbers of a list."""
-    import drjit as dr
-
-    numbers = backend.UInt(np.ascontiguousarray(chosen, np.uint32))
-    dr.make_opaque(numbers)
-    return Launch(
-        backend.vector(source.position[chosen]),
-        backend.vector(source.direction[chosen]),
-        backend.opaque(source.weight[chosen]),
-        numbers,
-        random_streams(backend, numbers, seed),
-    )
 
 
 def pieces(total: int, size: int) -> Iterator[tuple[int, int]]:

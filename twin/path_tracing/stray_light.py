@@ -1,26 +1,190 @@
 """Ghosts and stray light on the area CCDs, added to the wave path's images.
 
-The path tracer (``twin.path_tracing``) gives where light goes by all other ways than the nominal one, as geometric rays
-in pixels. That light went through apertures of the same size as the nominal spot's, so that it is spread by the nominal
-spot's diffraction image before it is added. Its interference with the nominal light is left out.
+The wave path's image (``twin.monitor.monitor_path``) holds the nominal family exactly. Every pinhole's light is
+path-traced through the whole instrument, and the surfaces that a path met tell the nominal family from all others, so
+that nothing is counted twice. The other light is geometric rays in pixels. It went through apertures of the same size
+as the nominal spot's, and is spread by the nominal spot's diffraction image before it is added. Its interference with
+the nominal light is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from optics.geometry.tree import State
+from optics.numerics import quadrature
+from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
 from optics.waves.diffraction import Grid, image
-from scenes.models.scene_surface import Finishes
+from scenes.models.instrument_model import Instrument
+from scenes.models.scenery import Scenery, build_scenery
+from scenes.models.scenery_parts import Finishes
+from scenes.specs.baffle import Plate
 from scenes.specs.instrument import Channel, prism_of
+from twin.monitor.monitor_beams import Aimed
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.path_tracing.families import Event, Touch, family_name
-from twin.path_tracing.path_result import Family
-from twin.path_tracing.stray_rays import StrayResult, trace_stray
+from twin.monitor.monitor_path import MonitorPath
+from twin.path_tracing.families import Event, Touch, family_name, nominal_codes
+from twin.path_tracing.path_result import Balance, Family, PathResult
+from twin.path_tracing.sinks import NOMINAL
+from twin.path_tracing.source import DiskSource
+from twin.path_tracing.tracer import CHUNK, FAINT, PathTracer, Progress, Sampling
+from twin.run.quantity import Quantity, Record
+
+CONE_ROOM = 1.25
+"""Half angle of the source's cone relative to that of the pupil seen from the focal plane."""
+
+AIM_RINGS = 6
+NARROW_ROOM = 1.2
+"""Room around the rays to the outermost of these rings of the return face: they end 3 % inside its edge."""
+
+
+class NominalPathLost(PhysicalError, RuntimeError):
+    """No path reached an area CCD by its nominal way, so that nothing can be normalised."""
+
+
+@dataclass(frozen=True, eq=False)
+class StrayResult:
+    """Stray light of some monitor channels in one state.
+
+    Attributes:
+        photons: area CCD (``<camera>/<side>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from
+            all traced sources, without the nominal families.
+        runs: channel -> all that its source's light did.
+        photons_per_power: channel -> photons per frame for a detected share 1 of the source's power.
+    """
+
+    photons: Mapping[str, np.ndarray]
+    runs: Mapping[str, PathResult]
+    photons_per_power: Mapping[str, float]
+
+    def relative(self, channel: str) -> tuple[tuple[Family, float, float], ...]:
+        """Families of a channel's source at any detector, each with its energy relative to the nominal family's and the
+        standard deviation of that by the number of paths.
+        """
+        run = self.runs[channel]
+        nominal = run.nominal(f"{channel}/area_ccd")
+        others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
+        # a path of the one is none of the other: the covariance of their energies is -1 / paths of the product
+        own = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
+        return tuple(
+            (family, share, share * float(np.sqrt((family.error / family.energy) ** 2 + own)))
+            for family, share in others
+        )
+
+
+def pinhole(
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    channel: Channel,
+    cone: float | None = None,
+    aimed: Aimed | None = None,
+) -> DiskSource:
+    """The light source of a channel: its pinhole, evenly lit into a cone that covers the camera's pupil.
+
+    Half of the paths are aimed at the return face.
+
+    Args:
+        instrument: the instrument.
+        backend: where to aim.
+        state: what is perturbed.
+        channel: which channel.
+        cone: sine of the cone's half angle; by default that of the pupil with ``CONE_ROOM``.
+        aimed: all channels' nominal rays to the return faces, by default worked out here.
+    """
+    placed = instrument.assembly.place([state])
+    model = instrument.cameras[channel.camera]
+    if cone is None:
+        cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_focal_length
+    place = placed.pose(channel.reticle_body).translation
+    axis = instrument.toward_optics(placed, channel.camera)[0]
+    radius = 0.5 * instrument.spec.monitor.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
+    aimed = aimed or _nominal_rays(instrument, backend)
+    number = instrument.channels.index(channel)
+    return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)
+
+
+def _nominal_rays(instrument: Instrument, backend: Backend) -> Aimed:
+    """Rays from every pinhole to its return face in the unperturbed instrument."""
+    return MonitorPath(instrument, backend, quadrature.disk(AIM_RINGS)).nominal
+
+
+def monitor_families(scenery: Scenery, instrument: Instrument) -> dict[str, tuple[int, ...]]:
+    """Area CCD -> events of its nominal family."""
+    return {
+        f"{c.key}/area_ccd": nominal_codes(scenery, instrument.assembly, f"{c.key}/monitor")
+        for c in instrument.channels
+    }
+
+
+def trace_stray(
+    instrument: Instrument,
+    backend: Backend,
+    state: State,
+    paths: int,
+    seed: int,
+    channels: Sequence[Channel] | None = None,
+    finishes: Finishes | None = None,
+    baffles: Iterable[Plate] = (),
+    sampling: Sampling = FAINT,
+    cone: float | None = None,
+    chunk: int = CHUNK,
+    progress: Progress | None = None,
+) -> StrayResult:
+    """Trace the light of monitor channels, one after the other.
+
+    Args:
+        instrument: the instrument.
+        backend: where to trace.
+        state: what is perturbed.
+        paths: of every channel.
+        seed: of the random numbers; the channels' are independent of each other.
+        channels: which sources shine; by default all.
+        finishes: what surfaces do with light.
+        baffles: what else stands there.
+        sampling: how paths are drawn.
+        cone: sine of the half angle into which the pinholes shine, see ``pinhole``.
+        chunk: paths of one launch.
+        progress: told the paths done, of all channels together.
+
+    Raises:
+        NominalPathLost: too few paths, or the perturbation moves a beam off.
+    """
+    chosen = tuple(instrument.channels if channels is None else channels)
+    scenery = build_scenery(instrument, state, finishes, baffles)
+    tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
+    aimed = _nominal_rays(instrument, backend)
+    ccd = instrument.spec.monitor.area_ccd
+    photons = {f"{c.key}/area_ccd": np.zeros((ccd.rows, ccd.columns)) for c in instrument.channels}
+    runs: dict[str, PathResult] = {}
+    scale: dict[str, float] = {}
+    for number, channel in enumerate(chosen):
+        source = pinhole(instrument, backend, state, channel, cone, aimed)
+        own = int(np.random.SeedSequence([seed, instrument.channels.index(channel)]).generate_state(1)[0])
+
+        def tell(done: int, _: int, before: int = number) -> None:
+            if progress is not None:
+                progress(before * paths + done, len(chosen) * paths)
+
+        run = tracer.run(source, paths, own, chunk=chunk, progress=tell)
+        found = run.of(f"{channel.key}/area_ccd", "nominal")
+        if not found:
+            raise NominalPathLost(
+                f"none of {paths} paths of {channel.key} came back to its area CCD by the nominal way; trace more, or "
+                "the perturbation moves the beam off"
+            )
+        runs[channel.key] = run
+        scale[channel.key] = channel.photons / found[0].energy
+        for name, light in photons.items():
+            every = run.images[name]
+            light += scale[channel.key] * (every.sum(axis=0) - every[NOMINAL])
+    return StrayResult(photons, runs, scale)
+
 
 REACH = 88
 """Pixels from the middle of the diffraction image out to which stray light is spread."""
@@ -53,39 +217,58 @@ class StrayLight:
 
     def to_dict(self) -> dict[str, Any]:
         """Contents of stray.json: by source, the families at any detector and where the light went."""
-        out: dict[str, Any] = {}
-        for channel, run in self.traced.runs.items():
-            families = sorted(self.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
-            balance = run.balance
-            nominal = run.nominal(f"{channel}/area_ccd").touches
-            out[channel] = {
-                "families": [_family(family, share, sigma, nominal) for family, share, sigma in families],
-                "balance": {
-                    "emitted": balance.emitted,
-                    "absorbed": dict(balance.absorbed),
-                    "detected": dict(balance.detected),
-                    "escaped": balance.escaped,
-                    "under_way": balance.under_way,
-                    "relative_error": balance.error,
-                },
-            }
-        return {"paths_per_source": self.paths, "sources": out}
+        return {"paths_per_source": self.paths, "sources": {name: _source(self, name) for name in self.traced.runs}}
 
 
-def _family(family: Family, share: float, sigma: float, nominal: tuple[Touch, ...]) -> dict[str, Any]:
-    return {
-        "detector": family.detector,
-        "kind": family.kind,
-        "name": family_name(family.touches, nominal),
-        "surfaces": [str(touch) for touch in family.touches],
-        "relative_to_nominal": share,
-        "relative_to_nominal_sigma": sigma,
-        "paths": family.count,
-        "x_um": 1e6 * family.centroid[0],
-        "y_um": 1e6 * family.centroid[1],
-        "rms_x_um": 1e6 * family.rms[0],
-        "rms_y_um": 1e6 * family.rms[1],
-    }
+@dataclass(frozen=True, eq=False)
+class _ListedFamily:
+    """A family beside the nominal one of its source, for files.
+
+    Attributes:
+        family: which.
+        share: its light over that of the nominal family at the source's own area CCD.
+        sigma: of this share, by the number of paths.
+        nominal: events of the nominal family.
+    """
+
+    family: Family
+    share: float
+    sigma: float
+    nominal: tuple[Touch, ...]
+
+
+_FAMILY: Record[_ListedFamily] = Record(
+    "All paths that reach a detector by the same events in the same order.",
+    Quantity("detector", lambda one: one.family.detector, "where the paths end"),
+    Quantity("kind", lambda one: one.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
+    Quantity("name", lambda one: family_name(one.family.touches, one.nominal), "in what it differs from nominal light"),
+    Quantity("surfaces", lambda one: list(map(str, one.family.touches)), "surface by surface"),
+    Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's own spot"),
+    Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "standard deviation by the number of paths"),
+    Quantity("paths", lambda one: one.family.count, "that were traced"),
+    Quantity("x_um", lambda one: one.family.centroid[0], "centroid from the detector's middle"),
+    Quantity("y_um", lambda one: one.family.centroid[1], "centroid from the detector's middle"),
+    Quantity("rms_x_um", lambda one: one.family.rms[0], "size about the centroid"),
+    Quantity("rms_y_um", lambda one: one.family.rms[1], "size about the centroid"),
+)
+_BALANCE: Record[Balance] = Record(
+    "Where the light of a source went, in shares of its power.",
+    Quantity("emitted", lambda balance: balance.emitted, "all paths at their start"),
+    Quantity("absorbed", lambda balance: balance.absorbed, "body -> light absorbed in it"),
+    Quantity("detected", lambda balance: balance.detected, "detector -> light detected by it"),
+    Quantity("escaped", lambda balance: balance.escaped, "light that left the instrument"),
+    Quantity("under_way", lambda balance: balance.under_way, "light of paths that were cut at the step limit"),
+    Quantity("relative_error", lambda balance: balance.error, "what is missing in the sum"),
+)
+
+
+def _source(light: StrayLight, channel: str) -> dict[str, Any]:
+    """The strongest families of a source, and its balance."""
+    run = light.traced.runs[channel]
+    nominal = run.nominal(f"{channel}/area_ccd").touches
+    strongest = sorted(light.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
+    families = [_FAMILY(_ListedFamily(*one, nominal)) for one in strongest]
+    return {"families": families, "balance": _BALANCE(run.balance)}
 
 
 def stray_light(

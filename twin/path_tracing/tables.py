@@ -18,8 +18,8 @@ from optics.materials.finish import Finish
 from optics.materials.scatter import DrawnScatter
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import leaves
-from scenes.models.scene_surface import SceneSurface
 from scenes.models.scenery import Scenery
+from scenes.models.scenery_parts import SceneSurface
 
 _HEADER = 8
 """Numbers of a scatter table: rings, sectors, first share, first of the rings' sums, first of the sectors' sums, first

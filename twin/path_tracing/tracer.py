@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -11,12 +11,11 @@ import numpy as np
 
 from optics.numerics.backend import Backend
 from scenes.models.scenery import Scenery
-from twin.path_tracing.collect import Collector, Key, event_lists
 from twin.path_tracing.families import Touch, signature, touches
 from twin.path_tracing.kernel import Features, Launch, Limits, PreparedScene, follow
-from twin.path_tracing.path_result import PathResult
+from twin.path_tracing.path_result import Collector, Key, PathResult, event_lists
 from twin.path_tracing.sinks import NOMINAL, Sinks, make_sinks
-from twin.path_tracing.source import DiskSource, Source, draw, pieces, take
+from twin.path_tracing.source import DiskSource, Source, pieces, start
 from twin.path_tracing.tables import ROWS_PER_SURFACE, SurfaceForm, upload
 
 VARIANTS = {"llvm": "llvm_ad_mono", "cuda": "cuda_ad_mono"}
@@ -122,12 +121,8 @@ def _register(variant: str) -> Callable[..., Any]:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            self.sampling = Sampling(
-                int(props.get("steps", BALANCED.steps)),
-                float(props.get("floor", 0.0)),
-                float(props.get("scatter_floor", 0.0)),
-                float(props.get("roulette", 0.0)),
-            )
+            usual = asdict(BALANCED)
+            self.sampling = Sampling(**{name: type(value)(props.get(name, value)) for name, value in usual.items()})
 
         def sample(self, *arguments: Any, **options: Any) -> Any:
             raise NotImplementedError(f"{NAME} follows light from its sources; call launch")
@@ -164,8 +159,7 @@ def make_integrator(backend: Backend, sampling: Sampling) -> Any:
     """The integrator as Mitsuba's plugin."""
     mi = load_mitsuba(backend)
     _register(mi.variant())
-    numbers = {"floor": sampling.floor, "scatter_floor": sampling.scatter_floor, "roulette": sampling.roulette}
-    return mi.load_dict({"type": NAME, "steps": sampling.steps, **numbers})
+    return mi.load_dict({"type": NAME, **asdict(sampling)})
 
 
 CHUNK = 1 << 20
@@ -229,7 +223,6 @@ class PathTracer:
         keep: bool = False,
         chunk: int = CHUNK,
         progress: Progress | None = None,
-        look_up: int = MOST_FAMILIES,
     ) -> PathResult:
         """Trace paths from a source.
 
@@ -240,7 +233,6 @@ class PathTracer:
             keep: keep the single detections (memory grows with the number of paths).
             chunk: paths of one launch; bounds the memory.
             progress: told after each launch.
-            look_up: number of families whose ways are looked up, the strongest first.
         """
         total = self._total(source, paths)
         features = self.features(keep)
@@ -249,9 +241,8 @@ class PathTracer:
         for first, count in pieces(total, chunk):
             while True:
                 sinks = self._sinks(room)
-                emitted = self.integrator.launch(
-                    self.prepared, features, self._start(source, first, count, total, seed), 1.0 / total, sinks
-                )
+                light = start(self.backend, source, np.arange(first, first + count), total, seed)
+                emitted = self.integrator.launch(self.prepared, features, light, 1.0 / total, sinks)
                 wanted = int(sinks.counter.numpy()[0])
                 if wanted <= sinks.room:
                     break
@@ -259,7 +250,7 @@ class PathTracer:
             collector.add(sinks, emitted, count)
             if progress is not None:
                 progress(first + count, total)
-        return collector.result(self._ways(source, collector, total, seed, look_up))
+        return collector.result(self._ways(source, collector, total, seed))
 
     def _total(self, source: Source, paths: int | None) -> int:
         if isinstance(source, DiskSource):
@@ -277,17 +268,7 @@ class PathTracer:
             self.backend, ROWS_PER_SURFACE * len(self.scenery.surfaces), len(detectors), pixels, room, log
         )
 
-    def _start(self, source: Source, first: int, count: int, total: int, seed: int) -> Launch:
-        import drjit as dr
-
-        if isinstance(source, DiskSource):
-            numbers = dr.arange(self.backend.UInt, count) + dr.opaque(self.backend.UInt, first)
-            return draw(self.backend, source, numbers, total, seed)
-        return take(self.backend, source, np.arange(first, first + count), seed)
-
-    def _ways(
-        self, source: Source, collector: Collector, total: int, seed: int, most: int
-    ) -> dict[Key, tuple[Touch, ...]]:
+    def _ways(self, source: Source, collector: Collector, total: int, seed: int) -> dict[Key, tuple[Touch, ...]]:
         """Events of the families: of the nominal ones as given, of the others by tracing one path of each again."""
         names = [d.name for d in self.scenery.detectors]
         ways = {
@@ -295,7 +276,7 @@ class PathTracer:
             for key in collector.sums
             if key.kind == NOMINAL
         }
-        keys = collector.strongest(most)
+        keys = collector.strongest(MOST_FAMILIES)
         if not keys:
             return ways
         examples = np.array([collector.examples[k] for k in keys], np.uint32)
@@ -312,14 +293,8 @@ class PathTracer:
         import drjit as dr
 
         count, steps = len(numbers), self.sampling.steps
-        if isinstance(source, DiskSource):
-            chosen = self.backend.UInt(np.ascontiguousarray(numbers, np.uint32))
-            dr.make_opaque(chosen)
-            start = draw(self.backend, source, chosen, total, seed)
-        else:
-            start = take(self.backend, source, numbers.astype(np.intp), seed)
-        slots = dr.arange(self.backend.UInt, count)
-        start = Launch(start.position, start.direction, start.weight, slots, start.rng)
+        # each path has its own part of the log, whatever its number in the run
+        light = replace(start(self.backend, source, numbers, total, seed), path=dr.arange(self.backend.UInt, count))
         sinks = self._sinks(LEAST_ROOM, count * steps)
-        self.integrator.launch(self.prepared, self.features(log=True), start, 1.0 / total, sinks)
+        self.integrator.launch(self.prepared, self.features(log=True), light, 1.0 / total, sinks)
         return list(event_lists(sinks.log.numpy(), count))

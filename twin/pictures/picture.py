@@ -329,18 +329,6 @@ def render_shot(
     return displayed(without_grain(image.reshape(shot.height, shot.width, 3), patches))
 
 
-def which_body(instrument: Instrument, paths: LightPaths, backend: Backend, shot: Shot) -> tuple[np.ndarray, list[str]]:
-    """What the middle of every pixel shows first: (height, width) number into the list of bodies, -1 for nothing.
-
-    Raises:
-        PictureError: as for ``render_shot``.
-    """
-    view, parts = staged(instrument, paths, shot)
-    with colour_variant(backend) as mi:
-        index, _ = Studio(mi, parts, view).first_hits(0.0, 0.0)
-    return index, [part.body for part in parts]
-
-
 def staged(instrument: Instrument, paths: LightPaths, shot: Shot) -> tuple[View, list[Part]]:
     """Where the camera of a picture stands, and all that it may see."""
     points = points_in_world(build_scene(instrument, paths))

@@ -5,7 +5,7 @@ Bodies come from ``twin.pictures.scene_file``, so that a picture and ``scene.glb
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -67,12 +67,7 @@ def looking(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, n
 
 
 def framed(
-    points: np.ndarray,
-    azimuth: float,
-    elevation: float,
-    field: float,
-    size: tuple[int, int],
-    margin: float = 0.04,
+    points: np.ndarray, azimuth: float, elevation: float, field: float, size: tuple[int, int], margin: float = 0.04
 ) -> View:
     """The nearest camera of a direction that has all points in its picture.
 
@@ -110,6 +105,14 @@ GAP = 0.05
 """From the lowest point of the instrument to the floor, metres."""
 
 _GLASS_EDGE = (0.03, 0.12, 0.15)
+
+
+def _coloured(colour: Sequence[float], **more: float) -> dict[str, Any]:
+    """Mitsuba's description of a surface of one colour, linear red, green and blue, that is alike on both sides."""
+    own = {"type": "principled", "base_color": {"type": "rgb", "value": list(colour)}, **more}
+    return {"type": "twosided", "bsdf": own}
+
+
 _BSDF: dict[str, dict[str, Any]] = {
     "mirror": {
         "type": "twosided",
@@ -119,50 +122,11 @@ _BSDF: dict[str, dict[str, Any]] = {
             "specular_reflectance": {"type": "rgb", "value": [0.93, 0.935, 0.94]},
         },
     },
-    "substrate": {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": [0.30, 0.29, 0.275]},
-            "roughness": 0.45,
-            "specular": 0.4,
-        },
-    },
-    "block": {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": [0.32, 0.42, 0.48]},
-            "roughness": 0.25,
-            "specular": 0.5,
-        },
-    },
-    "board": {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": [0.025, 0.028, 0.034]},
-            "roughness": 0.45,
-        },
-    },
-    "silicon": {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": [0.06, 0.16, 0.62]},
-            "metallic": 0.6,
-            "roughness": 0.35,
-        },
-    },
-    "gold": {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": [0.95, 0.66, 0.2]},
-            "metallic": 0.9,
-            "roughness": 0.3,
-        },
-    },
+    "substrate": _coloured([0.30, 0.29, 0.275], roughness=0.45, specular=0.4),
+    "block": _coloured([0.32, 0.42, 0.48], roughness=0.25, specular=0.5),
+    "board": _coloured([0.025, 0.028, 0.034], roughness=0.45),
+    "silicon": _coloured([0.06, 0.16, 0.62], metallic=0.6, roughness=0.35),
+    "gold": _coloured([0.95, 0.66, 0.2], metallic=0.9, roughness=0.3),
     "glass": {
         "type": "dielectric",
         "int_ior": 1.457,
@@ -254,16 +218,9 @@ def points_in_world(scene: trimesh.Scene) -> dict[str, np.ndarray]:
 
 
 def _paint(material: Any) -> dict[str, Any]:
-    """What ``scene.glb`` has a body painted with."""
-    return {
-        "type": "twosided",
-        "bsdf": {
-            "type": "principled",
-            "base_color": {"type": "rgb", "value": _linear(material.baseColorFactor[:3]).tolist()},
-            "metallic": float(material.metallicFactor),
-            "roughness": float(material.roughnessFactor),
-        },
-    }
+    """What ``scene.glb`` has a body painted with, as Mitsuba describes it."""
+    metallic, roughness = float(material.metallicFactor), float(material.roughnessFactor)
+    return _coloured(_linear(material.baseColorFactor[:3]).tolist(), metallic=metallic, roughness=roughness)
 
 
 def _part_of(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
@@ -295,7 +252,7 @@ def _linear(colour: Any) -> np.ndarray:
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
-def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
+def _studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
     """Soft neutral light from all sides, two large soft boxes beside and above the camera, a dark horizon opposite."""
     theta = np.pi * (np.arange(rows) + 0.5) / rows
     phi = 2.0 * np.pi * (np.arange(2 * rows) + 0.5) / (2 * rows)
@@ -328,7 +285,7 @@ def studio_light(mi: Any, view: View, rows: int = 128) -> dict[str, Any]:
 def load_studio(mi: Any, parts: list[Part], view: View) -> Any:
     """A ``mi.Scene`` of the parts under the studio's light; Mitsuba's index of a shape is the number of the part."""
     names = [f"part{i:04d}" for i in range(len(parts))]
-    description: dict[str, Any] = {"type": "scene", "light": studio_light(mi, view)}
+    description: dict[str, Any] = {"type": "scene", "light": _studio_light(mi, view)}
     for name, part in zip(names, parts, strict=True):
         description[name] = _mesh(mi, name, part)
     scene = mi.load_dict(description, optimize=False)

@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 from trimesh.visual.material import PBRMaterial
 
 from optics.geometry.aperture import Circle, Rectangle
-from optics.geometry.pose import Pose
 from optics.geometry.solid import Coating, Solid, solid_mesh
 from optics.geometry.tree import AT_REST, Body, PlacedBodies, State
 from scenes.models.instrument_model import Instrument
@@ -135,34 +134,21 @@ def _all_in_parents(bodies: Sequence[Body], placed: PlacedBodies) -> np.ndarray:
     return out
 
 
-def _in_parent(path: str, placed: PlacedBodies) -> Pose:
-    """A body's pose relative to its parent, or to the world."""
-    parent = path.rpartition("/")[0]
-    pose = placed.pose(path)
-    return placed.pose(parent).inverse() @ pose if parent else pose
-
-
-def _matrix(pose: Pose) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = pose.rotation, pose.translation
-    return matrix
-
-
 def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -> trimesh.Scene:
     """The scene as a tree of nodes with the bodies' names; rays are tubes of radius ``tube``, metres."""
-    meshes = body_meshes(instrument, paths)
+    meshes = _body_meshes(instrument, paths)
     scene = trimesh.Scene(base_frame=_WORLD)
     placed = paths.placed
-    for body in instrument.assembly.tree.bodies:
+    bodies = instrument.assembly.tree.bodies
+    for body, matrix in zip(bodies, _all_in_parents(bodies, placed), strict=True):
         parent = body.parent or _WORLD
-        matrix = _matrix(_in_parent(body.path, placed))
         scene.graph.update(body.path, parent, matrix=matrix)
         mesh = meshes.get(body.path)
         if mesh is not None:
             mesh.vertices = mesh.vertices * placed.scale[0, placed.index[body.path]].real
             scene.geometry[body.path] = mesh
             scene.graph.update(body.path, parent, matrix=matrix, geometry=body.path)
-    for name, (carrier, mesh) in baffle_meshes(instrument.baffles).items():
+    for name, (carrier, mesh) in _baffle_meshes(instrument.baffles).items():
         node = f"baffles/{name}"
         scene.geometry[node] = mesh
         scene.graph.update(node, carrier, matrix=np.eye(4), geometry=node)
@@ -173,7 +159,7 @@ def build_scene(instrument: Instrument, paths: LightPaths, tube: float = TUBE) -
     return scene
 
 
-def body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
+def _body_meshes(instrument: Instrument, paths: LightPaths) -> dict[str, trimesh.Trimesh]:
     """Body path -> mesh in the body's own frame, metres, unscaled."""
     out: dict[str, trimesh.Trimesh] = {}
     for camera, model in instrument.cameras.items():
@@ -206,7 +192,7 @@ def _material(solid: Solid) -> PBRMaterial:
     return GLASS if solid.transparent else MIRROR if is_mirror(solid) else BLOCK
 
 
-def baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
+def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Trimesh]]:
     """Name of a baffle -> the body that carries it, and its plates in that body's frame, metres."""
     parts: dict[str, tuple[str, list[trimesh.Trimesh]]] = {}
     for plate in plates:

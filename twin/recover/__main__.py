@@ -15,9 +15,8 @@ import typer
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.measured.monitor_frames import MeasurementSetup, resolve_measurement
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet
-from twin.run.command import Result, print_report, run_command
+from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 
 PROGRAM = "twin.recover"
 
@@ -68,23 +67,9 @@ def main(
         # frames that cannot be measured are told before anything that draws is loaded
         from twin.main_job.monitor_reading import worst_checks
         from twin.recover.recover_report import KIND, recover_numbers, recover_report
-        from twin.run.page import RunFacts, write_test
 
-        shown, numbers = recover_report(run), recover_numbers(run)
-        facts = RunFacts(
-            setup.to_yaml(),
-            str(measurement),
-            session.backend.name,
-            None,
-            session.started,
-            session.seconds,
-            PROGRAM,
-            "",
-            named=setup.plain(),
-            checks=worst_checks(run.readings),
-        )
-        write_test(KIND, numbers, shown, facts, session.folder)
-        return Result(described(KIND, numbers), lambda console: print_report(shown, console))
+        facts = {"config": setup.to_yaml(), "named": setup.plain(), "checks": worst_checks(run.readings)}
+        return finished(session, KIND, recover_report(run), recover_numbers(run), program=PROGRAM, **facts)
 
     run_command(
         measurement.stem,

@@ -39,8 +39,7 @@ from twin.recover.measured_frames import (
     repeated_frames,
 )
 from twin.run.procedure import Advance, silent
-from twin.sensors.area_detector import EmvaDetector
-from twin.sensors.grey_steps import told_of_steps
+from twin.sensors.area_detector import EmvaDetector, told_of_steps
 
 __all__ = ["RecoverRun", "run_recover", "state_name"]
 

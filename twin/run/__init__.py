@@ -1,1 +1,1 @@
-"""What every command shares: options, run folder, pages, files, versions."""
+"""What every command shares: its options and progress, its run folder, results, reports, pages, figures and files."""

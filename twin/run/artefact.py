@@ -8,7 +8,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from markupsafe import Markup
 
@@ -36,7 +36,13 @@ def _typeset(text: str) -> str:
 
 
 def fixed(value: float, decimals: int, sign: bool = False) -> str:
-    """A fixed-point number; what rounds to zero has no sign."""
+    """A fixed-point number; what rounds to zero has no sign.
+
+    Args:
+        value: the number; infinities and NaN become a dash.
+        decimals: digits behind the point.
+        sign: whether numbers above zero have a plus sign.
+    """
     if not math.isfinite(value):
         return "\N{EM DASH}"
     rounded = round(value, decimals) + 0.0
@@ -44,14 +50,28 @@ def fixed(value: float, decimals: int, sign: bool = False) -> str:
 
 
 def decimals_for(sigma: float, digits: int = 2, most: int = 7, default: int = 4) -> int:
-    """Decimals that show ``sigma`` with that many digits."""
+    """Decimals that show ``sigma`` with that many digits.
+
+    Args:
+        sigma: standard deviation, in the unit in which numbers are shown.
+        digits: significant digits of it that are to be seen.
+        most: decimals at most.
+        default: decimals where sigma is zero or not finite.
+    """
     if not (math.isfinite(sigma) and sigma > 0):
         return default
     return min(max(digits - 1 - math.floor(math.log10(sigma)), 0), most)
 
 
 def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool = False) -> str:
-    """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0."""
+    """A number with some significant digits, one less where a power of ten is written; below ``floor`` it is 0.
+
+    Args:
+        value: the number; infinities and NaN become a dash.
+        digits: significant digits.
+        floor: size below which a number is rounding and is shown as 0.
+        sign: whether numbers above zero have a plus sign.
+    """
     if not math.isfinite(value):
         return "\N{EM DASH}"
     if value == 0.0 or abs(value) < floor:
@@ -66,7 +86,12 @@ def significant(value: float, digits: int = 3, floor: float = SAME, sign: bool =
 
 
 def plain(value: float, digits: int = 5) -> str:
-    """A number that was given, without trailing zeros."""
+    """A number that was given, without trailing zeros.
+
+    Args:
+        value: the number.
+        digits: significant digits at most.
+    """
     return _typeset(f"{value:.{digits}g}")
 
 
@@ -130,7 +155,14 @@ class Marked(str):
 
 
 def residual_cell(text: str, ratio: float | None, key: str, hint: str = "") -> Marked:
-    """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR."""
+    """A reading with its departure from the truth in sigma below it, and a mark where that is beyond FAR.
+
+    Args:
+        text: the reading.
+        ratio: reading minus truth over sigma; None without noise.
+        key: name by which programs find the cell.
+        hint: shown to who points at the cell.
+    """
     far = ratio is not None and abs(ratio) > FAR
     return Marked(text, f"{'▲' if far else '●'} {residual_text(ratio)} σ", "far" if far else "near", key, hint)
 
@@ -143,10 +175,12 @@ class Artefact:
         name: of its file, without ending: small letters, digits, - and _; unique in its group.
         title: heading in the report; empty for none.
         caption: what it shows, in sentences; words between backticks are shown as code.
+        kind: ending of its file: ``svg``, ``png``, ``csv``, ``json``.
         within: file of the run folder that holds it; None for a file of its own, empty if only the page shows it.
         full: table with all digits that a reader can take away from the page.
     """
 
+    kind: ClassVar[str]
     name: str
     title: str
     caption: str
@@ -158,11 +192,6 @@ class Artefact:
         if not _NAME.fullmatch(self.name):
             raise ValueError(f"artefact name {self.name!r}: only small letters, digits, - and _ can be used")
         self.content()
-
-    @property
-    def kind(self) -> str:
-        """``svg``, ``png``, ``csv`` or ``json``; also the ending of the file."""
-        raise NotImplementedError
 
     @property
     def file(self) -> str:
@@ -188,12 +217,8 @@ class Artefact:
 class SvgFigure(Artefact):
     """A drawing; ``svg`` is one <svg> element, as ``twin.run.svg.to_svg`` makes it."""
 
+    kind: ClassVar[str] = "svg"
     svg: str
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "svg"
 
     @property
     def drawing(self) -> Markup:
@@ -213,12 +238,8 @@ class SvgFigure(Artefact):
 class PngFigure(Artefact):
     """A picture; ``png`` is the file's content."""
 
+    kind: ClassVar[str] = "png"
     png: bytes
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "png"
 
     @property
     def address(self) -> str:
@@ -241,6 +262,7 @@ class Table(Artefact):
     title of the rows from there on, of a table in parts.
     """
 
+    kind: ClassVar[str] = "csv"
     heads: Sequence[str]
     rows: Sequence[Sequence[Cell]]
     decimals: Sequence[int | None] = ()
@@ -282,11 +304,6 @@ class Table(Artefact):
             return fixed(value, value.decimals)
         return significant(value, self.digits, floor=0.0) if place is None else fixed(value, place)
 
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "csv"
-
     def content(self) -> bytes:
         """The table with all its digits."""
         for row in self.rows:
@@ -317,12 +334,8 @@ def _is_word(cell: str) -> bool:
 class Data(Artefact):
     """Plain data, kept as JSON and named in the report."""
 
+    kind: ClassVar[str] = "json"
     data: Any
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "json"
 
     def content(self) -> bytes:
         """The data; NaN and infinities are refused."""
@@ -333,12 +346,8 @@ class Data(Artefact):
 class Text(Artefact):
     """Words of a report beside its figures and tables: ``caption`` is a paragraph, ``points`` are a list below it."""
 
+    kind: ClassVar[str] = "txt"
     points: Sequence[str] = ()
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "txt"
 
     def content(self) -> bytes:
         """The words."""
@@ -349,12 +358,8 @@ class Text(Artefact):
 class Piece(Artefact):
     """A part of a page that this program wrote, with all texts of users escaped in it."""
 
+    kind: ClassVar[str] = "html"
     markup: Markup
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "html"
 
     def content(self) -> bytes:
         """The part."""
@@ -369,12 +374,8 @@ class Undrawn(Artefact):
         why: the error.
     """
 
+    kind: ClassVar[str] = "txt"
     why: str
-
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "txt"
 
     def content(self) -> bytes:
         """The note."""
@@ -395,10 +396,7 @@ class Undrawn(Artefact):
 class CameraFile(Data):
     """A camera as a file of the library; ``data`` is its YAML text."""
 
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "yaml"
+    kind: ClassVar[str] = "yaml"
 
     def content(self) -> bytes:
         """The file."""

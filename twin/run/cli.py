@@ -12,16 +12,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich import box
+from rich import box, progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    ProgressColumn,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from optics.numerics.backend import NAMES, BackendUnavailable
@@ -105,8 +97,9 @@ TICK_SECONDS = 8.0
 """From one line of progress to the next where there is no terminal: nobody waits longer than 10 s for a word."""
 
 
-class Heartbeat:
-    """Context manager: inside the block a line now and then says how far a command is, where no terminal shows it.
+@contextmanager
+def heartbeat(console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> Iterator[None]:
+    """Inside the block a line now and then says how far a command is, where no terminal shows it.
 
     Args:
         console: where it is said; nothing is where it is a terminal, which shows progress itself.
@@ -114,28 +107,22 @@ class Heartbeat:
         silent: whether nothing shall be said.
         seconds: from one line to the next, None for TICK_SECONDS.
     """
+    if silent or console.is_terminal:
+        yield
+        return
+    ended, pause = threading.Event(), TICK_SECONDS if seconds is None else seconds
 
-    def __init__(self, console: Console, says: Callable[[], str], silent: bool, seconds: float | None = None) -> None:
-        self._console, self._says = console, says
-        self._seconds = TICK_SECONDS if seconds is None else seconds
-        self._ended = threading.Event()
-        self._thread = None if silent or console.is_terminal else threading.Thread(target=self._beat, daemon=True)
+    def beat() -> None:
+        while not ended.wait(pause):
+            console.print(f"progress: {says()}", markup=False, highlight=False, soft_wrap=True)
 
-    def __enter__(self) -> Heartbeat:
-        """Begin."""
-        if self._thread is not None:
-            self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End; no line comes after it."""
-        self._ended.set()
-        if self._thread is not None:
-            self._thread.join()
-
-    def _beat(self) -> None:
-        while not self._ended.wait(self._seconds):
-            self._console.print(f"progress: {self._says()}", markup=False, highlight=False, soft_wrap=True)
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()  # no line comes after the block
 
 
 @dataclass
@@ -171,15 +158,15 @@ def time_text(seconds: float | None) -> str:
     return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
 
 
-def progress_columns(width: int) -> tuple[ProgressColumn, ...]:
+def progress_columns(width: int) -> tuple[progress.ProgressColumn, ...]:
     """Columns of a progress display: what is done, in ``width`` letters, how far, since when and for how long."""
     return (
-        SpinnerColumn(),
-        TextColumn(f"{{task.description:{width}}}", markup=False),
-        BarColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
+        progress.SpinnerColumn(),
+        progress.TextColumn(f"{{task.description:{width}}}", markup=False),
+        progress.BarColumn(),
+        progress.TimeElapsedColumn(),
+        progress.TextColumn("left"),
+        progress.TimeRemainingColumn(),
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from inspect import Signature, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -19,31 +19,8 @@ from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
 from scenes.specs.procedures import PROCEDURES, Procedure
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import (
-    AsJson,
-    BackendName,
-    Export,
-    File,
-    Force,
-    Heartbeat,
-    Options,
-    Out,
-    Quiet,
-    Seed,
-    Standing,
-    check_backend,
-    explained,
-    print_place,
-    print_verdict,
-    print_whole,
-    progress_columns,
-    result_table,
-)
-from twin.run.ending_signals import exit_on_terminate
+from twin.run import cli, durable, provenance, reference_frames, run_folder
 from twin.run.procedure import Advance, Session, performed
-from twin.run.provenance import program_digest
-from twin.run.reference_frames import described
-from twin.run.run_folder import RunFolder, RunFolderError, chosen, write_manifest
 
 if TYPE_CHECKING:
     from twin.run.report import Report
@@ -66,11 +43,31 @@ class Result:
     code: int = 0
 
 
+def finished(session: Session, kind: str, report: Report, numbers: Mapping[str, Any], **facts: Any) -> Result:
+    """Write the run folder of a command that shows a report, and what it tells in the terminal.
+
+    Args:
+        session: the command at work.
+        kind: of the numbers, which stand in KIND.json.
+        report: of the run, with the exit code that it asks for.
+        numbers: of the run; the report's verdict is added to them.
+        facts: how it was run, as `twin.run.page.RunFacts` takes them, beside what the session knows.
+    """
+    from twin.run.page import RunFacts, write_test
+
+    told = {**numbers, "verdict": report.verdict}
+    known = {"started": session.started, "seconds": session.seconds, "backend": session.backend.name}
+    write_test(kind, told, report, RunFacts(**{**known, **facts}), session.folder)
+    return Result(
+        reference_frames.described(kind, told), lambda console: print_report(report, console), code=report.code
+    )
+
+
 Given = TypeVar("Given")
 
 
 def run_command(
-    stem: str, options: Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
+    stem: str, options: cli.Options, resolve: Callable[[], Given], work: Callable[[Given, Session], Result]
 ) -> None:
     """Read what is asked for, do it in a run folder and print what it gave.
 
@@ -84,20 +81,20 @@ def run_command(
         typer.Exit: with the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(options.backend)
+    with cli.explained(errors):
+        cli.check_backend(options.backend)
         given = resolve()
-        folder = RunFolder(chosen(options.out, stem), options.force)
+        folder = run_folder.RunFolder(run_folder.chosen(options.out, stem), options.force)
         started, clock = time.time(), time.monotonic()
         tracer = load_backend(options.backend)
-        program_digest()  # of the files that compute, which may be others when the run ends
-        silent, standing = options.as_json or options.quiet, Standing()
+        provenance.program_digest()  # of the files that compute, which may be others when the run ends
+        silent, standing = options.as_json or options.quiet, cli.Standing()
         hidden = silent or not errors.is_terminal
         with (
-            exit_on_terminate(),
+            durable.exit_on_terminate(),
             folder,
-            Progress(*progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
-            Heartbeat(errors, standing.__str__, silent),
+            Progress(*cli.progress_columns(28), console=errors, disable=hidden, transient=True) as bar,
+            cli.heartbeat(errors, standing.__str__, silent),
         ):
             result = work(given, Session(folder, tracer, _advance(bar, standing), started, clock))
     with to_stdout(errors, f"the run is complete in {folder.target}"):
@@ -106,7 +103,7 @@ def run_command(
         elif not options.quiet:
             console = Terminal()
             result.show(console)
-            print_place(console, folder.target)
+            cli.print_place(console, folder.target)
     if result.problem:
         print_error(errors, f"{result.problem}; all else is in {folder.target}")
         raise typer.Exit(FAILURE)
@@ -114,7 +111,7 @@ def run_command(
         raise typer.Exit(result.code)
 
 
-def _advance(bar: Progress, standing: Standing) -> Advance:
+def _advance(bar: Progress, standing: cli.Standing) -> Advance:
     """Shows every part of the work as a line, from its beginning on."""
     parts: dict[str, TaskID] = {}
 
@@ -146,16 +143,16 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
     """
 
     def test(
-        file: File,
-        out: Out = None,
-        seed: Seed = None,
-        export_to: Export = None,
-        backend: BackendName = "llvm",
-        force: Force = False,
-        as_json: AsJson = False,
-        quiet: Quiet = False,
+        file: cli.File,
+        out: cli.Out = None,
+        seed: cli.Seed = None,
+        export_to: cli.Export = None,
+        backend: cli.BackendName = "llvm",
+        force: cli.Force = False,
+        as_json: cli.AsJson = False,
+        quiet: cli.Quiet = False,
     ) -> None:
-        run_test(program, command, procedure, file, Options(out, seed, backend, force, as_json, quiet, export_to))
+        run_test(program, command, procedure, file, cli.Options(out, seed, backend, force, as_json, quiet, export_to))
 
     if procedure.export is None:
         # Typer makes the options from the signature
@@ -165,7 +162,7 @@ def add_test(app: typer.Typer, program: str, command: str, procedure: Procedure)
     app.command(command, help=procedure.about)(test)
 
 
-def run_test(program: str, command: str, procedure: Procedure, file: Path, options: Options) -> None:
+def run_test(program: str, command: str, procedure: Procedure, file: Path, options: cli.Options) -> None:
     """Read a test, run it, write its run folder and print what it gave.
 
     Args:
@@ -180,7 +177,6 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
     """
 
     def work(setup: Any, session: Session) -> Result:
-        from twin.run.page import RunFacts, write_test
         from twin.run.report import numbers_only, with_warnings
 
         # a folder that cannot be made is told before the run
@@ -192,27 +188,24 @@ def run_test(program: str, command: str, procedure: Procedure, file: Path, optio
                 for name, content in procedure.export(run).items():
                     folder.write_bytes(name, content if isinstance(content, bytes) else content.encode())
                 said = {"test": procedure.kind, "backend": session.backend.name, "seed": number}
-                write_manifest(folder, program, session.started, session.seconds, **said)
+                run_folder.write_manifest(folder, program, session.started, session.seconds, **said)
         try:
             made, problem = procedure.report(run), ""
         except Exception as error:  # minutes or hours of computing are not thrown away for a figure
             problem = "the report could not be made"
             made = numbers_only(f"{program} {command}", f"{procedure.kind}.json", error)
             Console(stderr=True).print(traceback.format_exc(), markup=False, highlight=False, soft_wrap=True)
-        shown = with_warnings(made, given)
-        numbers = {**procedure.numbers(run), "verdict": shown.verdict}
-        seeded, name = setup.with_seed(number), session.backend.name
+        seeded = setup.with_seed(number)
         drawn = number if procedure.seeded and "seed" in type(setup.test).model_fields else None
-        times = session.started, session.seconds
-        facts = RunFacts(seeded.to_yaml(), str(file), name, drawn, *times, program, command, named=seeded.plain())
-        write_test(procedure.kind, numbers, shown, facts, session.folder)
-        told = described(procedure.kind, numbers)
-        return Result(told, lambda console: print_report(shown, console), problem, shown.code)
+        facts = {"config": seeded.to_yaml(), "named": seeded.plain(), "seed": drawn, "command": command}
+        shown, numbers = with_warnings(made, given), procedure.numbers(run)
+        done = finished(session, procedure.kind, shown, numbers, program=program, **facts)
+        return replace(done, problem=problem)
 
     run_command(file.stem, options, lambda: read_for(f"{program} {command}", file, procedure.resolve), work)
 
 
-def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
+def _export_folder(setup: Any, target: Path, force: bool) -> run_folder.RunFolder:
     """The folder of ``--export``, checked before anything is computed.
 
     Raises:
@@ -223,24 +216,24 @@ def _export_folder(setup: Any, target: Path, force: bool) -> RunFolder:
         text = "measurements are files already; --export writes those of a simulated bench"
         raise setup.test.error(text, ("measured",), allowed="the file of a simulated test")
     try:
-        return RunFolder(target, force)
-    except RunFolderError as error:
-        raise RunFolderError(str(error).replace("--out", "--export")) from None
+        return run_folder.RunFolder(target, force)
+    except run_folder.RunFolderError as error:
+        raise run_folder.RunFolderError(str(error).replace("--out", "--export")) from None
 
 
 def print_report(report: Report, console: Console) -> None:
     """The verdict, the main table of a report, and what else was found."""
     from twin.run.artefact import cell_text
 
-    print_verdict(console, report.verdict)
+    cli.print_verdict(console, report.verdict)
     summary = report.summary
-    table = result_table(report.title)
+    table = cli.result_table(report.title)
     for k, head in enumerate(summary.heads):
         text = all(isinstance(row[k], str) for row in summary.rows)
         table.add_column(escape(head), justify="left" if text else "right", no_wrap=text)
     for row in summary.shown():
         table.add_row(*(escape(cell_text(cell)) for cell in row))  # [m] is a unit
-    print_whole(console, table)
+    cli.print_whole(console, table)
     for line in report.lead:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     print_warnings(console, report.warnings)

@@ -76,7 +76,7 @@ def _application() -> typer.Typer:
             super().__init__(**{**attrs, "commands": lines})
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-            """With the program's own parser: only completion comes here."""
+            """Find the program's own parser; only completion comes here."""
             name, command, rest = super().resolve_command(ctx, args)
             return name, parser(PROGRAMS[args[0]][0]) if command else command, rest
 

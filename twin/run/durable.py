@@ -1,4 +1,4 @@
-"""Files and folders that outlive a failure of the power, and two folders that change places in one step.
+"""Files and folders that outlive a failure of the power, and what waits for a signal that asks the program to end.
 
 A file system may keep what is written in memory for half a minute, and write names before what they stand for. So
 whatever is to be relied on is written through (``fsync``) before the name that vouches for it: files before their
@@ -10,9 +10,11 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
-from collections.abc import Iterable
+import signal
+import threading
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 PARTIAL = ".partial"
@@ -26,7 +28,7 @@ _NOT_FOR_FOLDERS = (errno.EINVAL, errno.EOPNOTSUPP, errno.EBADF)
 """What file systems that know no fsync of a folder answer, those of a network for instance."""
 
 
-def sync_file(place: Path) -> None:
+def _sync_file(place: Path) -> None:
     """Write a file's content through to the disk. Raises OSError."""
     file = os.open(place, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:
@@ -54,7 +56,7 @@ def sync_tree(place: Path) -> None:
         folders.append(Path(folder))
         files += [path for path in (Path(folder) / name for name in names) if not path.is_symlink()]
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        for _ in pool.map(sync_file, files):
+        for _ in pool.map(_sync_file, files):
             pass
         for _ in pool.map(sync_folder, folders[1:]):
             pass
@@ -84,6 +86,10 @@ def write_safely(place: Path, content: bytes) -> None:
 
     Until then it is a hidden file beside its place that ends in ``PARTIAL``.
 
+    Args:
+        place: of the file; its folder is there.
+        content: of the file.
+
     Raises:
         OSError: the disk is full, or gone.
     """
@@ -91,7 +97,7 @@ def write_safely(place: Path, content: bytes) -> None:
 
 
 def write_all_safely(files: Iterable[tuple[Path, bytes]]) -> None:
-    """As ``write_safely``, for several files with their contents, whose folders are there.
+    """Write several files with their contents as ``write_safely`` does; their folders are there.
 
     Raises:
         OSError: the disk is full, or gone; some may be there.
@@ -168,3 +174,60 @@ def put_in_place(new: Path, target: Path, aside: Path) -> None:
             raise
     # what stands aside is removed next, which must not reach the disk before this
     sync_folder(target.parent)
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Signals that ask the program to end, Ctrl-C aside. SIGHUP does not when ``nohup`` has started it."""
+    asked = (signal.SIGTERM, signal.SIGHUP)
+    return tuple(number for number in asked if signal.getsignal(number) != signal.SIG_IGN)
+
+
+@contextmanager
+def exit_on_terminate() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the program as an exception, as Ctrl-C does, so that a half-written run folder is
+    removed. The exception that leaves the block is the signal's whatever became of it on its way: compiled modules turn
+    one that comes while they are imported or call back into their own, and clearing up may fail after it.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    got: list[int] = []
+
+    def leave(number: int, frame: object) -> None:
+        got.append(number)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if len(got) == 1:  # a second one must not break off the clearing up
+            raise SystemExit(128 + number)
+
+    asked = ending_signals()
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        asked = (*asked, signal.SIGINT)
+    before = {number: signal.signal(number, leave) for number in asked}
+    try:
+        yield
+    except BaseException as error:
+        if got:
+            raise (KeyboardInterrupt() if got[0] == signal.SIGINT else SystemExit(128 + got[0])) from error
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def ending_later() -> Iterator[None]:
+    """Ctrl-C and signals that ask to end are heeded when the block is over, of what cannot be broken off."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    got: list[int] = []
+    asked = (signal.SIGINT, *ending_signals())
+    before = {number: signal.signal(number, lambda number, frame: got.append(number)) for number in asked}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for heard in got:
+        signal.raise_signal(heard)

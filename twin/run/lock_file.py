@@ -57,6 +57,10 @@ def normal(name: str) -> str:
 def read_layer(layer: str, folder: Path = FOLDER) -> tuple[Locked, ...]:
     """The packages of one file.
 
+    Args:
+        layer: one of `LAYERS`.
+        folder: of the lock files.
+
     Raises:
         LockError: a line that is neither a pin, nor a hash, nor a comment; a pin without a hash.
         OSError: no such file.
@@ -66,7 +70,7 @@ def read_layer(layer: str, folder: Path = FOLDER) -> tuple[Locked, ...]:
 
 
 def parse(text: str, layer: str, file: str) -> tuple[Locked, ...]:
-    """The same of a text; `file` is for messages."""
+    """The packages that the text of one file lists; `file` is for messages."""
     found: list[Locked] = []
     pin: re.Match[str] | None = None
     hashes: list[str] = []

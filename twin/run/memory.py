@@ -97,6 +97,11 @@ def _own(which: int) -> float:
         return 0.0
 
 
+def largest_memory() -> float:
+    """Largest resident memory of this process so far, bytes."""
+    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
 PROGRAM = 140e6
 """Resident memory of the imported program, bytes."""
 

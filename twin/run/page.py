@@ -24,12 +24,9 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
+from twin.run import data_files, provenance, reference_frames, run_folder
 from twin.run.artefact import Artefact
-from twin.run.data_files import FrameFacts, frame_files
-from twin.run.provenance import SelfCheck, checks_in, inputs_in, versions
-from twin.run.reference_frames import described
 from twin.run.report import Report, further_sections
-from twin.run.run_folder import RunFolder, write_manifest
 
 FIGURES = "*{stroke-linejoin: round; stroke-linecap: butt}"
 """The style sheet that Matplotlib writes into every figure."""
@@ -96,12 +93,11 @@ class RunFacts:
 
     Attributes:
         config: the test with all it refers to, as YAML; it can be given in place of the test's file.
-        file: the test's file as the user gave it.
-        backend: where it was traced.
-        seed: of everything that is drawn; None where nothing is.
+        program: that ran it, as the user calls it.
         started: seconds since the epoch.
         seconds: that it took.
-        program: that ran it, as the user calls it.
+        backend: where it was traced; empty where nothing was.
+        seed: of everything that is drawn; None where nothing is.
         command: its subcommand.
         again: words of the command that runs it again, program first, where it is not the test with the run's own
             config.yaml.
@@ -111,21 +107,20 @@ class RunFacts:
     """
 
     config: str
-    file: str
-    backend: str
-    seed: int | None
+    program: str
     started: float
     seconds: float
-    program: str
-    command: str
+    backend: str = ""
+    seed: int | None = None
+    command: str = ""
     again: tuple[str, ...] = ()
     named: Any = None
     given: tuple[Path, ...] = ()
-    checks: tuple[SelfCheck, ...] = ()
+    checks: tuple[provenance.SelfCheck, ...] = ()
 
     @property
     def words(self) -> tuple[str, ...]:
-        """Of the command that makes the run again in its folder."""
+        """Words of the command that makes the run again in its folder."""
         if self.again:
             return self.again
         seed = () if self.seed is None else ("--seed", str(self.seed))
@@ -139,12 +134,22 @@ class RunFacts:
             numbers: of the run.
         """
         place = {"started_in": str(Path.cwd())} if self.given else {}
-        checks = [check.to_dict() for check in self.checks or checks_in(numbers)]
-        return {"again": list(self.words), **place, "inputs": inputs_in(self.named, self.given), "checks": checks}
+        checks = [check.to_dict() for check in self.checks or provenance.checks_in(numbers)]
+        return {
+            "again": list(self.words),
+            **place,
+            "inputs": provenance.inputs_in(self.named, self.given),
+            "checks": checks,
+        }
 
 
-def write_artefacts(artefacts: Iterable[Artefact], folder: RunFolder) -> None:
-    """Write artefacts that have files of their own into an open run folder."""
+def write_artefacts(artefacts: Iterable[Artefact], folder: run_folder.RunFolder) -> None:
+    """Write artefacts that have files of their own into an open run folder.
+
+    Args:
+        artefacts: of a report.
+        folder: open.
+    """
     for artefact in artefacts:
         if artefact.within is None:
             folder.write_bytes(artefact.file, artefact.content())
@@ -177,7 +182,7 @@ def report_page(
         report=report,
         command=reproduce(words),
         rows=rows,
-        versions=", ".join(f"{name} {version}" for name, version in versions().items()),
+        versions=", ".join(f"{name} {version}" for name, version in provenance.versions().items()),
         config=config,
         programs=programs,
         scripts=Markup(scripts),
@@ -185,7 +190,13 @@ def report_page(
 
 
 def render_report(kind: str, report: Report, facts: RunFacts) -> str:
-    """``report.html`` of a test as text; its numbers are in KIND.json."""
+    """``report.html`` of a test as text; its numbers are in KIND.json.
+
+    Args:
+        kind: of the test.
+        report: what it says.
+        facts: how it was run.
+    """
     rows: list[tuple[str, str]] = [("Numbers", links((f"{kind}.json", "config.yaml")))]
     if report.images:
         images = (Markup('<a href="images/{0}.tiff">{0}.tiff</a>').format(name) for name in report.images)
@@ -196,7 +207,9 @@ def render_report(kind: str, report: Report, facts: RunFacts) -> str:
     return report_page(report, facts.words, rows)
 
 
-def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: RunFacts, folder: RunFolder) -> None:
+def write_test(
+    kind: str, numbers: Mapping[str, Any], report: Report, facts: RunFacts, folder: run_folder.RunFolder
+) -> None:
     """Write everything into an open run folder: config, numbers, report, artefacts, images, the manifest.
 
     Args:
@@ -208,11 +221,13 @@ def write_test(kind: str, numbers: Mapping[str, Any], report: Report, facts: Run
     """
     report = replace(report, sections=(*report.sections, *further_sections(kind, numbers)))
     folder.write_text("config.yaml", facts.config)
-    folder.write_json(f"{kind}.json", described(kind, numbers))
+    folder.write_json(f"{kind}.json", reference_frames.described(kind, numbers))
     write_artefacts(report.artefacts, folder)
     for name, frames in report.images.items():
-        for file, content in frame_files(name, frames, report.image_facts.get(name, FrameFacts()), stretch=None):
+        for file, content in data_files.frame_files(
+            name, frames, report.image_facts.get(name, data_files.FrameFacts()), stretch=None
+        ):
             folder.write_bytes(file, content)
     folder.write_text("report.html", render_report(kind, report, facts))
     entries = {"test": kind, "backend": facts.backend, "seed": facts.seed or 0, "warnings": list(report.warnings)}
-    write_manifest(folder, facts.program, facts.started, facts.seconds, **entries, **facts.kept(numbers))
+    run_folder.write_manifest(folder, facts.program, facts.started, facts.seconds, **entries, **facts.kept(numbers))

@@ -85,6 +85,17 @@ NOT_IN_RUNS = ("twin/validation/",)
 """No run of a study needs these."""
 
 
+ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".py", ".svg", ".txt", ".yaml")
+"""Endings of the packages' own files, as a wheel holds them."""
+
+
+def _program_files(endings: tuple[str, ...]) -> dict[str, str]:
+    """Files of the packages with these endings, by their paths from the root -> SHA-256."""
+    paths = (path for package in SOURCES for path in sorted((ROOT / package).rglob("*")))
+    found = (path for path in paths if path.suffix in endings and path.is_file())
+    return {path.relative_to(ROOT).as_posix(): _checksum(path) for path in found}
+
+
 @cache
 def sources() -> dict[str, str]:
     """Source files that compute, as this process found them first -> checksum; comments and docstrings count.
@@ -92,17 +103,12 @@ def sources() -> dict[str, str]:
     To leave these out every file would have to be parsed, a second or two for every command, and nobody edits the
     program in the middle of a study just to rephrase it.
     """
-    out = {}
-    for package in SOURCES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            name = path.relative_to(ROOT).as_posix()
-            if not name.startswith(NOT_IN_RUNS):
-                out[name] = _checksum(path)[:16]
-    return out
+    every = _program_files((".py",))
+    return {name: check[:16] for name, check in every.items() if not name.startswith(NOT_IN_RUNS)}
 
 
 def _checksum(path: Path) -> str:
-    """Of a file as the source tree has it."""
+    """SHA-256 of a file as the source tree has it."""
     text = path.read_bytes()
     return hashlib.sha256(text.replace(BEFORE.encode(), b"") if BEFORE and path.suffix == ".py" else text).hexdigest()
 
@@ -112,33 +118,18 @@ def source_digest() -> str:
     return hashlib.sha256(json.dumps(sources(), sort_keys=True).encode()).hexdigest()
 
 
-ENDINGS = (".css", ".csv", ".html", ".j2", ".js", ".py", ".svg", ".txt", ".yaml")
-"""Of the packages' own files, as a wheel holds them."""
-
-
 @cache
 def program_digest() -> str:
     """One SHA-256 for every file of the program as this process found them first: code, library, templates; the same
     for a source tree and for what was installed from it.
     """
-    every = {}
-    for package in SOURCES:
-        for path in sorted((ROOT / package).rglob("*")):
-            if path.suffix in ENDINGS and path.is_file():
-                every[path.relative_to(ROOT).as_posix()] = _checksum(path)
-    return hashlib.sha256(json.dumps(every, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(_program_files(ENDINGS), sort_keys=True).encode()).hexdigest()
 
 
 Checksum = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
-SETTINGS = (
-    LIMIT,
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "OPENBLAS_CORETYPE",
-    "NPY_DISABLE_CPU_FEATURES",
-)
-"""Of the environment, which change how numbers are rounded or how fast they come."""
+SETTINGS = (LIMIT, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES")
+"""Variables of the environment that change how numbers are rounded or how fast they come."""
 
 
 class Blas(BaseModel):
@@ -189,17 +180,10 @@ class Provenance(BaseModel):
 
     @classmethod
     def here(cls) -> Provenance:
-        """Of this process."""
+        """Provenance of what this process computes."""
         loaded = [one for one in threadpool_info() if one["user_api"] == "blas"]
-        found = [
-            Blas(
-                name=one["internal_api"],
-                version=str(one["version"]),
-                kernels=str(one.get("architecture", "")),
-                threads=one["num_threads"],
-            )
-            for one in loaded
-        ]
+        told = [(one["internal_api"], str(one["version"]), str(one.get("architecture", "")), one) for one in loaded]
+        found = [Blas(name=a, version=b, kernels=c, threads=one["num_threads"]) for a, b, c, one in told]
         return cls(
             source=program_digest(),
             system=f"{platform.system()} {platform.release()}",
@@ -253,14 +237,14 @@ class SelfCheck:
         return None if self.limit is None else bool(self.value <= self.limit)
 
     def to_dict(self) -> dict[str, Any]:
-        """As plain data."""
+        """The check as plain data."""
         return {**asdict(self), "holds": self.holds}
 
 
 CHI_SQUARE, WITHIN = re.compile(r"(^|_)chi_square$|^relative_error$|^worst_relative$"), ("chi_square_limit", "limit")
 TRUE = ("converged", "agrees", "holds", "sigma_holds")
 MOST_CHECKS = 50
-"""Of one run."""
+"""Checks of one run that are kept at most."""
 
 
 def checks_in(numbers: Mapping[str, Any]) -> tuple[SelfCheck, ...]:
@@ -310,7 +294,7 @@ def inputs_in(tree: Any, given: Iterable[Path] = ()) -> dict[str, str]:
 
 
 MOST_FILES = 10_000
-"""Of a folder that is named as an input."""
+"""Files of a folder that is named as an input, at most."""
 
 
 def _files(place: Path) -> Iterable[Path]:

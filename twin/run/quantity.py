@@ -18,7 +18,7 @@ from analysis.units import ARCMIN, ARCSEC
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from twin.run.artefact import Cell, Table, shown_unit
-from twin.run.data_table import DataColumn, DataTable
+from twin.run.data_files import DataColumn, DataTable
 from twin.run.plain_data import plain_data
 
 S = TypeVar("S")
@@ -85,7 +85,7 @@ class Quantity(Generic[S]):
 
     @property
     def unit(self) -> str:
-        """As the program writes it, empty for none."""
+        """Unit as the program writes it, empty for none."""
         square = self.key.removesuffix("2") if self.key.endswith("m2") else ""
         return f"{unit_of((square,))}2" if square else unit_of((self.key,))
 
@@ -129,7 +129,7 @@ class Record(Generic[S]):
         self.meaning, self.quantities = meaning, quantities
 
     def __iter__(self) -> Iterator[Quantity[S]]:
-        """Its quantities."""
+        """Iterate over the quantities."""
         return iter(self.quantities)
 
     def __getitem__(self, key: str) -> Quantity[S]:

@@ -16,7 +16,7 @@ from scenes.specs.procedures import PROCEDURES
 __all__ = ["FRAMES", "described", "frames_text", "schema"]
 
 _VERSION = 2
-"""Of the files' keys; 1 had no statement of frames."""
+"""Version of the files' keys; 1 had no statement of frames."""
 _LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3, "recovered": 3, "course": 3, "monitor": 3})
 """Kind of file -> version, where keys went or changed their meaning since then: what a paper prints and whether it
 holds; sigmas, which were those of the noise alone."""
@@ -194,6 +194,10 @@ def schema(kind: str) -> str:
 
 def described(kind: str, data: Mapping[str, Any]) -> dict[str, Any]:
     """The data of a file with its schema and its frames before them.
+
+    Args:
+        kind: of the file.
+        data: its contents, plain data.
 
     Raises:
         KeyError: a kind without an entry in `FRAMES` or a test's `frames` of its own.

@@ -103,7 +103,12 @@ def numbers_only(title: str, file: str, error: Exception) -> Report:
 
 
 def with_warnings(report: Report, given: tuple[str, ...]) -> Report:
-    """The report with further warnings before its own."""
+    """The report with further warnings before its own.
+
+    Args:
+        report: of a run.
+        given: warnings of what the run was given.
+    """
     return replace(report, warnings=(*given, *report.warnings))
 
 
@@ -115,6 +120,11 @@ stands before the one that says how to reproduce the run; its artefacts are in t
 
 
 def further_sections(kind: str, run: Any) -> tuple[Section, ...]:
-    """The sections for a run of that kind, in the order of SECTIONS."""
+    """The sections for a run of that kind, in the order of SECTIONS.
+
+    Args:
+        kind: of the run.
+        run: what the run gave.
+    """
     found = (section(run) for (of, _), section in SECTIONS.items() if of == kind)
     return tuple(section for section in found if section is not None)

@@ -10,20 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 from typing import Annotated, Any, Protocol
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from twin.run.durable import make_folders, put_in_place, sync_folder, sync_tree
-from twin.run.ending_signals import ending_later
+from twin.run import owned_files
+from twin.run.durable import ending_later, make_folders, put_in_place, sync_folder, sync_tree
 from twin.run.owned_files import MANIFEST as MANIFEST
-from twin.run.owned_files import digest, every_file, foreign_files, remove_files
 from twin.run.provenance import Checksum, Provenance, versions
-from twin.run.unfinished import OLD, PARTIAL, Unfinished, successor, sweep
-
-NAMED = 5
-"""Files that a message names at most."""
 
 
 class RunFolderError(Exception):
@@ -50,13 +44,18 @@ class Numbered:
         """
         for number in range(1, 1_000_000):
             candidate = self.folder / f"{self.stem}-{number:03d}"
-            if not (candidate.exists() or candidate.is_symlink() or successor(candidate).exists()):
+            if not (candidate.exists() or candidate.is_symlink() or owned_files.successor(candidate).exists()):
                 return candidate
         raise RunFolderError(f"no free name {self.stem}-NNN in {self.folder}; choose one with --out")
 
 
 def chosen(out: Path | None, stem: str) -> Path | Numbered:
-    """The folder that the user chose, else the next free one of that name below ``runs``."""
+    """The folder that the user chose, else the next free one of that name below ``runs``.
+
+    Args:
+        out: of the option --out, None where it was not given.
+        stem: of the folder's name.
+    """
     return out if out is not None else Numbered(Path("runs"), stem)
 
 
@@ -81,7 +80,7 @@ class RunFolder:
         self.target = target.free() if isinstance(target, Numbered) else Path(target)
         self.force = force
         self.path = self.target
-        self._unfinished: Unfinished | None = None
+        self._unfinished: owned_files.Unfinished | None = None
         self._made_parents: list[Path] = []
         try:
             self._check_target()
@@ -111,11 +110,11 @@ class RunFolder:
         """Make the temporary folder."""
         try:
             self._made_parents = make_folders(self.target.parent)
-            sweep(self.target.parent, remove_replaced)
+            owned_files.sweep(self.target.parent, remove_replaced)
             if self._numbered is None:
                 self._check_target()  # what a killed run had put aside may stand there again
-            self._unfinished = Unfinished(self.target)
-            self.path = self._unfinished.path(PARTIAL)
+            self._unfinished = owned_files.Unfinished(self.target)
+            self.path = self._unfinished.path(owned_files.PARTIAL)
             self.path.mkdir()
         except OSError as error:
             self._remove()
@@ -125,9 +124,7 @@ class RunFolder:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Rename when all went well, else remove."""
         if error is None:
             try:
@@ -148,7 +145,7 @@ class RunFolder:
     def _remove(self) -> None:
         """Take back everything that was made."""
         if self._unfinished is not None:
-            shutil.rmtree(self._unfinished.path(PARTIAL), ignore_errors=True)
+            shutil.rmtree(self._unfinished.path(owned_files.PARTIAL), ignore_errors=True)
             self._unfinished.close()
         for parent in self._made_parents:
             try:
@@ -159,7 +156,7 @@ class RunFolder:
     def _publish(self) -> None:
         assert self._unfinished is not None
         # the manifest vouches for the rest, and has its name once that is on the disk
-        manifest, waiting = self.path / MANIFEST, self.path / f".{MANIFEST}{PARTIAL}"
+        manifest, waiting = self.path / MANIFEST, self.path / f".{MANIFEST}{owned_files.PARTIAL}"
         vouched = manifest.exists()
         if vouched:
             os.rename(manifest, waiting)
@@ -169,7 +166,7 @@ class RunFolder:
             sync_folder(self.path)
         with ending_later():
             if self.force and self.target.exists():
-                old = self._unfinished.path(OLD)
+                old = self._unfinished.path(owned_files.OLD)
                 put_in_place(self.path, self.target, old)
                 with suppress(OSError):  # the next run beside it tries again
                     remove_run(old, self.target)
@@ -221,7 +218,7 @@ class RunFolder:
         out = {}
         for file in sorted(self.path.rglob("*")):
             if file.is_file():
-                out[file.relative_to(self.path).as_posix()] = digest(file)
+                out[file.relative_to(self.path).as_posix()] = owned_files.digest(file)
         return out
 
 
@@ -359,7 +356,7 @@ def altered(folder: Path, manifest: Manifest) -> list[str]:
 
 
 def _is_as_written(place: Path, known: str) -> bool:
-    return place.is_file() and not place.is_symlink() and digest(place) == known
+    return place.is_file() and not place.is_symlink() and owned_files.digest(place) == known
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -380,11 +377,15 @@ def unlisted(folder: Path) -> list[str] | None:
     neither. Raises OSError.
     """
     manifest = read_manifest(folder)
-    return foreign_files(folder, None if manifest is None else manifest.sha256)
+    return owned_files.foreign_files(folder, None if manifest is None else manifest.sha256)
 
 
 def refuse_others(folder: Path, others: Sequence[str]) -> None:
     """Refuse to replace a folder with files in it that no run put there, or that were changed since.
+
+    Args:
+        folder: that is to be replaced.
+        others: files in it that are not the run's own.
 
     Raises:
         RunFolderError: there are some.
@@ -393,8 +394,7 @@ def refuse_others(folder: Path, others: Sequence[str]) -> None:
         return
     manifest = read_manifest(folder)
     changed = set(manifest.sha256 if manifest is not None else ())
-    shown = [f"{name} (changed since)" if name in changed else name for name in others[:NAMED]]
-    named = ", ".join(shown) + (f" and {len(others) - NAMED} more" if len(others) > NAMED else "")
+    named = owned_files.first_names([f"{name} (changed since)" if name in changed else name for name in others])
     raise RunFolderError(
         f"output folder {folder} also holds what the run did not write: {named}; --force removes only the run's own "
         "files, so move these away or choose another folder with --out"
@@ -409,17 +409,22 @@ def remove_run(old: Path, new: Path) -> None:
         new: what stands in its place.
     """
     others = unlisted(old)
-    for name in every_file(old) if others is None else others:
+    for name in owned_files.every_file(old) if others is None else others:
         place = new / name
         while place.exists() or place.is_symlink():
             place = place.with_name(f"{place.name}.kept")
         place.parent.mkdir(parents=True, exist_ok=True)
         (old / name).rename(place)
-    remove_files(old, set())
+    owned_files.remove_files(old, set())
 
 
 def remove_replaced(old: Path, new: Path) -> bool:
-    """Remove what a killed process had replaced, if what it had in its place is complete."""
+    """Remove what a killed process had replaced, if what it had in its place is complete.
+
+    Args:
+        old: what was to be replaced, under another name.
+        new: what stands in its place.
+    """
     if not is_run_folder(new):
         return False
     remove_run(old, new)

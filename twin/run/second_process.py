@@ -17,7 +17,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import IO, Any
 
 from optics.numerics.threads import cores
@@ -48,9 +47,7 @@ class SecondProcess:
             self._begin()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._child:
             self._ended(0.0)
             self._from_child.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from functools import cache
 from io import BytesIO, StringIO
@@ -32,7 +33,7 @@ BEFORE, AFTER = SKY, VERMILION
 GRAY, DIVERGING = "gray", "RdBu_r"
 """Colour maps of images and of what has a sign."""
 
-STYLE: dict[str, Any] = {
+_STYLE: dict[str, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.0,
@@ -56,7 +57,12 @@ WIDTH = 10.6
 
 
 def new_figure(height: float, pads: dict[str, Any] | None = None) -> Figure:
-    """An empty figure, ``height`` inches high, arranged without overlap; ``pads``: of ``ConstrainedLayoutEngine``."""
+    """An empty figure as wide as a page's column, arranged without overlap.
+
+    Args:
+        height: of the figure, inches.
+        pads: arguments of ``ConstrainedLayoutEngine``; None for the usual room between panels.
+    """
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     return _arranged()(figsize=(WIDTH, height), layout=ConstrainedLayoutEngine(**(pads or {"h_pad": 0.08})))
@@ -87,7 +93,7 @@ def look(name: str) -> AbstractContextManager[None]:
     """Context in which figures are drawn; ``name`` makes an SVG's identifiers its own, and the same in every run."""
     import matplotlib
 
-    style: Any = {**STYLE, "svg.hashsalt": name}
+    style: Any = {**_STYLE, "svg.hashsalt": name}
     return matplotlib.rc_context(style)
 
 
@@ -108,7 +114,12 @@ def to_svg(figure: Figure) -> str:
 
 
 def to_png(figure: Figure, dpi: int) -> bytes:
-    """The figure as PNG."""
+    """The figure as PNG.
+
+    Args:
+        figure: what is drawn.
+        dpi: dots per inch.
+    """
     out = BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
     return out.getvalue()
@@ -119,8 +130,46 @@ def plain_axes(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+def panels(heights: Sequence[float], wide: int) -> tuple[Figure, list[Axes]]:
+    """A figure of panels in rows, each row as high as its highest panel.
+
+    Args:
+        heights: of the panels in their order, inches.
+        wide: number of panels beside each other; places that are left over stay empty.
+    """
+    rows = [max(heights[k : k + wide]) for k in range(0, len(heights), wide)]
+    figure = new_figure(sum(rows))
+    grid = figure.subplots(len(rows), wide, squeeze=False, height_ratios=rows).ravel()
+    for axes in grid[len(heights) :]:
+        axes.set_axis_off()
+    return figure, list(grid[: len(heights)])
+
+
+def interval_bars(
+    axes: Axes, x: np.ndarray, y: np.ndarray, ends: Any, which: Literal["x", "y"] = "y", **how: Any
+) -> None:
+    """Error bars from the ends of intervals, which need not lie evenly about the values.
+
+    Args:
+        axes: where.
+        x: places of the values along x, (N,).
+        y: and along y, (N,).
+        ends: lower and upper ends of the intervals, (N, 2), in the units of the axis.
+        which: the axis along which the bars lie.
+        how: more for ``errorbar``; without ``fmt`` only the bars are drawn, in ink.
+    """
+    reach = np.abs(np.asarray(ends, np.float64).T - (x if which == "x" else y))
+    bare: dict[str, Any] = {} if "fmt" in how else {"fmt": "none", "ecolor": INK, "elinewidth": 1.0}
+    axes.errorbar(x, y, **{f"{which}err": reach, **bare, **how})
+
+
 def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
-    """Light lines behind what is drawn, and only the left and the bottom axis line."""
+    """Light lines behind what is drawn, and only the left and the bottom axis line.
+
+    Args:
+        axes: where.
+        which: along which axis the lines are counted.
+    """
     axes.grid(axis=which, color=LIGHT, lw=0.5)
     axes.set_axisbelow(True)
     plain_axes(axes)
@@ -129,7 +178,15 @@ def gridded(axes: Axes, which: Literal["both", "x", "y"] = "both") -> None:
 def shared_legend(
     figure: Figure, axes: Axes, place: str = "upper center", columns: int | None = None, **how: Any
 ) -> None:
-    """A legend beside all panels, of what one of them shows; in one row unless ``columns`` are given."""
+    """A legend beside all panels, of what one of them shows.
+
+    Args:
+        figure: with all panels.
+        axes: the panel whose lines are named.
+        place: beside the panels, as Matplotlib names it.
+        columns: of the legend; None for one row.
+        how: more for ``legend``.
+    """
     handles, labels = axes.get_legend_handles_labels()
     outside: Any = f"outside {place}"
     figure.legend(handles, labels, loc=outside, ncols=columns or max(len(labels), 1), **how)

@@ -36,7 +36,7 @@ from twin.monitor.truth import truth_jacobian
 from twin.run.reference_frames import frames_text
 from twin.scripting.results import Found, Shot, as_frames, found_table, name_html
 from twin.scripting.results import shot_of as _shot_of
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 
 if TYPE_CHECKING:
     from twin.camera.camera_view import CameraView

@@ -104,7 +104,7 @@ def perform(
     run, given = performed(procedure, setup, load_backend(backend), number)
     program, command = name.split()
     seeded, seconds = setup.with_seed(number), time.monotonic() - clock
-    told = (seeded.to_yaml(), str(file), backend, number, started, seconds, f"twin.{program}", command)
+    told = (seeded.to_yaml(), f"twin.{program}", started, seconds, backend, number, command)
     facts = RunFacts(*told, named=seeded.plain())
     shown = with_warnings(procedure.report(run), given)
     numbers = {**procedure.numbers(run), "verdict": shown.verdict}

@@ -26,7 +26,7 @@ from twin.main_job.verdict import judge
 from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
 from twin.run.run_folder import RunFolder
-from twin.targets.target_result import PlaceTargets
+from twin.targets.target_measurement import PlaceTargets
 
 
 @dataclass(frozen=True, eq=False)

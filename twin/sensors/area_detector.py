@@ -8,9 +8,9 @@ The signal chain is the linear camera model of EMVA Standard 1288 (release 3.1, 
     y_DN = clip(rint(y), 0, 2**bit_depth - 1)                                     uint16
 
 PRNU scales the response to light only; DSNU is a fixed additive pattern in electrons that adds no shot noise. Further
-noise is what a data sheet lists beyond the model (``twin.sensors.noise_terms``). The
-Poisson numbers are exact at every mean (``twin.sensors.poisson_numbers``); no normal approximation is made anywhere.
-Pixel coordinates are (row, column); arrays are (..., H, W).
+noise is what a data sheet lists beyond the model, term by term (``NOISE_TERMS``). The Poisson numbers are exact at
+every mean (``twin.sensors.poisson_numbers``); no normal approximation is made anywhere. Pixel coordinates are
+(row, column); arrays are (..., H, W).
 """
 
 from __future__ import annotations
@@ -20,22 +20,104 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import ValidationError
 
-from analysis.spots.noise import NoiseModel
+from analysis.spots.noise import FurtherNoise, NoiseModel
+from analysis.spots.rounding import COARSE, FEW, WHOLE
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import cores
 from scenes.specs.detector import DetectorSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.yaml.errors import Problem, names_text, nearest
+from scenes.yaml.spec import Spec
 from twin.run.random_streams import stream
-from twin.sensors.noise_terms import NOISE_TERMS, FixedOffsets, NoiseTerm, ReadNoise
 from twin.sensors.poisson_numbers import poisson_pieces
 
-__all__ = ["EmvaDetector", "FixedPattern", "SaturationReport"]
+
+class NoiseTerm(FurtherNoise, Protocol):
+    """What a term adds to the electrons of a pixel, after the well is clipped and before the grey value is made.
+
+    It is independent from pixel to pixel and of mean zero, and its variances are those that ``FurtherNoise`` tells.
+    """
+
+    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray | None:
+        """Electrons (..., H, W) that stay from frame to frame, for detectors of that shape; None for nothing."""
+        ...
+
+    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+        """New in every frame: electrons of the shape of those collected, (frames, H, W); None for nothing."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReadNoise:
+    """Normal noise of the electronics, new in every frame.
+
+    Attributes:
+        sigma_e: electrons rms.
+    """
+
+    sigma_e: float
+
+    @property
+    def fixed_variance_e2(self) -> float:
+        """Read noise adds nothing that stays from frame to frame, electrons squared."""
+        return 0.0
+
+    def temporal_variance_e2(self, electrons: Any) -> float:
+        """Variance within a pixel, the same at every signal, electrons squared."""
+        return self.sigma_e**2
+
+    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> None:
+        """Nothing is drawn for what stays."""
+        return
+
+    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+        """Electrons drawn for every pixel of every frame; no number is drawn for a sigma of zero."""
+        if self.sigma_e <= 0:
+            return None
+        out = rng.standard_normal(electrons.shape)
+        out *= self.sigma_e
+        return out
+
+
+@dataclass(frozen=True)
+class FixedOffsets:
+    """Normal differences of the pixels' offsets.
+
+    Attributes:
+        sigma_e: electrons rms.
+    """
+
+    sigma_e: float
+
+    @property
+    def fixed_variance_e2(self) -> float:
+        """Variance over the pixels, electrons squared."""
+        return self.sigma_e**2
+
+    def temporal_variance_e2(self, electrons: Any) -> float:
+        """Offsets do not change from frame to frame, electrons squared."""
+        return 0.0
+
+    def fixed_e(self, shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+        """Electrons drawn for every pixel."""
+        return self.sigma_e * rng.standard_normal(shape)
+
+    def temporal_e(self, electrons: np.ndarray, rng: np.random.Generator) -> None:
+        """Nothing is drawn anew."""
+        return
+
+
+NOISE_TERMS: dict[str, Callable[[float], NoiseTerm]] = {"read": ReadNoise, "offset": FixedOffsets}
+"""Name that a data sheet may write under ``noise`` -> the term of the number that stands there, electrons rms where the
+term does not say otherwise. A new one is added here.
+"""
+
 
 Seed = int | np.random.SeedSequence
 
@@ -143,16 +225,16 @@ class EmvaDetector:
 
     @classmethod
     def _sheet_names(cls) -> list[str]:
-        """Of the numbers, as they are called in a data sheet."""
+        """Names of the numbers, as a data sheet has them."""
         return [field.name for field in fields(cls) if field.name != "noise"]
 
     @cached_property
     def _sheet(self) -> DetectorSpec:
-        """The same numbers as a data sheet, which knows their limits and what follows from them."""
+        """These numbers as a data sheet, which knows their limits and what follows from them."""
         return DetectorSpec.model_validate({"name": "detector", **self._numbers()})
 
     def _numbers(self) -> dict[str, Any]:
-        """As plain numbers, not numpy's."""
+        """The detector's numbers as Python's own, not numpy's."""
         values = {name: getattr(self, name) for name in self._sheet_names()}
         return {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
 
@@ -358,3 +440,42 @@ def _photons(photons: ArrayLike) -> NDArray[np.float64]:
             f"detector: photons must be finite, >= 0 and <= {_MAX_PHOTONS:g} per pixel and frame, found {low} to {high}"
         )
     return light
+
+
+def told_of_steps(noise: NoiseModel, whose: str) -> tuple[str, ...]:
+    """A warning for a detector whose noise does not spread over the steps of its grey values where there are few DN of
+    light; none for others. It depends on the detector's numbers alone, and nothing is drawn.
+
+    Args:
+        noise: of the detector.
+        whose: how a reader knows it.
+    """
+    few = float(noise.frame_variance_dn2(noise.dark_level_dn + FEW)) - WHOLE
+    if few >= COARSE**2:
+        return ()
+    return (
+        f"{whose} has coarse grey values: noise of {math.sqrt(few):.2g} DN at {FEW:g} DN of light, less than "
+        f"{COARSE:g}; there rounding is the same in every frame, does not average down and is alike in neighbouring "
+        "pixels, while σ takes it for another one in each; a larger system_gain_dn_per_e, with the bit_depth for it, "
+        "makes the steps finer",
+    )
+
+
+def coarse_warnings(setup: Spec) -> tuple[str, ...]:
+    """Warnings as of `told_of_steps` for the area CCDs of an instrument that a job or test refers to; none without one.
+
+    Args:
+        setup: a job or test with all it refers to.
+
+    Raises:
+        InputError: as `EmvaDetector.from_sheet`.
+    """
+    instrument, sheet = getattr(setup, "instrument", None), getattr(setup, "detector", None)
+    if not isinstance(instrument, InstrumentSpec) or not isinstance(sheet, DetectorSpec):
+        return ()
+    exposure = instrument.monitor.area_ccd.exposure
+    chosen = {sheet.name: sheet, **{one.name: one for one in getattr(setup, "detectors", {}).values()}}
+    out: list[str] = []
+    for name, one in chosen.items():
+        out += told_of_steps(EmvaDetector.from_sheet(one, exposure).noise_model(exposure), f"area CCD {name}")
+    return tuple(out)

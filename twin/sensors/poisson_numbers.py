@@ -41,7 +41,7 @@ SERIES_END = 65536.0
 _CELLS_PER_UNIT = 32
 """Cells of the mean, per electron."""
 _BITS = 10
-"""Of u that choose a cell of the table."""
+"""Bits of u that choose a cell of the table."""
 _SHIFT = np.uint64(64 - _BITS)
 _MOST = 120
 """Numbers in the table: beyond it lies 1e-31 of the largest mean's distribution, less than the last cell of u."""

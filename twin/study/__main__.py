@@ -16,19 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
-from twin.run.cli import (
-    AsJson,
-    BackendName,
-    Force,
-    Heartbeat,
-    Standing,
-    explained,
-    print_place,
-    print_verdict,
-    print_whole,
-    result_table,
-    time_text,
-)
+from twin.run import cli
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
@@ -57,14 +45,14 @@ def main(
         ),
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the study in the folder --out.")] = False,
-    force: Force = False,
+    force: cli.Force = False,
     gradient: Annotated[
         bool,
         typer.Option("--gradient", help="Differentiate the responses by the factors at the base, instead of the runs."),
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Run more runs than the study's limit.")] = False,
-    backend: BackendName = "llvm",
-    as_json: AsJson = False,
+    backend: cli.BackendName = "llvm",
+    as_json: cli.AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
@@ -92,29 +80,23 @@ def main(
     options = StudyOptions(out, workers, scheduler, resume, force, yes, backend)
     place: list[StudyFolder] = []
     if gradient:
+        _refuse_with_gradient(errors, options)
         # drawing libraries are not needed before
-        from twin.study.gradient_command import run_gradient
+        from twin.study.gradient.gradient_report import run_gradient
 
-        run_gradient(file, options, as_json, quiet)
+        run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet))
         return
-    with explained(errors):
+    with cli.explained(errors):
         display = _Display(errors, quiet or as_json)
         try:
-            with display:
+            with display.bar, display.heartbeat:
                 run = run_study(file, options, display.progress(), place.append)
-        except Broken as broken:
-            print_error(errors, f"{broken}{_how_to_go_on(file, place)}")
-            raise typer.Exit(broken.code) from None
-        except ProgramFault as fault:
-            errors.print(fault.trace, markup=False, highlight=False, soft_wrap=True)
-            print_error(errors, f"{fault}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
-        except (IncompleteError, ClusterError) as error:
-            print_error(errors, f"{error}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
-        except OSError as error:
-            print_error(errors, f"{error.strerror or error}{_how_to_go_on(file, place)}")
-            raise typer.Exit(FAILURE) from None
+        except (Broken, ProgramFault, IncompleteError, ClusterError, OSError) as error:
+            if isinstance(error, ProgramFault):
+                errors.print(error.trace, markup=False, highlight=False, soft_wrap=True)
+            said = (error.strerror or error) if isinstance(error, OSError) else error
+            print_error(errors, f"{said}{_how_to_go_on(file, place)}")
+            raise typer.Exit(error.code if isinstance(error, Broken) else FAILURE) from None
     with to_stdout(errors, f"the study is complete in {run.folder}"):
         if as_json:
             print_json(run.numbers)
@@ -128,8 +110,20 @@ def main(
         raise typer.Exit(FAILURE)
     if run.fault is not None:
         # everything is written: only what the file says of a response is wrong
-        with explained(errors):
+        with cli.explained(errors):
             raise run.fault
+
+
+def _refuse_with_gradient(errors: Console, options: StudyOptions) -> None:
+    """Refuse options that mean nothing with --gradient."""
+    words = ("--workers", "--scheduler", "--resume", "--yes")
+    given = (options.workers, options.scheduler, options.resume or None, options.confirmed or None)
+    with cli.explained(errors):
+        for name, value in zip(words, given, strict=True):
+            if value is not None:
+                raise cli.InputErrorText(
+                    f"--gradient differentiates at the base in this process, so {name} has no meaning"
+                )
 
 
 def _how_to_go_on(file: Path, place: list[StudyFolder]) -> str:
@@ -157,17 +151,8 @@ class _Display:
         )
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
-        self._standing = Standing("start the workers and a pilot")
-        self._heartbeat = Heartbeat(console, lambda: str(self._standing), silent)
-
-    def __enter__(self) -> _Display:
-        self.bar.start()
-        self._heartbeat.__enter__()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._heartbeat.__exit__()
-        self.bar.stop()
+        self._standing = cli.Standing("start the workers and a pilot")
+        self.heartbeat = cli.heartbeat(console, lambda: str(self._standing), silent)
 
     def progress(self) -> EngineProgress:
         """What the engine calls."""
@@ -184,7 +169,7 @@ class _Display:
         there = f" ({estimate.there} are there already)" if estimate.there else ""
         self._say(
             f"{estimate.runs} runs{there} in {estimate.blocks} blocks and {estimate.chunks} chunks on "
-            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {time_text(estimate.seconds)}, "
+            f"{estimate.workers} worker{'s' if estimate.workers > 1 else ''}; about {cli.time_text(estimate.seconds)}, "
             f"{1e-9 * estimate.memory:.1f} GB; {1e3 * estimate.state_seconds:.3g} ms a run"
         )
 
@@ -206,15 +191,15 @@ def _print_result(run: StudyRun) -> None:
 
     numbers = run.numbers
     title = f"{numbers['name']}: {numbers['runs']} runs, {numbers['failed']} failed"
-    table = result_table(title)
+    table = cli.result_table(title)
     for head in ("response", "unit", "mean", "std", "95%", "99.7%"):
         table.add_column(head, justify="left" if head in ("response", "unit") else "right", no_wrap=True)
     for name, r in numbers["responses"].items():
         table.add_row(name, r["unit"], *(cell_text(r[key]) for key in ("mean", "std", "p95", "p997")))
     console = Terminal()
-    print_verdict(console, run.verdict)
-    print_whole(console, table)
-    print_place(console, run.folder)
+    cli.print_verdict(console, run.verdict)
+    cli.print_whole(console, table)
+    cli.print_place(console, run.folder)
 
 
 if __name__ == "__main__":

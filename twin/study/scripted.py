@@ -19,8 +19,8 @@ from scenes.specs.study import NOISE, TOTAL, StudySpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
-from twin.run.unfinished import scratch
-from twin.study.runs.config_tree import Tree
+from twin.run.owned_files import scratch
+from twin.study.runs.base_job import Tree
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 _RANGE = re.compile(rf"\(\s*({_NUMBER})\s*(\.\.|±|\+-)\s*({_NUMBER})\s*\)")
@@ -35,7 +35,7 @@ class Perturbed(Protocol):
         """The job that it stands for."""
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> Perturbed:
-        """The same with these bodies perturbed; InputError where that cannot be."""
+        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Spread:
 
     @property
     def name(self) -> str:
-        """Of the factor: ``forward_M2_shift_z``."""
+        """Name of the factor: ``forward_M2_shift_z``."""
         node, *rest = (str(part) for part in self.key)
         parts = [node.removeprefix("base/").replace("/", "_"), *rest]
         if self.key[1] in ("shift", "rotate") or parts[-2:-1] == ["gradient"]:
@@ -141,7 +141,7 @@ def config_text(
 
 
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Of every camera what is read, with its sigma, and what is true: by the estimator that a run is judged by."""
+    """Readings of every camera with their sigmas, and true values, by the estimator that a run is judged by."""
     out: Tree = {}
     own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:

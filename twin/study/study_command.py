@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -15,15 +14,11 @@ from optics.numerics.backend import load_backend
 from optics.numerics.threads import cores
 from scenes.kinds.file_kinds import read_for
 from scenes.yaml.errors import InputError
-from twin.run.cli import InputErrorText, check_backend
-from twin.run.ending_signals import ending_signals
-from twin.run.provenance import inputs_in, program_digest
-from twin.run.run_folder import RunFolderError, chosen, write_manifest
+from twin.run import cli, durable, memory, provenance, run_folder
+from twin.study.runs import cluster, sampling
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import LEAST_MEMORY, Workers, local_workers, remote_workers
 from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan, require_study_memory
-from twin.study.runs.sampling import run_count
 from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
 
@@ -71,8 +66,6 @@ class StudyRun:
         numbers: contents of study.json.
         verdict: what was found, in one sentence.
         folder: where it is.
-        plan: all its runs.
-        warnings: what the user should know.
         fault: what the study's file says of its responses and the runs contradict; None where they do not.
         missing: figures and files that could not be made, a sentence each; all else is there.
     """
@@ -80,8 +73,6 @@ class StudyRun:
     numbers: dict[str, Any]
     verdict: str
     folder: Path
-    plan: Plan
-    warnings: tuple[str, ...]
     fault: InputError | None = None
     missing: tuple[str, ...] = ()
 
@@ -102,13 +93,13 @@ def run_study(
         IncompleteError, ProgramFault, ClusterError: not all runs could be done; the others stay for --resume.
         Broken: SIGINT, SIGTERM or SIGHUP; what is done stays.
     """
-    check_backend(options.backend)
+    cli.check_backend(options.backend)
     if options.workers is not None and options.scheduler is not None:
-        raise InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
+        raise cli.InputErrorText("--workers and --scheduler exclude each other: a cluster has its own workers")
     if options.resume and options.force:
-        raise InputErrorText("--resume goes on with a folder, --force replaces it; choose one of them")
+        raise cli.InputErrorText("--resume goes on with a folder, --force replaces it; choose one of them")
     if options.resume and options.out is None:
-        raise InputErrorText("--resume needs the folder to go on with: --out DIR")
+        raise cli.InputErrorText("--resume needs the folder to go on with: --out DIR")
     setup = read_for(PROGRAM, file, resolve_study)
     _check_size(setup, options.confirmed)
     base = base_of(setup)
@@ -116,46 +107,43 @@ def run_study(
     warnings: list[str] = []
     warn = progress.warn
 
-    def remember(text: str) -> None:
-        warnings.append(text)
-        warn(text)
+    def remember(*texts: str) -> None:
+        for text in texts:
+            warnings.append(text)
+            warn(text)
 
     progress.warn = remember
     started = time.time()
-    program_digest()  # of the files that compute, which may be others when the study ends
+    provenance.program_digest()  # of the files that compute, which may be others when the study ends
     with broken_by_signals():
         # a scheduler that cannot be reached is told before anything is written
         with (
             _workers(options, setup, remember) as start,
-            StudyFolder(chosen(options.out, file.stem), setup, options.resume, options.force) as folder,
+            StudyFolder(run_folder.chosen(options.out, file.stem), setup, options.resume, options.force) as folder,
         ):
             opened(folder)
             store = ChunkStore(folder.path, plan)
             store.open()
-            for text in store.corrupt:
-                remember(text)
+            remember(*store.corrupt)
             # nor is what judges cameras, before the study's file is known to be good
             from scenes.models.camera_sharpness import blur_warnings, cameras_of
-            from twin.sensors.grey_steps import coarse_warnings
+            from twin.sensors.area_detector import coarse_warnings
 
             given = blur_warnings(base, load_backend(options.backend)) if cameras_of(base) else ()
             given = (*given, *coarse_warnings(base))
-            for text in given:
-                remember(text)
+            remember(*given)
             engine = Engine(plan, store, options.backend, progress)
             count = 0
             if store.missing:
                 with start() as workers:
-                    for text in workers.warnings:
-                        remember(text)
-                    engine.run(workers, _own_memory())
+                    remember(*workers.warnings)
+                    engine.run(workers, memory.largest_memory())
                     count = workers.count
             else:
                 progress.done(store.runs, plan.runs)
             # drawing libraries and the like are not needed before
-            from twin.study.report.stated_noise import impossible
             from twin.study.report.study_report import write_report
-            from twin.study.report.study_runs import StudyRuns
+            from twin.study.report.study_statistics import StudyRuns, impossible
             from twin.study.study_files import write_data
 
             result = store.result()
@@ -164,24 +152,20 @@ def run_study(
                 remember(f"σ does not hold in {numbers.summary['doubted']} of {plan.runs} runs: see the report")
             report = write_report(numbers.data, plan, folder, numbers.files, (*given, *numbers.unwritten))
             missing = (*numbers.unwritten, *report.undrawn)
-            for text in missing:
-                remember(text)
+            remember(*missing)
             fault = impossible(StudyRuns.of(numbers.data, setup.study))
-            entries = {
-                "backend": options.backend,
-                "seed": setup.study.design.seed,
-                "workers": count,
-                "warnings": [*warnings, *(str(issue) for issue in (fault.issues if fault else ()))],
-            }
-            entries |= {"runs": plan.runs, "failed": int(result.failed.sum()), "inputs": inputs_in(setup.tree)}
+            entries: dict[str, Any] = {"backend": options.backend, "seed": setup.study.design.seed, "workers": count}
+            entries |= {"runs": plan.runs, "failed": int(result.failed.sum())}
+            entries["warnings"] = [*warnings, *(str(issue) for issue in (fault.issues if fault else ()))]
+            entries["inputs"] = provenance.inputs_in(setup.tree)
             entries["again"] = [PROGRAM, "config.yaml", "--backend", options.backend, "--yes"]
-            write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
-    return StudyRun(numbers.summary, report.verdict, folder.target, plan, tuple(warnings), fault, missing)
+            run_folder.write_manifest(folder, PROGRAM, started, engine.seconds, **entries)
+    return StudyRun(numbers.summary, report.verdict, folder.target, fault, missing)
 
 
 def _check_size(setup: StudySetup, confirmed: bool) -> None:
     limit = setup.study.limits.runs
-    runs = run_count(setup.study)
+    runs = sampling.run_count(setup.study)
     if runs > limit and not confirmed:
         raise setup.error(
             f"the study has {runs} runs, more than its limit of {limit}",
@@ -194,27 +178,22 @@ def _check_size(setup: StudySetup, confirmed: bool) -> None:
 @contextmanager
 def _workers(
     options: StudyOptions, setup: StudySetup, warn: Callable[[str], None]
-) -> Iterator[Callable[[], AbstractContextManager[Workers]]]:
+) -> Iterator[Callable[[], AbstractContextManager[cluster.Workers]]]:
     """What starts the workers. Those of others are reached at once, own ones only when there is something to do."""
     if options.scheduler is not None:
-        with remote_workers(options.scheduler, warn) as workers:
+        with cluster.remote_workers(options.scheduler, warn) as workers:
 
             @contextmanager
-            def given() -> Iterator[Workers]:
+            def given() -> Iterator[cluster.Workers]:
                 yield workers
 
             yield given
         return
     wanted = options.workers if options.workers is not None else cores()
-    count = fit_workers(wanted, setup.study.limits.bytes, LEAST_MEMORY)
+    count = fit_workers(wanted, setup.study.limits.bytes, cluster.LEAST_MEMORY)
     if count < wanted:
         warn(f"{count} workers instead of {wanted}: no more fit into the study's {setup.study.limits.memory}")
-    yield lambda: local_workers(count)
-
-
-def _own_memory() -> float:
-    """Of this process and the scheduler in it, bytes."""
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield lambda: cluster.local_workers(count)
 
 
 @contextmanager
@@ -227,7 +206,7 @@ def broken_by_signals() -> Iterator[None]:
             got.append(number)
             raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, leave) for number in (*ending_signals(), signal.SIGINT)}
+    before = {number: signal.signal(number, leave) for number in (*durable.ending_signals(), signal.SIGINT)}
     try:
         yield
     except BaseException:
@@ -238,6 +217,3 @@ def broken_by_signals() -> Iterator[None]:
             signal.signal(number, handler)
     if got:
         raise Broken(got[0])
-
-
-__all__ = ["Broken", "RunFolderError", "StudyOptions", "StudyRun", "run_study"]

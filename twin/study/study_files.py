@@ -11,11 +11,8 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import NOISE
-from twin.run.data_files import csv_table, netcdf
-from twin.run.data_table import TABLE_FORMATS, DataColumn, DataTable, MissingPackage
-from twin.run.reference_frames import described, frames_text
-from twin.study.runs.base_job import one_line
-from twin.study.runs.block_result import BlockResult
+from twin.run import data_files, reference_frames
+from twin.study.runs.base_job import BlockResult, one_line
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import StudyFolder
 
@@ -73,7 +70,7 @@ def make_dataset(plan: Plan, result: BlockResult) -> xr.Dataset:
         "fingerprint": plan.setup.fingerprint,
         "design": study.design.kind,
         "seed": study.design.seed,
-        "reference_frames": frames_text("study"),
+        "reference_frames": reference_frames.frames_text("study"),
     }
     numbered = (RUN, np.arange(plan.runs), {"units": "", "long_name": "number of the run"})
     return xr.Dataset(data, coords={RUN: numbered}, attrs=attributes)
@@ -87,7 +84,7 @@ def table(data: xr.Dataset) -> bytes:
     """The data set as CSV, a line for each run; heads are the names, with the unit in brackets."""
     names = [RUN, *(str(name) for name in data.data_vars)]
     rows = zip(*(_cells(data[name].values) for name in names), strict=True)
-    return csv_table([[_head(data, name) for name in names], *rows])
+    return data_files.csv_table([[_head(data, name) for name in names], *rows])
 
 
 def _head(data: xr.Dataset, name: str) -> str:
@@ -105,15 +102,17 @@ def parquet(data: xr.Dataset) -> bytes | None:
     columns = []
     for name in (RUN, *map(str, data.data_vars)):
         about = data[name].attrs
-        columns.append(DataColumn(name, data[name].values, about.get("units", ""), about["long_name"]))
+        columns.append(data_files.DataColumn(name, data[name].values, about.get("units", ""), about["long_name"]))
     title, frames = str(data.attrs["title"]), str(data.attrs["reference_frames"])
     try:
-        return TABLE_FORMATS["parquet"](DataTable("study", title, tuple(columns), {"reference_frames": frames}))
-    except MissingPackage:
+        return data_files.TABLE_FORMATS["parquet"](
+            data_files.DataTable("study", title, tuple(columns), {"reference_frames": frames})
+        )
+    except data_files.MissingPackage:
         return None
 
 
-FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": netcdf, "csv": table, "parquet": parquet}
+FORMATS: dict[str, Callable[[xr.Dataset], bytes | None]] = {"nc": data_files.netcdf, "csv": table, "parquet": parquet}
 """Ending of a file of the data set, study.ENDING -> its contents, None where what it needs is not installed. A new one
 is added here.
 """
@@ -122,6 +121,10 @@ is added here.
 def summary(data: xr.Dataset, plan: Plan) -> dict[str, Any]:
     """Contents of study.json, but for the times: of each response mean, standard deviation and quantiles of the runs
     that did not fail; null where there are none.
+
+    Args:
+        data: as `make_dataset` makes it.
+        plan: the study.
     """
     study = plan.setup.study
     failed = data[FAILED].values.astype(bool)
@@ -196,7 +199,7 @@ def write_data(plan: Plan, result: BlockResult, seconds: float, computed: int, f
         folder: of the study.
     """
     data = make_dataset(plan, result)
-    numbers = described(
+    numbers = reference_frames.described(
         "study",
         {
             **summary(data, plan),

@@ -169,7 +169,8 @@ MARGIN = 0.02
 """Share of the line's pixels kept between each end and the nominal windows, so that an image may move."""
 
 BAR_TILT = float(np.radians(7.0))
-"""Of the bars' normal from the axis: within the group every sampling phase occurs four times, even in 112 pixels."""
+"""Tilt of the bars' normal from the axis, radians: within the group every sampling phase occurs four times, even in 112
+pixels."""
 
 BAR_SHARE = 0.45
 """Side of the bar group, as a share of the region's."""
@@ -209,7 +210,7 @@ class View:
 
     @property
     def band(self) -> BandSpec:
-        """Of the line CCD."""
+        """Band of the line CCD."""
         return self.ccd.band
 
     def transfer(self, frequency: np.ndarray) -> np.ndarray:

@@ -1,8 +1,12 @@
-"""Test targets in the main job: rendered, exposed and measured for every camera, before and after."""
+"""Test targets in the main job: rendered, exposed and measured for every camera, before and after; the contract of
+mtf.json.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,20 +21,240 @@ from scenes.models.shadow import imaging_shadows
 from scenes.specs.instrument import BASE
 from scenes.specs.job import TargetsSpec
 from scenes.specs.resolved import ResolvedJob, target_band
+from twin.run.data_files import FrameFacts
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 from twin.sensors.line_ccd import LineCcd
 from twin.targets.target_images import DIRECTIONS, PLACES, BarDesign, TargetCamera, View, usable_pixels
 from twin.targets.target_path import TargetPath
-from twin.targets.target_result import (
-    NYQUIST,
-    BarReading,
-    CameraTargets,
-    EdgeReading,
-    PlaceTargets,
-    TargetRun,
-    TargetShots,
-)
+
+NYQUIST = 0.5
+"""Nyquist frequency of any pixel, cycles/pixel."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetReading:
+    """MTF from one target.
+
+    Attributes:
+        reason: why the frames cannot be measured; empty if they can.
+        true_nyquist: MTF of the traced pupil and the detector at ``at_nyquist``.
+        at_nyquist: frequency of what is called the MTF at Nyquist, (along, track), cycles/pixel.
+        true_axis: what ``true_nyquist`` would be without the target's tilt, at the Nyquist frequency along the line or
+            along the track: that of image quality at this place.
+    """
+
+    reason: str
+    true_nyquist: float
+    at_nyquist: tuple[float, float]
+    true_axis: float
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeReading(TargetReading):
+    """MTF from one knife edge.
+
+    Attributes:
+        measured: from the frames, None if they cannot be measured.
+        frequency: (F,) along the edge's normal, cycles/m.
+        true: (F,) MTF of the traced pupil and the detector there.
+    """
+
+    measured: EdgeMtf | None
+    frequency: np.ndarray
+    true: np.ndarray
+
+    @property
+    def nyquist(self) -> tuple[float, float] | None:
+        """Measured MTF at the Nyquist frequency and its sigma; None if the frames cannot be measured."""
+        return None if self.measured is None else self.measured.at(NYQUIST)
+
+    @property
+    def nyquist_bias(self) -> float | None:
+        """How much noise lengthens the measured MTF at the Nyquist frequency on the average."""
+        edge = self.measured
+        return None if edge is None else float(np.interp(NYQUIST, edge.frequency, edge.noise_bias))
+
+
+@dataclass(frozen=True, eq=False)
+class BarReading(TargetReading):
+    """MTF from one bar target near the Nyquist frequency.
+
+    Attributes:
+        measured: from the frames, None if they cannot be measured.
+    """
+
+    measured: BarMtf | None
+
+    @property
+    def nyquist(self) -> tuple[float, float] | None:
+        """Measured MTF of the bars and its sigma; None if the frames cannot be measured."""
+        return None if self.measured is None else (self.measured.mtf, self.measured.sigma)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetShots:
+    """All targets at one place in one state.
+
+    Attributes:
+        frames: name of the image -> grey values, uint16 (N, H, W).
+        column: of the windows' first pixels on the line.
+        edges, bars: direction -> reading; empty if not rendered.
+        light_lost: share of the light that bodies in the beam take.
+    """
+
+    frames: Mapping[str, np.ndarray]
+    column: int
+    edges: Mapping[str, EdgeReading]
+    bars: Mapping[str, BarReading]
+    light_lost: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceTargets:
+    """Before and after at one place of a line.
+
+    Attributes:
+        place: nominal (along, across) on the focal plane, metres.
+        shift: true move of the image of a fixed direction on the focal plane, (along, across), metres.
+        before, after: the images.
+    """
+
+    place: np.ndarray
+    shift: np.ndarray
+    before: TargetShots
+    after: TargetShots
+
+    @property
+    def shots(self) -> dict[str, TargetShots]:
+        """By their names in files and results."""
+        return {"before": self.before, "after": self.after}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraTargets:
+    """One camera.
+
+    Attributes:
+        band: name of the line CCD's band.
+        pitch: of its pixels, metres.
+        places: left, centre, right.
+    """
+
+    band: str
+    pitch: float
+    places: Mapping[str, PlaceTargets]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetRun:
+    """All cameras.
+
+    Attributes:
+        cameras: by name.
+        frames: of each image.
+        obstruction: whether what stands in the beams is missing in the pupils.
+    """
+
+    cameras: Mapping[str, CameraTargets]
+    frames: int
+    obstruction: bool = True
+
+    def images(self) -> Iterator[tuple[str, str, np.ndarray, FrameFacts]]:
+        """Every image: the stem of its file, its name, the frames (N, H, W) and what is known of them."""
+        for camera, found in self.cameras.items():
+            for place, targets in found.places.items():
+                for when, shots in targets.shots.items():
+                    for name, frames in shots.frames.items():
+                        facts = FrameFacts(
+                            f"{camera}, line CCD {found.band}", found.pitch, note=f"{name}, {place}, {when}"
+                        )
+                        yield f"{camera}_{place}_{name}_{when}", name, frames, facts
+
+    @property
+    def has_edges(self) -> bool:
+        """Whether there are curves."""
+        return any(place.before.edges for camera in self.cameras.values() for place in camera.places.values())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What could not be measured, and why."""
+        out = []
+        for camera, found in self.cameras.items():
+            for place, targets in found.places.items():
+                for when, shots in targets.shots.items():
+                    kinds = (("knife edge", shots.edges), ("bars", shots.bars))
+                    for what, readings in kinds:
+                        for direction, reading in readings.items():
+                            if reading.measured is None:
+                                out.append(
+                                    f"{what} ({direction}) at the {place} of {camera} {when}: no MTF at Nyquist, truly "
+                                    f"{reading.true_nyquist:.3f}: {reading.reason}"
+                                )
+        return tuple(out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Contents of mtf.json. What could not be measured is null; ``truth`` has the shape of ``cameras``, and the MTF
+        on the axes, which tilted edges and bars do not see, beside it.
+        """
+        cameras, truth = {}, {}
+        for name, camera in self.cameras.items():
+            places, true_places = {}, {}
+            for place, targets in camera.places.items():
+                along, across = (1e3 * targets.place + 0.0).tolist()
+                columns = {when: shots.column for when, shots in targets.shots.items()}
+                where = {"along_mm": along, "across_mm": across, "columns": columns}
+                places[place] = {**where, **_directions(targets, _measured)}
+                shift = dict(zip(("along", "across"), (1e6 * targets.shift + 0.0).tolist(), strict=True))
+                lost = {when: shots.light_lost for when, shots in targets.shots.items()}
+                true_places[place] = {"image_shift_um": shift, "light_lost": lost, **_directions(targets, _true)}
+            cameras[name] = {
+                "band": camera.band,
+                "pixel_um": 1e6 * camera.pitch,
+                "nyquist_per_mm": 1e-3 * NYQUIST / camera.pitch,
+                "places": places,
+            }
+            truth[name] = {"places": true_places}
+        about = {"frames": self.frames, "obstruction": "traced" if self.obstruction else "ignore"}
+        return {**about, "cameras": cameras, "truth": {"cameras": truth}}
+
+
+def _directions(targets: PlaceTargets, say: Any) -> dict[str, Any]:
+    """Direction -> before/after -> what ``say`` makes of the readings."""
+    out: dict[str, Any] = {}
+    for when, shots in targets.shots.items():
+        for direction in sorted({*shots.edges, *shots.bars}):
+            out.setdefault(direction, {})[when] = say(shots.edges.get(direction), shots.bars.get(direction))
+    return out
+
+
+def _measured(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if edge is not None:
+        value, sigma = edge.nyquist or (None, None)
+        found = edge.measured
+        out |= {"mtf_nyquist": value, "mtf_nyquist_sigma": sigma, "mtf_nyquist_noise_bias": edge.nyquist_bias}
+        out["curve"] = None if found is None else {**_curve(edge, found.mtf), "mtf_sigma": found.sigma.tolist()}
+    if bars is not None:
+        value, sigma = bars.nyquist or (None, None)
+        out |= {"bars_mtf": value, "bars_mtf_sigma": sigma}
+    return out
+
+
+def _true(edge: EdgeReading | None, bars: BarReading | None) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    if edge is not None:
+        out |= {"mtf_nyquist": edge.true_nyquist, "curve": _curve(edge, edge.true)}
+        out |= {"mtf_nyquist_cycles_per_pixel": list(edge.at_nyquist), "mtf_nyquist_axis": edge.true_axis}
+    if bars is not None:
+        out |= {"bars_mtf": bars.true_nyquist, "bars_cycles_per_pixel": list(bars.at_nyquist)}
+        out["mtf_nyquist_axis"] = bars.true_axis
+    return out
+
+
+def _curve(edge: EdgeReading, mtf: np.ndarray) -> dict[str, list[float]]:
+    return {"frequency_per_mm": (1e-3 * edge.frequency).tolist(), "mtf": mtf.tolist()}
+
 
 CURVE = np.linspace(0.0, 1.0, 65)
 """Frequencies of the measured curves, cycles/pixel: to twice the Nyquist frequency."""
@@ -75,10 +299,9 @@ def check_targets(resolved: ResolvedJob) -> None:
             found=str(settings.frames),
             allowed=f"at most {LARGEST_FRAMES // each} with regions of {settings.region} pixels",
         )
-    for mounted in resolved.instrument.cameras.values():
-        camera = resolved.cameras[mounted.camera]
-        name = target_band(camera)
-        pixels = camera.bands[name].pixels
+    for key, mounted in resolved.instrument.cameras.items():
+        name = _band(resolved, key)
+        pixels = resolved.cameras[mounted.camera].bands[name].pixels
         if usable_pixels(pixels, settings.region) <= 0.0:
             raise job.error(
                 f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
@@ -86,6 +309,28 @@ def check_targets(resolved: ResolvedJob) -> None:
                 found=f"{settings.region} pixels on a line of {pixels}",
                 allowed="a smaller region or a longer line",
             )
+
+
+def _band(resolved: ResolvedJob, name: str) -> str:
+    """Name of the band whose line CCD of a camera images targets."""
+    return target_band(resolved.cameras[resolved.instrument.cameras[name].camera])
+
+
+def target_camera(resolved: ResolvedJob, instrument: Instrument, name: str, backend: Backend) -> TargetCamera:
+    """A camera of an instrument before targets, with the line CCD, the windows and the obstruction that a job asks for.
+
+    Args:
+        resolved: the job, with the data sheets of its line CCDs.
+        instrument: as built from it.
+        name: of the camera.
+        backend: where to trace.
+    """
+    assert resolved.line_detectors is not None
+    model, sheet = instrument.cameras[name], resolved.line_detectors[resolved.instrument.cameras[name].camera]
+    shadows = imaging_shadows(instrument, name, backend) if resolved.job.render.obstructed else None
+    path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
+    ccd = LineCcd.from_specs(model.spec.bands[_band(resolved, name)], sheet)
+    return TargetCamera(path, ccd, resolved.targets.region)
 
 
 def render_targets(
@@ -110,17 +355,12 @@ def render_targets(
         TargetLostError: the perturbation moves the light off.
     """
     settings, images = resolved.targets, resolved.job.render.target_images
-    frames, obstructed = settings.frames or 1, resolved.job.render.obstructed
+    frames = settings.frames or 1
     total = len(instrument.cameras) * len(PLACES) * 2
     cameras, done = {}, 0
-    for number, (name, model) in enumerate(instrument.cameras.items()):
-        reference = resolved.instrument.cameras[name].camera
-        band = target_band(resolved.cameras[reference])
-        assert resolved.line_detectors is not None
-        ccd = LineCcd.from_specs(model.spec.bands[band], resolved.line_detectors[reference])
-        shadows = imaging_shadows(instrument, name, backend) if obstructed else None
-        path = TargetPath(instrument.assembly, name, f"{BASE}/{name}", model, backend, shadows=shadows)
-        camera = TargetCamera(path, ccd, settings.region)
+    for number, name in enumerate(instrument.cameras):
+        camera = target_camera(resolved, instrument, name, backend)
+        ccd = camera.ccd
         before = camera.views({})
         after = camera.views(state) if state else before
         pattern = ccd.pattern(stream(seed, _PATTERN, number))
@@ -133,9 +373,9 @@ def render_targets(
                 shots.append(shooter.shoot(view, stream(seed, _EXPOSURE, number, k, when)))
                 done += 1
             places[place] = PlaceTargets(camera.places[k], after[place].shift - before[place].shift, *shots)
-        cameras[name] = CameraTargets(band, ccd.band.pitch, places)
+        cameras[name] = CameraTargets(_band(resolved, name), ccd.band.pitch, places)
     advance(done, total)
-    return TargetRun(cameras, frames, obstructed)
+    return TargetRun(cameras, frames, resolved.job.render.obstructed)
 
 
 class _Shooter:
@@ -197,8 +437,9 @@ def read_edge(view: View, direction: str, normal: np.ndarray, mean: np.ndarray, 
         found = measure_edge(mean, noise=view.ccd.noise, frames=frames, frequency=CURVE)
     except EdgeError as error:
         reason = str(error)
-    way = float(normal[0]), float(normal[1])
-    return EdgeReading(found, reason, frequency, true[:-1], float(true[-1]), way, on_axis(view, direction))
+    at_nyquist = NYQUIST * float(normal[0]), NYQUIST * float(normal[1])
+    own = reason, float(true[-1]), at_nyquist, on_axis(view, direction)
+    return EdgeReading(*own, found, frequency, true[:-1])
 
 
 def read_bars(
@@ -227,4 +468,4 @@ def read_bars(
         )  # fmt: skip
     except BarError as error:
         reason = str(error)
-    return BarReading(found, reason, true, (along, track), on_axis(view, direction))
+    return BarReading(reason, true, (along, track), on_axis(view, direction), found)

@@ -7,6 +7,7 @@ sense, so that its image is ``f / focal_length`` times its size and upright in t
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,22 +17,27 @@ from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
-from optics.raytrace.line_of_sight import chief_directions
+from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
+from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import PupilFunction, fit_pupils
+from optics.waves.pupil_stack import PupilFunction, RoughWavefrontError, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
+
+DEGREES = (8, 10, 12, 14)
+"""Of the polynomials of a pupil that edges cut, the first that do: outside of the light, in the middle of an obscured
+beam, wavefronts may bend much more than in it.
+"""
 
 MAP_POINTS = 7
 MAP_ORDER = 4
@@ -136,7 +142,7 @@ class TargetPath:
         body = line_body(self.root)
         local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
-        sight = chief_directions(
+        _, sight = chief_rays(
             self.backend,
             assemble(self.assembly, [f"{self.name}/image_to_stop"], placed=placed),
             assemble(self.assembly, [f"{self.name}/image_to_object"], placed=placed),
@@ -230,10 +236,6 @@ class TargetPath:
             BeamMissedError, AimError: the beam does not get through.
             ValueError: it is vignetted.
         """
-        if self.model.edges:
-            raise UnphysicalError(
-                "a pupil that edges of surfaces cut is no smooth function: such a camera has no MTF here"
-            )
         placed, systems, rays = self._imaging(state, directions)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
@@ -245,7 +247,28 @@ class TargetPath:
             owner = np.zeros(len(directions), dtype=int)
             beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
             taken = self.shadows.cast(beams).pieces
-        return fit_pupils(turned.in_lengths_of(systems.size), self.nodes, shadows=taken)
+        if self.model.edges:
+            others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
+            taken = self._edges(placed, systems, rays.launched, directions).shadows(len(directions), others)
+        turned = turned.in_lengths_of(systems.size)
+        for degree in DEGREES if self.model.edges else ():
+            with suppress(RoughWavefrontError):
+                return fit_pupils(turned, self.nodes, degree, taken)
+        return fit_pupils(turned, self.nodes, shadows=taken)
+
+    def _edges(
+        self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
+    ) -> StopOutlines:
+        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop."""
+        found = StopOutlines()
+        cut = {name: self.model.mirrors.index(name) for name in self.model.edges}
+        sent = make_rays(self.backend, launched, np.broadcast_to(directions[:, None], launched.shape))
+        traced = trace(self.backend, systems, sent, keep=tuple(cut.values()))
+        for name, number in cut.items():
+            size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
+            places = np.asarray(traced.hit(number) / size)[..., :2]
+            found += outlines_on_stop(places, self.model.edges[name], self.nodes)
+        return found
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""

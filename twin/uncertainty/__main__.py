@@ -8,15 +8,14 @@ if __name__ == "__main__":
     end_quietly()
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from scenes.specs.resolved import ResolvedJob, resolve_with
 from twin.run.cli import AsJson, BackendName, Force, Options, Out, Quiet, Seed
-from twin.run.command import Result, print_report, run_command
+from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
-from twin.run.reference_frames import described
 
 PROGRAM, KIND = "twin.uncertainty", "uncertainty"
 _MOST_STATES = 100_000
@@ -79,23 +78,18 @@ def main(
         return resolved.with_render(resolved.frames, chosen)
 
     def work(resolved: ResolvedJob, session: Session) -> Result:
-        from twin.run.page import RunFacts, write_test
         from twin.run.provenance import checks_in
         from twin.uncertainty.coverage import run_uncertainty
         from twin.uncertainty.uncertainty_numbers import uncertainty_numbers
         from twin.uncertainty.uncertainty_report import uncertainty_report
 
         run = run_uncertainty(resolved, session.backend, states, session.advance)
-        shown = uncertainty_report(run)
-        numbers = {**uncertainty_numbers(run), "verdict": shown.verdict}
-        name, drawn = session.backend.name, run.seed if states else None
+        numbers = uncertainty_numbers(run)
         options = ("--states", str(states), "--seed", str(run.seed)) if states else ()
-        again = (PROGRAM, "config.yaml", *options, "--backend", name)
-        times = session.started, session.seconds
-        told = (resolved.to_yaml(), str(file), name, drawn, *times, PROGRAM, "", again, resolved.plain())
-        facts = RunFacts(*told, checks=(*run.images.told(), *checks_in(numbers)))
-        write_test(KIND, numbers, shown, facts, session.folder)
-        return Result(described(KIND, numbers), lambda console: print_report(shown, console))
+        again = (PROGRAM, "config.yaml", *options, "--backend", session.backend.name)
+        facts: dict[str, Any] = {"config": resolved.to_yaml(), "named": resolved.plain(), "again": again}
+        facts |= {"seed": run.seed if states else None, "checks": (*run.images.told(), *checks_in(numbers))}
+        return finished(session, KIND, uncertainty_report(run), numbers, program=PROGRAM, **facts)
 
     run_command(file.stem, Options(out, seed, backend, force, as_json, quiet), resolve, work)
 

@@ -27,7 +27,7 @@ from twin.monitor.observation import Observing, observe
 from twin.monitor.reading_table import reading_table
 from twin.run.procedure import Advance, silent
 from twin.run.random_streams import stream
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
 
 LEVELS = (0.68, 0.95)

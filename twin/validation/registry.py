@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from scenes.yaml.errors import nearest
 from twin.validation.checks.group import CheckGroup, group_of, matches
 from twin.validation.paper_000 import equations_000, figures, suppositions, table1
-from twin.validation.paper_001 import budget_checks, formulas, joint, ranges, table2
+from twin.validation.paper_001 import budget_checks, formulas, joint, table2
+from twin.validation.paper_001.ranges import ranges_group
 from twin.validation.paper_003 import fields, model
 from twin.validation.paper_004 import distortion_checks, equations_004, focus_checks, turntable_checks
 
@@ -20,7 +21,7 @@ GROUPS: tuple[CheckGroup, ...] = (
     figures.GROUP,
     suppositions.USES,
     formulas.GROUP,
-    ranges.GROUP,
+    ranges_group.GROUP,
     joint.GROUP,
     table2.GROUP,
     budget_checks.GROUP,

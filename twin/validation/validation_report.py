@@ -12,22 +12,7 @@ from twin.run.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimal
 from twin.run.page import links, report_page, reproduce
 from twin.run.report import Report, Section, one_sentence
 from twin.run.run_folder import RunFolder, write_manifest
-from twin.validation.checks.check import (
-    AGREED,
-    CONFIRMED,
-    CONSISTENT,
-    CORRECTED,
-    FAILED,
-    NOT_CHECKABLE,
-    PAPERS,
-    REFUTED,
-    REPRODUCED,
-    SIGMAS,
-    UNDECIDED,
-    VERDICTS,
-    CheckResult,
-    Verdict,
-)
+from twin.validation.checks.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
 
 PROGRAM = "twin.validate"
@@ -144,16 +129,8 @@ def _cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-MARKS: dict[Verdict, tuple[str, str]] = {
-    CONFIRMED: ("=", "confirmed"),
-    REPRODUCED: ("⊜", "reproduced"),
-    CONSISTENT: ("∼", "consistent"),
-    CORRECTED: ("≈", "corrected"),
-    REFUTED: ("≠", "refuted"),
-    UNDECIDED: ("±", "undecided"),
-    NOT_CHECKABLE: ("?", "silent"),
-    FAILED: ("✕", "failed"),
-}
+_LOOKS = "confirmed", "reproduced", "consistent", "corrected", "refuted", "undecided", "silent", "failed"
+MARKS: dict[Verdict, tuple[str, str]] = dict(zip(VERDICTS, zip("=⊜∼≈≠±?✕", _LOOKS, strict=True), strict=True))
 """Verdict -> mark, so that no meaning hangs on a colour, and class in the page."""
 
 

@@ -14,12 +14,11 @@ import typer
 from rich.console import Console
 
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
-from twin.run.cli import AsJson, InputErrorText, Quiet, explained, print_verdict
-from twin.run.ending_signals import exit_on_terminate
+from twin.run import cli, durable
 
 if TYPE_CHECKING:  # what computes is imported when it is needed
     from twin.verify.folder_state import FolderState
-    from twin.verify.repetition import Repetition
+    from twin.verify.verification import Repetition
 
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -37,8 +36,8 @@ def main(
         Path | None,
         typer.Option("--keep", readable=False, metavar="DIR", help="Keep what is made again as this run folder."),
     ] = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: cli.AsJson = False,
+    quiet: cli.Quiet = False,
 ) -> None:
     """Verify a run folder: every file against the checksum that the run left of it, then the run itself, which is made
     again from the config.yaml and the inputs that the folder names, and compared number by number.
@@ -65,18 +64,17 @@ def main(
     """
     errors = Console(stderr=True)
     silent = as_json or quiet
-    with explained(errors), exit_on_terminate():
+    with cli.explained(errors), durable.exit_on_terminate():
         from twin.verify.folder_state import folder_state
-        from twin.verify.repetition import CannotRepeat, obstacle, repeat_chunk
-        from twin.verify.verification import Verification, expected_time
+        from twin.verify.verification import CannotRepeat, Verification, expected_time, obstacle, repeat_chunk
 
         if files and (every or keep is not None):
-            raise InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
+            raise cli.InputErrorText("--files makes nothing again, so --all and --keep have no meaning with it")
         if keep is not None and (keep.exists() or keep.is_symlink()):
-            raise InputErrorText(f"--keep: {keep} exists; choose another folder")
+            raise cli.InputErrorText(f"--keep: {keep} exists; choose another folder")
         state = folder_state(run)
         if every and not state.is_study:
-            raise InputErrorText("--all is for studies; of other runs everything is made again anyway")
+            raise cli.InputErrorText("--all is for studies; of other runs everything is made again anyway")
         chunk = state.is_study and not every and keep is None
         why, made = "" if files else obstacle(state), None
         if not files and not why:
@@ -93,7 +91,7 @@ def main(
             print_json(done.numbers())
         elif not quiet:
             console = Terminal()
-            print_verdict(console, done.verdict)
+            cli.print_verdict(console, done.verdict)
             for line in done.lines():
                 console.print(line, markup=False, highlight=False, soft_wrap=True)
     if done.code:
@@ -101,8 +99,8 @@ def main(
 
 
 def _whole(state: FolderState, keep: Path | None, silent: bool) -> Repetition:
-    from twin.run.unfinished import scratch
-    from twin.verify.repetition import repeat
+    from twin.run.owned_files import scratch
+    from twin.verify.verification import repeat
 
     if keep is not None:
         return repeat(state, keep, silent)

@@ -30,17 +30,19 @@ from twin.run.data_files import read_netcdf
 
 SAME, ROUNDED, DIFFERENT, LEFT_OUT = "same", "rounding", "different", "left out"
 REDRAWN = "drawn otherwise"
-"""Of a picture of numbers that differ by rounding: its lines have other corners."""
+"""State of a picture of numbers that differ by rounding: its lines have other corners."""
 GONE, NEW = "only in the run", "only made again"
 
 RELATIVE = 1e-9
 """Part of the largest number of its sort, or of an array's peak, up to which a difference is rounding: sums in another
 order, as those of stray light, move numbers by 1e-14, and readings of 1.5 arcsec by 1e-11 of what they are."""
 RELATIVE_ELSEWHERE = 1e-6
-"""The same for another processor, whose linear algebra rounds otherwise: fits with a condition of 1e8 and more move by
-1e-8 of themselves (orthonormal Zernike terms by 4e-8). No number here is known to a millionth."""
+"""The part that counts as rounding on another processor, whose linear algebra rounds otherwise: fits with a condition
+of 1e8 and more move by 1e-8 of themselves (orthonormal Zernike terms by 4e-8). No number here is known to a millionth.
+"""
 OF_SIGMA = 1e-3
-"""Likewise of the number's standard deviation: the least digit that a file states is a millionth."""
+"""Part of the number's standard deviation up to which a difference is rounding: the least digit that a file states is
+a millionth of it."""
 OF_A_SIGMA = 1e-6
 """Relative, of a standard deviation itself: it is worked out from matrices with a condition of 1e4 and more."""
 FEW, SMALL = 1e-4, 2
@@ -105,7 +107,7 @@ class FileDifference:
 
     @property
     def largest_in_sigma(self) -> float | None:
-        """Of those with a standard deviation."""
+        """Largest difference over sigma, None where no quantity has one."""
         return max((one.in_sigma for one in self.quantities if one.in_sigma is not None), default=None)
 
 
@@ -145,7 +147,7 @@ def file_difference(name: str, old: Path, new: Path, elsewhere: bool) -> FileDif
     # readers of spoilt files fail in ways that cannot be foreseen
     except Exception as error:
         return FileDifference(name, DIFFERENT, why=f"cannot be read: {error}")
-    found = content_differences(first, second, elsewhere)
+    found = _content_differences(first, second, elsewhere)
     if not found:
         found = [
             QuantityDifference(key, _short(first.told.get(key)), _short(second.told.get(key)))
@@ -176,11 +178,11 @@ def data_differences(old: Any, new: Any) -> list[QuantityDifference]:
         old: of the run.
         new: made again.
     """
-    return content_differences(_plain(old), _plain(new), False)
+    return _content_differences(_plain(old), _plain(new), False)
 
 
 @dataclass(frozen=True, eq=False)
-class Content:
+class _Content:
     """What a file holds.
 
     Attributes:
@@ -196,19 +198,19 @@ class Content:
     drawn: bool = False
 
 
-def _plain(data: Any) -> Content:
+def _plain(data: Any) -> _Content:
     told = {key: data[key] for key in TOLD if key in data} if isinstance(data, Mapping) else {}
     rest = {key: value for key, value in data.items() if key not in told} if isinstance(data, Mapping) else data
     found = dict(leaves(rest))
     arrays = {key: value for key, value in found.items() if isinstance(value, np.ndarray)}
-    return Content({key: value for key, value in found.items() if key not in arrays}, arrays, told)
+    return _Content({key: value for key, value in found.items() if key not in arrays}, arrays, told)
 
 
-def _json(content: bytes) -> Content:
+def _json(content: bytes) -> _Content:
     return _plain(json.loads(content))
 
 
-def _yaml(content: bytes) -> Content:
+def _yaml(content: bytes) -> _Content:
     """What a YAML file says. Comments, layout and the choice of units are the user's, and not the run's."""
     file = parse_yaml(content.decode("utf-8"))
     kind = kind_of(file.data)
@@ -218,7 +220,7 @@ def _yaml(content: bytes) -> Content:
     return _plain(file.data)
 
 
-def _csv(content: bytes) -> Content:
+def _csv(content: bytes) -> _Content:
     rows = list(csv.reader(io.StringIO(content.decode("utf-8"))))
     heads = rows[0] if rows else []
     cells = {
@@ -226,7 +228,7 @@ def _csv(content: bytes) -> Content:
         for k, row in enumerate(rows[1:], 2)
         for c, cell in enumerate(row)
     }
-    return Content({**{f"head {c + 1}": head for c, head in enumerate(heads)}, **cells}, {}, {})
+    return _Content({**{f"head {c + 1}": head for c, head in enumerate(heads)}, **cells}, {}, {})
 
 
 def _cell(text: str) -> Leaf:
@@ -240,19 +242,19 @@ def _cell(text: str) -> Leaf:
         return text
 
 
-def _netcdf(content: bytes) -> Content:
+def _netcdf(content: bytes) -> _Content:
     data = read_netcdf(content)
     arrays = {str(name): np.asarray(data[name].values) for name in (*data.data_vars, *data.coords)}
     numbers = {f"attribute {name}": value for name, value in data.attrs.items() if isinstance(value, str | float)}
     numbers.pop("attribute fingerprint", None)
-    return Content(numbers, arrays, {})
+    return _Content(numbers, arrays, {})
 
 
-def _tiff(content: bytes) -> Content:
-    return Content({}, {"pixels": np.asarray(tifffile.imread(io.BytesIO(content)))}, {})
+def _tiff(content: bytes) -> _Content:
+    return _Content({}, {"pixels": np.asarray(tifffile.imread(io.BytesIO(content)))}, {})
 
 
-def _fits(content: bytes) -> Content:
+def _fits(content: bytes) -> _Content:
     from astropy.io import fits
 
     with fits.open(io.BytesIO(content)) as units:
@@ -262,58 +264,60 @@ def _fits(content: bytes) -> Content:
         columns = values.dtype.names or ()
         arrays |= {f"{name} {column}": np.asarray(values[column]) for column in columns}
         arrays |= {} if columns else {name: np.asarray(values)}
-    return Content({}, arrays, {})
+    return _Content({}, arrays, {})
 
 
-def _npz(content: bytes) -> Content:
+def _npz(content: bytes) -> _Content:
     with np.load(io.BytesIO(content), allow_pickle=False) as file:
-        return Content({}, {name: file[name] for name in file.files}, {})
+        return _Content({}, {name: file[name] for name in file.files}, {})
 
 
-def _parquet(content: bytes) -> Content:
+def _parquet(content: bytes) -> _Content:
     import pandas as pd
 
     table = pd.read_parquet(io.BytesIO(content))
-    return Content({}, {str(name): table[name].to_numpy() for name in table.columns}, {})
+    return _Content({}, {str(name): table[name].to_numpy() for name in table.columns}, {})
 
 
-def _png(content: bytes) -> Content:
+def _png(content: bytes) -> _Content:
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("no PNG")
-    return Content({}, {"pixels": pixels}, {}, drawn=True)
+    return _Content({}, {"pixels": pixels}, {}, drawn=True)
 
 
-def _text(content: bytes) -> Content:
-    """Words and numbers of a text, also of a drawing; of anything else its bytes."""
+def _words(text: str, drawn: bool = False) -> _Content:
+    """Words and numbers of a text."""
+    numbers = np.array([float(found) for found in _NUMBER.findall(text)])
+    return _Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {}, drawn)
+
+
+def _text(content: bytes) -> _Content:
+    """A text; of anything else its bytes."""
     try:
-        text = content.decode("utf-8")
+        return _words(content.decode("utf-8"))
     except UnicodeDecodeError:
-        return Content({}, {"bytes": np.frombuffer(content, np.uint8)}, {})
-    numbers = np.array([float(found) for found in _NUMBER.findall(text)])
-    return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {})
+        return _Content({}, {"bytes": np.frombuffer(content, np.uint8)}, {})
 
 
-def _drawing(content: bytes) -> Content:
+def _drawing(content: bytes) -> _Content:
     """An SVG: its words and its places, without identifiers, which are checksums of what they name."""
-    text = _IDENTIFIER.sub(r"\1", content.decode("utf-8"))
-    numbers = np.array([float(found) for found in _NUMBER.findall(text)])
-    return Content({"text": _NUMBER.sub("#", text)}, {"numbers": numbers}, {}, drawn=True)
+    return _words(_IDENTIFIER.sub(r"\1", content.decode("utf-8")), drawn=True)
 
 
 _IDENTIFIER = re.compile(r"""(\bid="|url\(#|href="#)[^")]*""")
 
 
-def _scene(content: bytes) -> Content:
+def _scene(content: bytes) -> _Content:
     """A GLB: its JSON, and the numbers of its geometry."""
     length = struct.unpack_from("<I", content, 12)[0]
     told = _plain(json.loads(content[20 : 20 + length]))
     binary = content[20 + length + 8 :]
     geometry = np.frombuffer(binary, "<f4", len(binary) // 4)
-    return Content(told.numbers, {**told.arrays, "geometry": geometry}, {}, drawn=True)
+    return _Content(told.numbers, {**told.arrays, "geometry": geometry}, {}, drawn=True)
 
 
-READERS: dict[str, Callable[[bytes], Content]] = {
+READERS: dict[str, Callable[[bytes], _Content]] = {
     "json": _json,
     "yaml": _yaml,
     "csv": _csv,
@@ -372,7 +376,7 @@ def _peer(key: str) -> str:
 
 
 _PLACE = re.compile(r"\[(?:\[[^\]]*\]|[^\[\]])*\]")
-"""Of an entry in a list: its number, or what tells it from the others."""
+"""What follows a list's name in a key: the number of an entry, or what tells it from the others."""
 
 
 def _peers(*every: Mapping[str, Leaf]) -> dict[str, float]:
@@ -396,13 +400,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _short(value: Any) -> Leaf:
-    text = value if isinstance(value, str) else None
-    if text is not None and len(text) > 200:
-        return f"{text[:197]}..."
+    if isinstance(value, str) and len(value) > 200:
+        return f"{value[:197]}..."
     return value if value is None or isinstance(value, int | float | str | bool) else str(value)[:200]
 
 
-def content_differences(first: Content, second: Content, elsewhere: bool) -> list[QuantityDifference]:
+def _content_differences(first: _Content, second: _Content, elsewhere: bool) -> list[QuantityDifference]:
     """What differs between two files, but for what is told of their numbers.
 
     Args:
@@ -413,7 +416,7 @@ def content_differences(first: Content, second: Content, elsewhere: bool) -> lis
     return [*_numbers(first.numbers, second.numbers, elsewhere), *_arrays(first, second, elsewhere)]
 
 
-def _arrays(first: Content, second: Content, elsewhere: bool) -> list[QuantityDifference]:
+def _arrays(first: _Content, second: _Content, elsewhere: bool) -> list[QuantityDifference]:
     out = []
     for key in dict.fromkeys((*first.arrays, *second.arrays)):
         one, two = first.arrays.get(key), second.arrays.get(key)

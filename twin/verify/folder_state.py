@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from scenes.yaml.errors import InputError, Issue
-from twin.run.owned_files import MANIFEST, STUDY_LOCK, STUDY_STATE, digest, every_file
+from twin.run.owned_files import MANIFEST, PARTIAL, STUDY_LOCK, STUDY_STATE, digest, every_file
 from twin.run.provenance import Provenance
 from twin.run.run_folder import Manifest, altered, json_text, read_manifest, seal
-from twin.run.unfinished import PARTIAL
 from twin.study.runs.chunk_store import FOLDER, examined
 from twin.study.runs.study_folder import PROGRAM as STUDY
 
@@ -200,7 +199,7 @@ def _kernels(where: Provenance) -> dict[str, str]:
 
 
 def _that_round(settings: Mapping[str, str]) -> dict[str, str]:
-    """Of the environment what changes how numbers are rounded."""
+    """Variables of the environment that change how numbers are rounded."""
     return {name: value for name, value in settings.items() if not name.endswith("THREADS")}
 
 

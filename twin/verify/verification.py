@@ -1,15 +1,33 @@
-"""What is said of a run folder that was verified: one verdict, and the numbers it rests on."""
+"""A run made again from what its folder holds, and the verdict on that folder.
+
+A whole run is made by its command in a process of its own; of a study one chunk is computed here.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from twin.run.cli import time_text
-from twin.run.report import one_sentence
-from twin.verify.file_difference import DIFFERENT, LEFT_OUT, REDRAWN, ROUNDED, SAME, FileDifference
-from twin.verify.folder_state import FolderState
-from twin.verify.repetition import Repetition
+import numpy as np
+
+from scenes.yaml.errors import InputError
+from scenes.yaml.input_file import why_unreadable
+from twin.run import cli, data_files, provenance, report, run_folder
+from twin.study.runs import setup, task
+from twin.study.runs.base_job import BlockResult
+from twin.study.runs.chunk_store import FOLDER, ChunkError, ChunkStore, examined
+from twin.study.runs.plan import Plan
+from twin.study.study_files import make_dataset, summary
+from twin.verify import file_difference as difference
+from twin.verify.folder_state import Elsewhere, FolderState, elsewhere
 
 EQUAL, UNEQUAL, CANNOT = 0, 1, 2
 """Exit codes."""
@@ -34,7 +52,7 @@ class Verification:
     @property
     def code(self) -> int:
         """Exit code."""
-        if not self.state.whole or (self.repetition is not None and self.repetition.state == DIFFERENT):
+        if not self.state.whole or (self.repetition is not None and self.repetition.state == difference.DIFFERENT):
             return UNEQUAL
         return CANNOT if self.obstacle else EQUAL
 
@@ -52,7 +70,7 @@ class Verification:
             if names
         ]
         first = "; ".join(told) if told else f"All {count} files are as the run wrote them"
-        return one_sentence(first, *self._repeated())
+        return report.one_sentence(first, *self._repeated())
 
     def _repeated(self) -> list[str]:
         if self.obstacle:
@@ -61,17 +79,19 @@ class Verification:
         if made is None:
             return ["it was not made again"]
         what = made.what or "the run"
-        compared = [one for one in made.files if one.state != LEFT_OUT]
-        if made.state == SAME:
+        compared = [one for one in made.files if one.state != difference.LEFT_OUT]
+        if made.state == difference.SAME:
             out = [f"made again, {what} came out the same in all {len(compared)} files that hold numbers"]
-        elif made.state == ROUNDED:
-            rounded = [one for one in compared if one.state in (ROUNDED, REDRAWN)]
+        elif made.state == difference.ROUNDED:
+            rounded = [one for one in compared if one.state in (difference.ROUNDED, difference.REDRAWN)]
             out = [
                 f"made again, {what} came out the same but for rounding in {len(rounded)} of {len(compared)} files: "
                 f"numbers by {_largest(rounded)} at most"
             ]
         else:
-            worst = [one for one in compared if one.state not in (SAME, ROUNDED, REDRAWN)]
+            worst = [
+                one for one in compared if one.state not in (difference.SAME, difference.ROUNDED, difference.REDRAWN)
+            ]
             out = [f"made again, {what} came out different in {_named([one.file for one in worst])}"]
         where = made.elsewhere
         if not where.known:
@@ -80,12 +100,12 @@ class Verification:
             out.append(f"another program made it: {_named(where.program)}")
         if where.processor:
             out.append(f"it was made elsewhere: {_named(where.processor)}")
-        if made.state != SAME and where.known and not where.program and not where.processor:
+        if made.state != difference.SAME and where.known and not where.program and not where.processor:
             out.append("the program and the processor are the same")
         return out
 
     def numbers(self) -> dict[str, Any]:
-        """As plain data, for ``--json``."""
+        """What was found as plain data, for ``--json``."""
         state, made = self.state, self.repetition
         manifest = state.manifest
         return {
@@ -123,7 +143,7 @@ class Verification:
         out += [f"read by the run and changed since: {name}" for name in state.inputs_changed]
         out += [f"read by the run and gone: {name}" for name in state.inputs_gone]
         for one in () if self.repetition is None else self.repetition.files:
-            if one.state in (SAME, LEFT_OUT):
+            if one.state in (difference.SAME, difference.LEFT_OUT):
                 continue
             count = f", {one.count} quantities" if one.count else ""
             out.append(f"{one.file}: {one.state}{count}{f', {one.why}' if one.why else ''}")
@@ -136,10 +156,10 @@ class Verification:
 
 def expected_time(state: FolderState) -> str:
     """How long making a run again will take, as one says it."""
-    return time_text(state.manifest.wall_time_s)
+    return cli.time_text(state.manifest.wall_time_s)
 
 
-def _plain(one: FileDifference) -> dict[str, Any]:
+def _plain(one: difference.FileDifference) -> dict[str, Any]:
     return {
         "file": one.file,
         "state": one.state,
@@ -149,7 +169,7 @@ def _plain(one: FileDifference) -> dict[str, Any]:
     }
 
 
-def _largest(files: list[FileDifference]) -> str:
+def _largest(files: list[difference.FileDifference]) -> str:
     relative = max((one.largest for one in files if not one.drawn), default=0.0)
     in_sigma = [one.largest_in_sigma for one in files if one.largest_in_sigma is not None]
     return f"{relative:.2g} of them" + (f" and {max(in_sigma):.2g} sigma" if in_sigma else "")
@@ -162,3 +182,195 @@ def _named(names: Any) -> str:
 
 def _files(names: tuple[str, ...]) -> str:
     return f"{_named(names)} {'is' if len(names) == 1 else 'are'}"
+
+
+CONFIG = "config.yaml"
+
+
+class CannotRepeat(Exception):
+    """A run cannot be made again; the message says why."""
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """A run that was made again.
+
+    Attributes:
+        files: every file of the folder that was compared.
+        elsewhere: what is not the same here as where the run was made.
+        seconds: that it took.
+        what: was made again, where that is not the whole run.
+    """
+
+    files: tuple[difference.FileDifference, ...]
+    elsewhere: Elsewhere
+    seconds: float
+    what: str = ""
+
+    @property
+    def state(self) -> str:
+        """SAME, ROUNDED or DIFFERENT: of the file that differs most."""
+        states = {one.state for one in self.files}
+        if states - {difference.SAME, difference.ROUNDED, difference.REDRAWN, difference.LEFT_OUT}:
+            return difference.DIFFERENT
+        return difference.ROUNDED if states & {difference.ROUNDED, difference.REDRAWN} else difference.SAME
+
+
+def obstacle(state: FolderState) -> str:
+    """Why a run cannot be made again from its folder; empty where it can."""
+    manifest = state.manifest
+    if not manifest.again:
+        if manifest.provenance is None:
+            return "it was made by an older version, whose manifest does not say by which command"
+        return (
+            "it holds measurements that a test wrote beside its run (--export); the run folder of the test can be "
+            "verified"
+        )
+    made_of = [name for name in (*state.changed, *state.missing) if _goes_in(name)]
+    if made_of:
+        return f"what it was made of is not as it was: {', '.join(made_of)}"
+    if state.inputs_gone:
+        return f"files that it read are gone: {', '.join(state.inputs_gone)}"
+    if state.inputs_changed:
+        return f"files that it read have changed since: {', '.join(state.inputs_changed)}"
+    return ""
+
+
+def _goes_in(name: str) -> bool:
+    """Whether a file of a run folder is what the run was made of."""
+    return name == CONFIG or name.split("/")[0] in ("deformation", "temperature", "finish")
+
+
+def repeat(state: FolderState, place: Path, quiet: bool) -> Repetition:
+    """Make a whole run again, and compare every file.
+
+    Args:
+        state: of its folder; nothing is in the way.
+        place: where to make it; does not exist.
+        quiet: tell nothing meanwhile.
+
+    Raises:
+        CannotRepeat: the command does not make it.
+    """
+    manifest, began = state.manifest, time.monotonic()
+    words = [str(state.folder.resolve() / CONFIG) if word == CONFIG else word for word in manifest.again]
+    started_in = manifest.started_in or str(place.parent)
+    if not Path(started_in).is_dir():
+        raise CannotRepeat(f"the folder in which it was started is gone: {started_in}")
+    # modules are those of this program, whatever lies in the folder where it starts
+    command = [sys.executable, "-P", "-m", f"{provenance.BEFORE}{words[0]}", *words[1:], "--out", str(place.absolute())]
+    command += ["--quiet"] if quiet and manifest.program != "twin.validate" else []
+    paths = os.pathsep.join(
+        filter(
+            None, (str(provenance.ROOT.parent if provenance.BEFORE else provenance.ROOT), os.environ.get("PYTHONPATH"))
+        )
+    )
+    with subprocess.Popen(
+        command,
+        cwd=started_in,
+        env={**os.environ, "PYTHONPATH": paths},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE if quiet else None,
+        text=True,
+    ) as process:
+        try:
+            _, said = process.communicate()
+        except BaseException:
+            process.send_signal(signal.SIGTERM)
+            process.wait()
+            raise
+    made = run_folder.read_manifest(place)
+    if made is None:
+        told = " ".join((said or "").split()[-60:])
+        raise CannotRepeat(f"{' '.join(words)} ended with exit code {process.returncode}{': ' if told else ''}{told}")
+    where = elsewhere(manifest, made.provenance, made.versions)
+    other = bool(where.processor)
+    names = dict.fromkeys((*manifest.sha256, *made.sha256))
+    files = [difference.file_difference(name, state.folder / name, place / name, other) for name in names]
+    return Repetition(tuple(of_rounded(files)), where, time.monotonic() - began)
+
+
+def of_rounded(files: Sequence[difference.FileDifference]) -> Iterator[difference.FileDifference]:
+    """Pictures of numbers that are the same but for rounding are not different results.
+
+    Args:
+        files: of one run, as compared.
+    """
+    numbers = {one.state for one in files if not one.drawn}
+    rounded = difference.ROUNDED in numbers and not numbers - {difference.SAME, difference.ROUNDED, difference.LEFT_OUT}
+    for one in files:
+        yield (
+            replace(one, state=difference.REDRAWN)
+            if rounded and one.drawn and one.state == difference.DIFFERENT
+            else one
+        )
+
+
+def repeat_chunk(state: FolderState) -> Repetition:
+    """Make one chunk of a study again, the one in the middle, and hold all chunks against the study's data set.
+
+    Args:
+        state: of its folder; nothing is in the way.
+
+    Raises:
+        CannotRepeat: its chunks are not there, or not whole.
+        InputError: its config.yaml cannot be read.
+    """
+    began, folder = time.monotonic(), state.folder
+    try:
+        plan = Plan.of(setup.resolve_study(folder / CONFIG))
+        store = ChunkStore(folder, plan)
+        store.entries.update({entry.first: entry for entry in examined(folder).whole})
+        whole = store.result() if not store.missing else None
+    except (ChunkError, InputError) as error:
+        raise CannotRepeat(str(error)) from error
+    if whole is None:
+        raise CannotRepeat("its chunks are not whole; --all makes the whole study again")
+    entry = store.entries[sorted(store.entries)[len(store.entries) // 2]]
+    runs = [number for block in entry.range for number in plan.block(block)]
+    config, backend = plan.setup.to_yaml(), state.manifest.backend or "llvm"
+    blocks = tuple(tuple(some) for some in plan.runs_of(entry.range))
+    made = BlockResult.joined(
+        task.evaluate(task.Task(config, provenance.source_digest(), backend, entry.first, blocks))
+    )
+    where = elsewhere(state.manifest, provenance.Provenance.here(), provenance.versions())
+    chunk = _chunk_difference(f"{FOLDER}/{entry.file}", store.read(entry), made, plan)
+    files = (chunk, *_data_difference(folder, plan, whole))
+    what = f"runs {runs[0]} to {runs[-1]} of {plan.runs}"
+    return Repetition(files, where, time.monotonic() - began, what)
+
+
+def _chunk_difference(name: str, old: BlockResult, new: BlockResult, plan: Plan) -> difference.FileDifference:
+    """The responses of a chunk, run by run."""
+    found: list[difference.QuantityDifference | None] = []
+    for r, response in enumerate(plan.setup.study.responses):
+        for ending, part in (("", "values"), (" sigma", "sigmas"), (" noise", "noises")):
+            first, second = (getattr(result, part)[:, r] for result in (old, new))
+            found.append(difference.array_difference(f"{response}{ending}", first, second))
+    for part in ("messages", "doubts"):
+        texts = [np.array(getattr(result, part), object) for result in (old, new)]
+        found.append(difference.array_difference(part, texts[0], texts[1]))
+    return difference.judged(name, found)
+
+
+def _data_difference(folder: Path, plan: Plan, whole: BlockResult) -> Iterable[difference.FileDifference]:
+    """study.nc and study.json against what the chunks hold."""
+    name = "study.nc"
+    try:
+        data = data_files.read_netcdf((folder / name).read_bytes())
+        kept = {str(key): np.asarray(data[key].values) for key in data.data_vars}
+        told = json.loads((folder / "study.json").read_bytes())
+    # readers of spoilt files fail in ways that cannot be foreseen
+    except Exception as error:
+        return (difference.FileDifference(name, difference.DIFFERENT, why=f"cannot be read: {why_unreadable(error)}"),)
+    made = make_dataset(plan, whole)
+    found = [
+        difference.array_difference(str(key), kept.get(str(key), np.array([])), np.asarray(made[key].values))
+        for key in made.data_vars
+    ]
+    numbers = summary(made, plan)
+    # the data set is the chunks', and what is told of it is that of the data set
+    return difference.judged(name, found), difference.judged(
+        "study.json", difference.data_differences({key: told.get(key) for key in numbers}, numbers)
+    )

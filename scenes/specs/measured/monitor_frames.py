@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.course import Moment, moment
+from scenes.specs.course import Moment, ascending, moment
 from scenes.specs.detector import DetectorSpec, PixelPitch
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import SIDES, Exposure, FieldPlace, LookAngle
 from scenes.specs.job import AnalysisSpec, JobSpec
-from scenes.specs.load import find_detector, load_detector
+from scenes.specs.load import DETECTORS, find_named, load_detector
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
-from scenes.yaml.csv_table import table_text
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown
-from scenes.yaml.input_file import is_file, unusable
+from scenes.yaml.csv_table import rows_of
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
+from scenes.yaml.input_file import file_beside, is_file, unusable
 from scenes.yaml.quantity import PositiveLength
-from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, validate
+from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, one_given, short_for, validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import LARGEST_BYTES, read_yaml
 
@@ -34,35 +31,14 @@ ALL = "all"
 MOST_FILES, MOST_TIMES = 10_000, 1000
 
 
-def _listed(value: Any) -> Any:
-    """One file needs no brackets."""
-    return [value] if isinstance(value, str) else value
-
-
-Files = Annotated[
-    tuple[Reference, ...], BeforeValidator(_listed, json_schema_input_type=Reference | tuple[Reference, ...]),
-    Field(min_length=1, max_length=MOST_FILES),
-]  # fmt: skip
+_Several = Field(min_length=1, max_length=MOST_FILES)
+Files = Annotated[tuple[Reference, ...], short_for(None, str, schema=Reference | tuple[Reference, ...]), _Several]
 """Image files whose frames are taken together, relative to the file that names them."""
 
 
-def _for_all(value: Any) -> Any:
-    """A file for every channel."""
-    return {ALL: value} if isinstance(value, str | list) else value
-
-
-PerChannel = Annotated[
-    Paths[Files], BeforeValidator(_for_all, json_schema_input_type=Files | dict[str, Files]), Field(min_length=1)
-]
+PerChannel = Annotated[Paths[Files], short_for(ALL, str, list, schema=Files | dict[str, Files]), Field(min_length=1)]
 """Image files by channel, ``CAMERA/SIDE``, or for all."""
 FirstPixel = tuple[Annotated[Whole, Field(ge=0, le=65535)], Annotated[Whole, Field(ge=0, le=65535)]]
-
-
-def _ascending(times: tuple[float, ...]) -> tuple[float, ...]:
-    for k, (before, after) in enumerate(pairwise(times), 1):
-        if after <= before:
-            raise Problem("the times do not ascend", moment(after), f"a time after {moment(before)}", within=(k,))
-    return times
 
 
 class ChannelFramesSpec(Spec):
@@ -76,10 +52,7 @@ class ChannelFramesSpec(Spec):
     """
 
     before: Files
-    after: Annotated[
-        tuple[Files, ...], BeforeValidator(_listed, json_schema_input_type=Reference | tuple[Files, ...]),
-        Field(min_length=1, max_length=MOST_FILES),
-    ]  # fmt: skip
+    after: Annotated[tuple[Files, ...], short_for(None, str, schema=Reference | tuple[Files, ...]), _Several]
     offset: FirstPixel = (0, 0)
     offset_after: FirstPixel | None = None
 
@@ -133,7 +106,7 @@ class MeasurementSpec(Spec):
     geometry: Annotated[Named[GeometrySpec], Field(min_length=1)] | None = None
     frames: Reference | Paths[ChannelFramesSpec]
     times: (
-        Annotated[tuple[Moment, ...], Field(min_length=1, max_length=MOST_TIMES), AfterValidator(_ascending)] | None
+        Annotated[tuple[Moment, ...], Field(min_length=1, max_length=MOST_TIMES), AfterValidator(ascending)] | None
     ) = None
     disturbances: JobDisturbances | None = None
     template: Literal["twin", "measured"] = "twin"
@@ -149,20 +122,13 @@ class MeasurementSpec(Spec):
 
     @model_validator(mode="after")
     def _model_or_geometry(self) -> MeasurementSpec:
-        if (self.instrument is None) == (self.geometry is None):
-            found = "neither" if self.instrument is None else "both"
-            raise Problem(
-                "an instrument or its geometry is needed", found, "instrument: NAME, or geometry: {CAMERA: {...}}"
-            )
+        allowed = "instrument: NAME, or geometry: {CAMERA: {...}}"
+        one_given(self, ("instrument", "geometry"), "an instrument or its geometry is needed", allowed)
         if self.geometry is None:
             return self
         if self.template == "twin":
-            raise Problem(
-                "without an instrument there is no model of the spots",
-                "twin",
-                "template: measured",
-                within=("template",),
-            )
+            text = "without an instrument there is no model of the spots"
+            raise Problem(text, "twin", "template: measured", within=("template",))
         if self.disturbances is not None:
             text = "what disturbances do to the spots is known of an instrument's model only"
             raise Problem(text, None, "no disturbances, or an instrument", within=("disturbances",))
@@ -177,9 +143,8 @@ class MeasurementSpec(Spec):
             text = "photon transfer is measured in dark and in flat frames"
             raise Problem(text, f"no {missing}", "dark: FILES and flat: FILES", within=("photon_transfer",))
         if self.flat is not None and self.dark is None:
-            raise Problem(
-                "flat frames are of no use without dark frames", None, "dark: FILES as well", within=("flat",)
-            )
+            text = "flat frames are of no use without dark frames"
+            raise Problem(text, None, "dark: FILES as well", within=("flat",))
         if self.vibration == "fitted" and self.analysis.centroid != "ml":
             text = "smear is fitted with the calibrated shape of the spots"
             raise Problem(text, self.analysis.centroid, "centroid: ml", within=("analysis", "centroid"))
@@ -197,9 +162,8 @@ class MeasurementSpec(Spec):
                 found, allowed = f"{len(files.after)} of {len(self.times)} times", "one file or list of files a time"
                 raise Problem("not as many entries as times", found, allowed, within=where)
             if self.times is None and any(len(one) > 1 for one in files.after):
-                raise Problem(
-                    "lists of files are for several times", None, "times: [...], or a plain list", within=where
-                )
+                text = "lists of files are for several times"
+                raise Problem(text, None, "times: [...], or a plain list", within=where)
         return self
 
     def states(self, files: ChannelFramesSpec) -> tuple[tuple[str, ...], ...]:
@@ -224,7 +188,7 @@ def per_channel(files: Any, channel: str) -> tuple[str, ...]:
 
 
 ENDINGS = (".tiff", ".tif", ".fits", ".fit", ".fts", ".png")
-"""Of frames in a folder, in the order in which they are looked for."""
+"""Endings of frames in a folder, in the order in which they are looked for."""
 BEFORE, AFTER = "before", "after"
 HEADS = "channel, when (before or after) or 'time [min]' (before or a number), file, and perhaps row, column"
 _TIME_HEAD = re.compile(r"time *\[(?P<unit>[^\[\]]+)\]")
@@ -258,7 +222,7 @@ def resolve_measurement(path: str | Path) -> MeasurementSetup:
     spec = validate(MeasurementSpec, read_yaml(path))
     model = _model(spec)
     if spec.detector is not None:
-        detector = load_detector(find_detector(spec.detector or "", spec, ("detector",)))
+        detector = load_detector(find_named(DETECTORS, spec.detector, spec, ("detector",)))
     else:
         assert model is not None
         detector = model.detector
@@ -273,9 +237,7 @@ def _model(spec: MeasurementSpec) -> ResolvedJob | None:
         return None
     job = JobSpec.model_construct(instrument=spec.instrument, disturbances=spec.disturbances, analysis=spec.analysis)
     # its keys are called as the measurement's, so that faults are told at their lines
-    told = job.with_source(spec.source)
-    assert isinstance(told, JobSpec)
-    model = resolve_job(told)
+    model = resolve_job(job.with_source(spec.source))
     if spec.exposure is None:
         return model
     monitor = model.instrument.monitor
@@ -301,14 +263,9 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
         frames = dict(spec.frames)
         for name, files in frames.items():
             _known(spec, ("frames", name), name, channels)
-            frames[name] = files.model_copy(
-                update={
-                    "before": _paths(spec, ("frames", name, BEFORE), files.before, base),
-                    "after": tuple(
-                        _paths(spec, ("frames", name, AFTER, k), entry, base) for k, entry in enumerate(files.after)
-                    ),
-                }
-            )
+            before = _paths(spec, ("frames", name, BEFORE), files.before, base)
+            after = tuple(_paths(spec, ("frames", name, AFTER, k), one, base) for k, one in enumerate(files.after))
+            frames[name] = files.model_copy(update={"before": before, "after": after})
     missing = [name for name in channels if name not in frames]
     if missing:
         text = f"no frames of {names_text(missing)}"
@@ -327,34 +284,17 @@ def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> Me
     return spec.model_copy(update=update)
 
 
-def _known(spec: Spec, key: KeyPath, name: str, channels: Iterable[str]) -> None:
-    known = tuple(channels)
-    if name not in known:
-        meant = nearest(name, known)
-        raise spec.error("no such channel", key, found=name, allowed=names_text(known), suggestion=meant)
+def _known(spec: Spec, key: KeyPath, name: str, channels: tuple[str, ...]) -> None:
+    if name not in channels:
+        raise spec.error(unknown("no such channel", name, channels), key)
+
+
+_IMAGES = "an image file (TIFF, FITS, PNG)"
 
 
 def _paths(spec: Spec, key: KeyPath, files: Iterable[str], base: Path) -> tuple[str, ...]:
     """Absolute paths. Raises InputError for a file that is not there."""
-    out = []
-    for file in files:
-        place = base / file
-        if not is_file(place):
-            raise spec.error(unusable(place), key, allowed=_allowed(place), suggestion=_beside(place))
-        out.append(str(place.absolute()))
-    return tuple(out)
-
-
-def _allowed(place: Path) -> str:
-    return "an image file (TIFF, FITS, PNG), relative to the file that names it"
-
-
-def _beside(place: Path) -> str | None:
-    """The name in the same folder that was probably meant."""
-    try:
-        return nearest(place.name, sorted(one.name for one in place.parent.iterdir()))
-    except (OSError, ValueError):
-        return None
+    return tuple(str(spec.file_at(key, file, base, _IMAGES)) for file in files)
 
 
 def _found(
@@ -364,16 +304,13 @@ def _found(
     if is_file(place) and place.suffix.lower() == ".csv":
         return read_frame_table(place, channels)
     if is_file(place):
-        raise spec.error(
-            "neither a folder nor a table", ("frames",), found=spec.frames,
-            allowed="a folder of frames, a .csv table of files, or CAMERA/SIDE: {before: FILE, after: FILE}",
-        )  # fmt: skip
+        allowed = "a folder of frames, a .csv table of files, or CAMERA/SIDE: {before: FILE, after: FILE}"
+        raise spec.error("neither a folder nor a table", ("frames",), found=spec.frames, allowed=allowed)
     try:
         names = sorted(one.name for one in place.iterdir())
     except (OSError, ValueError):
-        raise spec.error(
-            f"no such folder: {place}", ("frames",), allowed="a folder of frames, relative to this file"
-        ) from None
+        allowed = "a folder of frames, relative to this file"
+        raise spec.error(f"no such folder: {place}", ("frames",), allowed=allowed) from None
     frames = {}
     for channel in channels:
         files = {}
@@ -381,11 +318,10 @@ def _found(
             stem = f"{channel.replace('/', '_')}_{when}"
             file = next((stem + ending for ending in ENDINGS if stem + ending in names), None)
             if file is None:
-                raise spec.error(
-                    f"no frames of {channel} {when} in {place}", ("frames",),
-                    allowed=f"{stem}.tiff (or {', '.join(ENDINGS[1:])}), or CAMERA/SIDE: {{before: FILE, after: FILE}}",
-                    suggestion=nearest(f"{stem}.tiff", names),
-                )  # fmt: skip
+                meant = nearest(f"{stem}.tiff", names)
+                text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
+                allowed = f"{stem}.tiff (or {others}), or CAMERA/SIDE: {{before: FILE, after: FILE}}"
+                raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
             files[when] = (str((place / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))
     return frames, ()
@@ -412,25 +348,18 @@ class _FrameTable:
     channels: tuple[str, ...]
 
     def read(self) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:
-        file, text = str(self.path), table_text(self.path, most=LARGEST_BYTES)
-        reader = csv.reader(io.StringIO(text, newline=""))
-        heads: list[str] = []
         seen: dict[str, dict[float | str, list[str]]] = {}
         corners: dict[tuple[str, bool], tuple[int, int]] = {}
-        try:
-            for row in reader:
-                cells = [cell.strip() for cell in row]
-                if not any(cells) or cells[0].startswith("#"):
-                    continue
-                if not heads:
-                    heads = self._heads(cells, reader.line_num)
-                    continue
-                if len(cells) != len(heads):
-                    text = f"{len(cells)} cells under {len(heads)} heads"
-                    raise InputError(Issue(text, file, reader.line_num, allowed="as many cells as heads"))
-                self._take(dict(zip(heads, cells, strict=True)), reader.line_num, seen, corners)
-        except csv.Error as error:
-            raise InputError(Issue(f"not a CSV file: {error}", file, reader.line_num)) from None
+        heads: list[str] = []
+        for line, row in rows_of(self.path, LARGEST_BYTES):
+            cells = [cell.strip() for cell in row]
+            if not heads:
+                heads = self._heads(cells, line)
+                continue
+            if len(cells) != len(heads):
+                text = f"{len(cells)} cells under {len(heads)} heads"
+                raise InputError(Issue(text, str(self.path), line, allowed="as many cells as heads"))
+            self._take(dict(zip(heads, cells, strict=True)), line, seen, corners)
         return self._frames(seen, corners)
 
     def _heads(self, cells: list[str], line: int) -> list[str]:
@@ -453,9 +382,7 @@ class _FrameTable:
         file = str(self.path)
         channel = row["channel"]
         if channel not in self.channels:
-            meant = nearest(channel, self.channels)
-            issue = Issue("no such channel", file, line, ("channel",), shown(channel), names_text(self.channels), meant)
-            raise InputError(issue)
+            raise InputError(unknown("no such channel", channel, self.channels).at(file, line, ("channel",)))
         head = next(name for name in row if name not in ("channel", "file", "row", "column"))
         when: float | str = row[head]
         if row[head] != BEFORE and head != "when":
@@ -470,7 +397,8 @@ class _FrameTable:
             raise InputError(Issue("no such state", file, line, (head,), shown(row[head]), f"{BEFORE}, {AFTER}"))
         place = self.path.parent / row["file"]
         if not is_file(place):
-            raise InputError(Issue(unusable(place), file, line, ("file",), None, _allowed(place), _beside(place)))
+            allowed, meant = f"{_IMAGES}, relative to the table", file_beside(place)
+            raise InputError(Issue(unusable(place), file, line, ("file",), None, allowed, meant))
         seen.setdefault(channel, {}).setdefault(when, []).append(str(place.absolute()))
         if "row" in row:
             corner = []

@@ -8,25 +8,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from scenes.specs.measured.pass_files import (
-    AngleSigma,
-    BodyAxes,
-    ClockReading,
-    GroundFileSpec,
-    PlatformFilesSpec,
-    PointSigma,
-    RasterFileSpec,
-    TimeScale,
-)
-from scenes.specs.orbit.angle import Angles, EffectsSpec, Flag, Moment
-from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec, checked_schemes
-from scenes.specs.orbit.flight import AngleSigmas, Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
-from scenes.specs.orbit.scene import ImagePointsSpec, LightEffectsSpec
+from scenes.specs.measured import pass_files
+from scenes.specs.orbit.angle import Angles, EffectsSpec, LightEffectsSpec, Moment
+from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec
+from scenes.specs.orbit.flight import Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
+from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Whole
+from scenes.yaml.quantity import AngleSigmas, Quantity
+from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Spec, Whole, not_empty
 from scenes.yaml.units import TIME
 
 
@@ -61,7 +52,7 @@ class ConventionsSpec(Spec):
 
     frame: Literal["itrs"]
     quaternion: QuaternionSpec | None = None
-    body_axes: BodyAxes | None = None
+    body_axes: pass_files.BodyAxes | None = None
     time_scale: Literal["utc"]
     line_moment: Literal["start", "middle", "end"]
     centre: Literal["integer", "half"]
@@ -70,7 +61,7 @@ class ConventionsSpec(Spec):
 
 
 FILE_KEYS = ("platform", "orbit", "attitude", "lines", "ground", "image_points", "tie_points")
-"""Of a pass, those that name a table."""
+"""Keys of a pass that name a table."""
 
 
 class PassFilesSpec(Spec):
@@ -89,7 +80,7 @@ class PassFilesSpec(Spec):
     """
 
     epoch: UtcTime
-    platform: Reference | PlatformFilesSpec | None = None
+    platform: Reference | pass_files.PlatformFilesSpec | None = None
     orbit: Reference | None = None
     attitude: Reference | None = None
     lines: Reference
@@ -113,13 +104,7 @@ class PassFilesSpec(Spec):
         return {name: file for name, file in found.items() if isinstance(file, str)}
 
 
-def _some_passes(passes: Named[PassFilesSpec]) -> Named[PassFilesSpec]:
-    if not passes:
-        raise Problem("no passes", "an empty mapping", "at least one pass")
-    return passes
-
-
-Passes = Annotated[Named[PassFilesSpec], AfterValidator(_some_passes)]
+Passes = Annotated[Named[PassFilesSpec], not_empty("no passes", "at least one pass")]
 
 
 class OrbitDataSpec(Spec):
@@ -191,7 +176,16 @@ class ReadingErrorsSpec(Spec):
         return (0.0, 0.0, 0.0)
 
 
-class MeasuredTestSpec(PayloadTestSpec):
+class FixedTestSpec(PayloadTestSpec):
+    """A test of a payload in which nothing is drawn."""
+
+    @property
+    def seed(self) -> int:
+        """Any: nothing is drawn."""
+        return 0
+
+
+class MeasuredTestSpec(FixedTestSpec):
     """What all tests on measurements say.
 
     Attributes:
@@ -219,11 +213,6 @@ class MeasuredTestSpec(PayloadTestSpec):
                 allowed = "`data: DIR`, or `conventions:` and `passes:`"
                 raise Problem("where the measurements are is not said once", found, allowed, within=("data",))
         return value
-
-    @property
-    def seed(self) -> int:
-        """Nothing is drawn."""
-        return 0
 
 
 class MeasuredCalibrationSpec(MeasuredTestSpec):
@@ -253,10 +242,6 @@ class MeasuredCalibrationSpec(MeasuredTestSpec):
     strip: Flag = False
     launch: LaunchSpec = LaunchSpec()
     limits: MapLimitsSpec = MapLimitsSpec()
-
-    def check_schemes(self, passes: Mapping[str, Any]) -> None:
-        """Raises Problem unless the schemes name passes."""
-        checked_schemes(self.schemes, passes)
 
 
 class MeasuredAngleSpec(MeasuredTestSpec):
@@ -288,10 +273,6 @@ class MeasuredAngleSpec(MeasuredTestSpec):
         return self
 
 
-TimeSigma = Annotated[float, Quantity(TIME, smallest="0 s", largest="100 s")]
-PixelSigma = Annotated[Number, Field(ge=0.0, le=10_000.0)]
-
-
 class LineTimesFileSpec(Spec):
     """When lines were exposed: a table of camera, line and time.
 
@@ -303,8 +284,8 @@ class LineTimesFileSpec(Spec):
     """
 
     file: Reference
-    time_scale: TimeScale
-    epoch: ClockReading | None = None
+    time_scale: pass_files.TimeScale
+    epoch: pass_files.ClockReading | None = None
     moment: Literal["start", "middle", "end"]
 
 
@@ -336,14 +317,14 @@ class UncertaintySpec(Spec):
         time: of the line times against those of orbit and attitude.
     """
 
-    attitude: AngleSigma = 3e-4
-    position: PointSigma = 10.0
-    interior: PixelSigma = 20.0
+    attitude: pass_files.AngleSigma = 3e-4
+    position: pass_files.PointSigma = 10.0
+    interior: Annotated[Number, Field(ge=0.0, le=10_000.0)] = 20.0
     scale: Annotated[Number, Field(ge=0.0, le=0.1)] = 1e-4
-    time: TimeSigma = 1e-3
+    time: Annotated[float, Quantity(TIME, smallest="0 s", largest="100 s")] = 1e-3
 
 
-class OrbitCheckSpec(PayloadTestSpec):
+class OrbitCheckSpec(FixedTestSpec):
     """A check of the conventions of a pass in files.
 
     Attributes:
@@ -360,19 +341,14 @@ class OrbitCheckSpec(PayloadTestSpec):
         shown: places of points that are printed for each reading.
     """
 
-    platform: PlatformFilesSpec
+    platform: pass_files.PlatformFilesSpec
     lines: LineTimesFileSpec
-    ground: GroundFileSpec
+    ground: pass_files.GroundFileSpec
     image_points: ImagePointsFileSpec
     effects: LightEffectsSpec = LightEffectsSpec()
     uncertainty: UncertaintySpec = UncertaintySpec()
     points: Annotated[Whole, Field(ge=4, le=1000)] = 60
     shown: Annotated[Whole, Field(ge=1, le=20)] = 3
-
-    @property
-    def seed(self) -> int:
-        """Nothing is drawn."""
-        return 0
 
 
 class ImageWindowSpec(Spec):
@@ -409,13 +385,7 @@ class LineImageFileSpec(Spec):
     window: ImageWindowSpec | None = None
 
 
-def _some_images(images: Named[LineImageFileSpec]) -> Named[LineImageFileSpec]:
-    if not images:
-        raise Problem("no images", "an empty mapping", "one line of the camera or more")
-    return images
-
-
-class OrbitMatchSpec(PayloadTestSpec):
+class OrbitMatchSpec(FixedTestSpec):
     """Points of an orthophoto, and tie points, sought in line images.
 
     Attributes:
@@ -432,16 +402,11 @@ class OrbitMatchSpec(PayloadTestSpec):
         points: how many, and how they are matched.
     """
 
-    platform: PlatformFilesSpec
+    platform: pass_files.PlatformFilesSpec
     lines: LineTimesFileSpec
-    images: Annotated[Named[LineImageFileSpec], AfterValidator(_some_images)]
-    orthophoto: RasterFileSpec
-    dem: RasterFileSpec
-    control_sigma: tuple[PointSigma, PointSigma]
+    images: Annotated[Named[LineImageFileSpec], not_empty("no images", "one line of the camera or more")]
+    orthophoto: pass_files.RasterFileSpec
+    dem: pass_files.RasterFileSpec
+    control_sigma: tuple[pass_files.PointSigma, pass_files.PointSigma]
     effects: LightEffectsSpec = LightEffectsSpec()
     points: ImagePointsSpec
-
-    @property
-    def seed(self) -> int:
-        """Nothing is drawn."""
-        return 0

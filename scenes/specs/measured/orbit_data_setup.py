@@ -4,40 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.measured.orbit_data import (
-    MeasuredAngleSpec,
-    MeasuredCalibrationSpec,
-    MeasuredTestSpec,
-    OrbitCheckSpec,
-    OrbitDataSpec,
-    OrbitMatchSpec,
-    PassFilesSpec,
-)
+from scenes.specs.load import ORBIT, load_named
+from scenes.specs.measured import orbit_data
 from scenes.specs.measured.pass_files import PlatformFilesSpec, with_absolute_files
-from scenes.specs.orbit.setup import (
-    AngleSetup,
-    CalibrationSetup,
-    find_payload,
-    load_orbit_test,
-    load_three_line_camera,
-    resolve_angle,
-    resolve_calibration,
-)
+from scenes.specs.orbit.calibration import checked_schemes
+from scenes.specs.orbit.setup import AngleSetup, CalibrationSetup, load_payload, resolve_angle, resolve_calibration
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.resolved import ExperimentSetup, read_setup
-from scenes.yaml.errors import Problem, names_text, nearest
+from scenes.specs.resolved import ExperimentSetup, TestType, read_setup, test_keys
+from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.input_file import MISSING, no_file
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import read_yaml
 
 DATA_FILE = "data.yaml"
-"""Of a folder of measurements."""
+"""Name of the file that says what a folder of measurements holds."""
 
 
-class MeasuredCalibrationSetup(ExperimentSetup[MeasuredCalibrationSpec]):
+class _FixedSetup(ExperimentSetup[TestType], Generic[TestType]):
+    camera: ThreeLineCameraSpec
+
+    def with_seed(self, seed: int) -> Self:
+        """Return this set-up: nothing is drawn."""
+        return self
+
+
+class MeasuredCalibrationSetup(_FixedSetup[orbit_data.MeasuredCalibrationSpec]):
     """A calibration on measurements, with its camera.
 
     Attributes:
@@ -45,15 +39,10 @@ class MeasuredCalibrationSetup(ExperimentSetup[MeasuredCalibrationSpec]):
         data: the passes, with paths that hold from anywhere.
     """
 
-    camera: ThreeLineCameraSpec
-    data: OrbitDataSpec
-
-    def with_seed(self, seed: int) -> MeasuredCalibrationSetup:
-        """The same: nothing is drawn."""
-        return self
+    data: orbit_data.OrbitDataSpec
 
 
-class MeasuredAngleSetup(ExperimentSetup[MeasuredAngleSpec]):
+class MeasuredAngleSetup(_FixedSetup[orbit_data.MeasuredAngleSpec]):
     """Intersection angles on measurements, with the camera.
 
     Attributes:
@@ -61,12 +50,7 @@ class MeasuredAngleSetup(ExperimentSetup[MeasuredAngleSpec]):
         data: the passes, with paths that hold from anywhere.
     """
 
-    camera: ThreeLineCameraSpec
-    data: OrbitDataSpec
-
-    def with_seed(self, seed: int) -> MeasuredAngleSetup:
-        """The same: nothing is drawn."""
-        return self
+    data: orbit_data.OrbitDataSpec
 
 
 Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup)
@@ -74,13 +58,9 @@ Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup)
 
 def is_measured(path: str | Path) -> bool:
     """Whether a file, or a run's config.yaml, is a test on measurements. InputError if it cannot be read."""
-    if not (isinstance(path, Path) or "/" in str(path) or str(path).endswith((".yaml", ".yml"))):
-        return False
-    data = read_yaml(path).data
-    if isinstance(data, dict) and isinstance(data.get("test"), dict):
-        data = data["test"]
+    said = test_keys(path)
     # `passes` of a simulation is a number
-    return isinstance(data, dict) and ("data" in data or "conventions" in data or isinstance(data.get("passes"), dict))
+    return "data" in said or "conventions" in said or isinstance(said.get("passes"), dict)
 
 
 def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:
@@ -89,17 +69,11 @@ def resolve_measured_calibration(path: str | Path) -> MeasuredCalibrationSetup:
     Raises:
         InputError: a file cannot be read or is not valid, or the schemes name passes that are none.
     """
-    setup = _resolved(MeasuredCalibrationSetup, MeasuredCalibrationSpec, path)
+    setup = _resolved(MeasuredCalibrationSetup, orbit_data.MeasuredCalibrationSpec, path)
     try:
-        setup.test.check_schemes(setup.data.passes)
+        checked_schemes(setup.test.schemes, setup.data.passes)
     except Problem as problem:
-        raise setup.test.error(
-            problem.problem,
-            problem.within,
-            found=problem.found,
-            allowed=problem.allowed,
-            suggestion=problem.suggestion,
-        ) from None
+        raise setup.test.error(problem) from None
     return setup
 
 
@@ -108,7 +82,9 @@ AnyCalibration = CalibrationSetup | MeasuredCalibrationSetup
 
 
 def resolve_any_calibration(path: str | Path) -> AnyCalibration:
-    """As `resolve_calibration`, or `resolve_measured_calibration` for a file that names measurements."""
+    """Read a calibration as `resolve_calibration`, or `resolve_measured_calibration` for a file that names
+    measurements.
+    """
     return resolve_measured_calibration(path) if is_measured(path) else resolve_calibration(path)
 
 
@@ -118,7 +94,7 @@ def resolve_measured_angle(path: str | Path) -> MeasuredAngleSetup:
     Raises:
         InputError: a file cannot be read or is not valid.
     """
-    return _resolved(MeasuredAngleSetup, MeasuredAngleSpec, path)
+    return _resolved(MeasuredAngleSetup, orbit_data.MeasuredAngleSpec, path)
 
 
 AnyAngle = AngleSetup | MeasuredAngleSetup
@@ -126,7 +102,7 @@ AnyAngle = AngleSetup | MeasuredAngleSetup
 
 
 def resolve_any_angle(path: str | Path) -> AnyAngle:
-    """As `resolve_angle`, or `resolve_measured_angle` for a file that names measurements."""
+    """Read intersection angles as `resolve_angle`, or `resolve_measured_angle` for a file that names measurements."""
     return resolve_measured_angle(path) if is_measured(path) else resolve_angle(path)
 
 
@@ -134,11 +110,11 @@ def _resolved(model: type[Setup], kind: type[Any], path: str | Path) -> Setup:
     setup = read_setup(model, path)
     if setup is not None:
         return setup
-    test: Any = load_orbit_test(kind, path)
-    return model.model_construct(test=test, camera=load_three_line_camera(find_payload(test)), data=data_of(test))
+    test: Any = load_named(kind, ORBIT, path)
+    return model.model_construct(test=test, camera=load_payload(test), data=_data_of(test))
 
 
-def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
+def _data_of(test: orbit_data.MeasuredTestSpec) -> orbit_data.OrbitDataSpec:
     """The passes of a test, with paths that hold from anywhere.
 
     Raises:
@@ -148,7 +124,9 @@ def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
     if test.data is None:
         assert test.conventions is not None
         assert test.passes is not None
-        data = OrbitDataSpec.model_construct(conventions=test.conventions, passes=_placed(test, test.passes, folder))
+        data = orbit_data.OrbitDataSpec.model_construct(
+            conventions=test.conventions, passes=_placed(test, test.passes, folder)
+        )
         return _with_quaternions_said(test, data)
     place = folder / test.data
     file = place / DATA_FILE if place.is_dir() else place
@@ -157,16 +135,19 @@ def data_of(test: MeasuredTestSpec) -> OrbitDataSpec:
         allowed = f"a folder with a {DATA_FILE}, or the path of such a file"
         problem = "no such measurements" if wrong == MISSING else f"no measurements: {wrong}"
         raise test.error(problem, ("data",), found=str(place), allowed=allowed)
-    data = validate(OrbitDataSpec, read_yaml(file))
+    data = validate(orbit_data.OrbitDataSpec, read_yaml(file))
     return _with_quaternions_said(data, data.model_copy(update={"passes": _placed(data, data.passes, file.parent)}))
 
 
-def _placed(owner: Spec, passes: Mapping[str, PassFilesSpec], folder: Path) -> FrozenMap[str, PassFilesSpec]:
+def _placed(
+    owner: Spec, passes: Mapping[str, orbit_data.PassFilesSpec], folder: Path
+) -> FrozenMap[str, orbit_data.PassFilesSpec]:
     """The passes with absolute paths. InputError, at the key of the owner, for a file that is not there."""
     found = {}
     for name, one in passes.items():
         files: dict[str, Any] = {
-            key: _present(owner, ("passes", name, key), folder, value) for key, value in one.files.items()
+            key: str(owner.file_at(("passes", name, key), value, folder, "a CSV file"))
+            for key, value in one.files.items()
         }
         if isinstance(one.platform, PlatformFilesSpec):
             others = {
@@ -176,29 +157,14 @@ def _placed(owner: Spec, passes: Mapping[str, PassFilesSpec], folder: Path) -> F
             }
             for key, value in others.items():
                 if value is not None:
-                    _present(owner, ("passes", name, "platform", *key), folder, value, "a file")
+                    owner.file_at(("passes", name, "platform", *key), value, folder, "a file")
             files["platform"] = with_absolute_files(one.platform, folder)
         found[name] = one.model_copy(update=files)
     return FrozenMap(found)
 
 
-def _present(owner: Spec, key: tuple[str, ...], folder: Path, value: str, what: str = "a CSV file") -> str:
-    """The absolute path of a file. InputError, at the key of the owner, where it is not there."""
-    place = folder / value
-    wrong = no_file(place)
-    if wrong is not None and wrong != MISSING:
-        raise owner.error(wrong, key, found=value, allowed=f"{what}, its path relative to this one")
-    if wrong is not None:
-        beside = [place.with_name(other.name) for other in _beside(place)]
-        meant = nearest(str(place), [str(other) for other in beside])
-        told = None if meant is None else str(Path(value).with_name(Path(meant).name))
-        allowed = f"{what}, its path relative to this one"
-        raise owner.error(MISSING, key, found=value, allowed=allowed, suggestion=told)
-    return str(place.absolute())
-
-
-def _with_quaternions_said(owner: Spec, data: OrbitDataSpec) -> OrbitDataSpec:
-    """The same. InputError where a table of an attitude is not said how to be read."""
+def _with_quaternions_said(owner: Spec, data: orbit_data.OrbitDataSpec) -> orbit_data.OrbitDataSpec:
+    """Return the data. InputError where nothing says how a table of an attitude is to be read."""
     tables = any(not isinstance(one.platform, PlatformFilesSpec) for one in data.passes.values())
     for key in ("quaternion", "body_axes"):
         if tables and getattr(data.conventions, key) is None:
@@ -207,26 +173,12 @@ def _with_quaternions_said(owner: Spec, data: OrbitDataSpec) -> OrbitDataSpec:
     return data
 
 
-def _beside(place: Path) -> list[Path]:
-    """Files in the same folder."""
-    try:
-        return sorted(other for other in place.parent.iterdir() if other.is_file())
-    except (OSError, ValueError):
-        return []
-
-
-class CheckSetup(ExperimentSetup[OrbitCheckSpec]):
+class CheckSetup(_FixedSetup[orbit_data.OrbitCheckSpec]):
     """A check of a pass in files with its camera.
 
     Attributes:
         camera: the payload.
     """
-
-    camera: ThreeLineCameraSpec
-
-    def with_seed(self, seed: int) -> CheckSetup:
-        """The same: nothing is drawn."""
-        return self
 
 
 def resolve_check(path: str | Path) -> CheckSetup:
@@ -239,23 +191,16 @@ def resolve_check(path: str | Path) -> CheckSetup:
     setup = read_setup(CheckSetup, path)
     if setup is not None:
         return setup
-    test = load_orbit_test(OrbitCheckSpec, path)
-    camera = load_three_line_camera(find_payload(test))
-    return CheckSetup.model_construct(test=with_absolute_files(test), camera=camera)
+    test = load_named(orbit_data.OrbitCheckSpec, ORBIT, path)
+    return CheckSetup.model_construct(test=with_absolute_files(test), camera=load_payload(test))
 
 
-class MatchSetup(ExperimentSetup[OrbitMatchSpec]):
+class MatchSetup(_FixedSetup[orbit_data.OrbitMatchSpec]):
     """Points in a user's images with the camera.
 
     Attributes:
         camera: the payload.
     """
-
-    camera: ThreeLineCameraSpec
-
-    def with_seed(self, seed: int) -> MatchSetup:
-        """The same: nothing is drawn."""
-        return self
 
 
 def resolve_match(path: str | Path) -> MatchSetup:
@@ -267,11 +212,9 @@ def resolve_match(path: str | Path) -> MatchSetup:
     """
     setup = read_setup(MatchSetup, path)
     if setup is None:
-        test = load_orbit_test(OrbitMatchSpec, path)
-        camera = load_three_line_camera(find_payload(test))
-        setup = MatchSetup.model_construct(test=with_absolute_files(test), camera=camera)
+        test = load_named(orbit_data.OrbitMatchSpec, ORBIT, path)
+        setup = MatchSetup.model_construct(test=with_absolute_files(test), camera=load_payload(test))
     for name in setup.test.images:
         if name not in setup.camera.lines:
-            allowed, meant = names_text(setup.camera.lines), nearest(name, setup.camera.lines)
-            raise setup.test.error("no such line", ("images", name), found=name, allowed=allowed, suggestion=meant)
+            raise setup.test.error(unknown("no such line", name, setup.camera.lines), ("images", name))
     return setup

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -11,7 +11,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.flight import EarthSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Reference, Spec, Text
+from scenes.yaml.spec import Reference, Spec, SpecType, Text, Whole
 from scenes.yaml.units import ANGLE, LENGTH, TIME
 
 Toward = Literal["forward", "back", "right", "left", "up", "down"]
@@ -140,7 +140,23 @@ class PlatformFilesSpec(Spec):
         return self
 
 
-class GroundFileSpec(Spec):
+class _HeightsFileSpec(Spec):
+    """A file with heights, and what they are above."""
+
+    file: Reference
+    crs: Text | None = None
+    heights: Literal["ellipsoid", "geoid"] | None = None
+    geoid: Reference | None = None
+
+    @model_validator(mode="after")
+    def _has_its_geoid(self) -> Self:
+        if (self.heights == "geoid") != (self.geoid is not None):
+            allowed = "heights: geoid with geoid: FILE, or heights: ellipsoid"
+            raise Problem("heights and geoid do not fit", None, allowed, within=("heights",))
+        return self
+
+
+class GroundFileSpec(_HeightsFileSpec):
     """Ground points in a file: CSV, GeoJSON or .gcp of the Ames Stereo Pipeline.
 
     Attributes:
@@ -153,22 +169,11 @@ class GroundFileSpec(Spec):
         sigma_axes: of the three sigmas of a .gcp: Earth-fixed x, y, z as that program takes them, or east, north, up.
     """
 
-    file: Reference
-    crs: Text | None = None
-    heights: Literal["ellipsoid", "geoid"] | None = None
-    geoid: Reference | None = None
     sigma: tuple[PointSigma, PointSigma] | None = None
     sigma_axes: Literal["xyz", "enu"] = "xyz"
 
-    @model_validator(mode="after")
-    def _has_its_geoid(self) -> "GroundFileSpec":
-        if (self.heights == "geoid") != (self.geoid is not None):
-            allowed = "heights: geoid with geoid: FILE, or heights: ellipsoid"
-            raise Problem("heights and geoid do not fit", None, allowed, within=("heights",))
-        return self
 
-
-class RasterFileSpec(Spec):
+class RasterFileSpec(_HeightsFileSpec):
     """An orthophoto or an elevation model as GeoTIFF.
 
     Attributes:
@@ -179,27 +184,15 @@ class RasterFileSpec(Spec):
         band: of the file that is read, counted from 1.
     """
 
-    file: Reference
-    crs: Text | None = None
-    heights: Literal["ellipsoid", "geoid"] | None = None
-    geoid: Reference | None = None
-    band: Annotated[int, Field(strict=True, ge=1, le=1000)] = 1
-
-    @model_validator(mode="after")
-    def _has_its_geoid(self) -> "RasterFileSpec":
-        if (self.heights == "geoid") != (self.geoid is not None):
-            allowed = "heights: geoid with geoid: FILE, or heights: ellipsoid"
-            raise Problem("heights and geoid do not fit", None, allowed, within=("heights",))
-        return self
+    band: Annotated[Whole, Field(ge=1, le=1000)] = 1
 
 
 FILE_KEYS = ("file", "geoid", "earth_orientation")
 """Keys that name files of measurements."""
-SpecType = TypeVar("SpecType", bound=Spec)
 
 
 def with_absolute_files(spec: SpecType, folder: Path | None = None) -> SpecType:
-    """The same with the paths of all its files of measurements absolute.
+    """Make the paths of all files of measurements that a specification names absolute.
 
     Args:
         spec: as it was read.

@@ -1,21 +1,21 @@
 """The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
-from scenes.yaml.spec import Name, Named, Number, Paths, Reference, Seed, Spec, Text, Whole
-from scenes.yaml.units import DISTANCE, LENGTH, MOMENT, format_quantity
+from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
+from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
 LINES = ("forward", "nadir", "aft")
-"""Of a three-line camera."""
+"""Lines of a three-line camera."""
 THREE_LINE_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
-"""Its angles: name -> the two lines that it lies between."""
+"""Angles of a three-line camera: name -> the two lines that it lies between."""
 LEAST_POINTS = 3
 
 Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
@@ -23,18 +23,12 @@ GroundSigma = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 km")]
 DatumShift = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, largest="1 km"))]
 TerrainHeight = Annotated[float, Quantity(LENGTH, smallest="-500 m", largest="9 km")]
 Relief = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="2 km")]
-ReliefLength = Annotated[float, Quantity(DISTANCE, smallest="10 m", largest="1000 km")]
 Points = Annotated[Whole, Field(le=2000)]
 Passes = Annotated[Whole, Field(ge=2, le=5000)]
-Flag = Annotated[bool, Field(strict=True)]
 
 
-def _turn(value: Any) -> Any:
-    """`[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
-    return {"rotate": value} if isinstance(value, list) else value
-
-
-Change = Annotated[PlainPerturbationSpec, BeforeValidator(_turn)]
+Change = Annotated[PlainPerturbationSpec, short_for("rotate", list)]
+"""A perturbation; `[1 arcsec, 4 arcsec, -3 arcsec]` means a rotation."""
 
 
 def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[str, str]] | None:
@@ -55,6 +49,12 @@ def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
     if set(LINES) <= set(lines):
         return THREE_LINE_ANGLES
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
+
+
+def check_ends(first: float, last: float, problem: str) -> None:
+    """Refuse a piece of a line, from one pixel to another, that has no length."""
+    if not first < last:
+        raise Problem(problem, f"first {first:g}, last {last:g}", "a last pixel after the first", within=("last",))
 
 
 class StripsSpec(Spec):
@@ -80,9 +80,7 @@ class StripsSpec(Spec):
             allowed = f"{LEAST_POINTS} or more; paper 000 asks for n >= {LEAST_POINTS}"
             problem = "too few points to fit a plane"
             raise Problem(problem, found, allowed, within=("points",))
-        if not self.first < self.last:
-            found = f"first {self.first:g}, last {self.last:g}"
-            raise Problem("the strip has no length", found, "a last pixel after the first", within=("last",))
+        check_ends(self.first, self.last, "the strip has no length")
         return self
 
 
@@ -97,10 +95,26 @@ class TerrainSpec(Spec):
 
     height: TerrainHeight = 0.0
     relief: Relief = 0.0
-    length: ReliefLength = 5e3
+    length: Annotated[float, Quantity(DISTANCE, smallest="10 m", largest="1000 km")] = 5e3
 
 
-class EffectsSpec(Spec):
+class LightEffectsSpec(Spec):
+    """What happens to the light between ground and camera.
+
+    Attributes:
+        light_time: the Earth turns while the light is under way.
+        aberration: the satellite's velocity tilts what it sees.
+        refraction: the standard atmosphere bends the light.
+        wavelength: in vacuum, for the refraction, metres.
+    """
+
+    light_time: Flag = True
+    aberration: Flag = True
+    refraction: Flag = True
+    wavelength: Wavelength = 650e-9
+
+
+class EffectsSpec(LightEffectsSpec):
     """What happens to the light between ground and camera.
 
     Attributes:
@@ -111,10 +125,6 @@ class EffectsSpec(Spec):
         corrected: the analysis takes the effects that are on out of the ground points, by its models of them.
     """
 
-    light_time: Flag = True
-    aberration: Flag = True
-    refraction: Flag = True
-    wavelength: Wavelength = 650e-9
     corrected: Flag = True
 
 
@@ -133,7 +143,7 @@ class AngleErrorsSpec(Spec):
     datum: DatumShift = (0.0, 0.0, 0.0)
 
 
-class OrbitAngleSpec(Spec):
+class OrbitAngleSpec(TitledSpec):
     """The intersection angles of a camera of two or more lines from one moment's ground points.
 
     Attributes:
@@ -157,8 +167,6 @@ class OrbitAngleSpec(Spec):
         seed: of every random number.
     """
 
-    name: Name
-    description: Text = ""
     camera: Reference
     angles: Angles = None
     changes: Paths[Change] = Field(default_factory=dict, validate_default=True)
@@ -175,9 +183,6 @@ class OrbitAngleSpec(Spec):
 
     @model_validator(mode="after")
     def _is_in_the_orbit(self) -> "OrbitAngleSpec":
-        first, last = -self.orbit.before, self.orbit.after
-        if not first < self.time < last:
-            allowed = f"between {format_quantity(first, MOMENT)} and {format_quantity(last, MOMENT)}, or a longer orbit"
-            found = format_quantity(self.time, MOMENT)
-            raise Problem("outside the orbit data", found, allowed, within=("time",))
+        if wrong := self.orbit.misses(self.time):
+            raise wrong.below("time")
         return self

@@ -5,21 +5,16 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, Flag, GroundSigma, Relief, TerrainHeight
-from scenes.specs.orbit.flight import AngleSigmas, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
+from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma, Relief, TerrainHeight, check_ends
+from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
-from scenes.yaml.errors import Problem, names_text, nearest
-from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.errors import Problem, names_text, unknown
+from scenes.yaml.quantity import AngleSigmas, LengthSigma, Quantity, Vector
+from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty, one_given
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, TIME
 
 LEAST_TIES = 20
 """Tie points of a strip. Fewer leave most readings of the attitude without a point near them."""
-
-FocalSigma = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="5 mm")]
-ReadingFocal = Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
-ReadingAngles = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
-StripLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="1000 km")]
 
 
 class CameraDriftSpec(Spec):
@@ -31,7 +26,7 @@ class CameraDriftSpec(Spec):
     """
 
     angles: AngleSigmas = (0.0, 0.0, 0.0)
-    focal_length: FocalSigma = 0.0
+    focal_length: LengthSigma = 0.0
 
 
 class MonitorReadingSpec(Spec):
@@ -42,8 +37,8 @@ class MonitorReadingSpec(Spec):
         focal_length: of d_f, metres.
     """
 
-    angles: ReadingAngles
-    focal_length: ReadingFocal
+    angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
+    focal_length: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
 
 
 class StripSpec(Spec):
@@ -55,7 +50,7 @@ class StripSpec(Spec):
     """
 
     ties: Annotated[Whole, Field(le=5000)] = 500
-    length: StripLength = 300e3
+    length: Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="1000 km")] = 300e3
 
     @model_validator(mode="after")
     def _are_enough(self) -> "StripSpec":
@@ -67,7 +62,7 @@ class StripSpec(Spec):
 def _of_lines(drift: Named[CameraDriftSpec]) -> Named[CameraDriftSpec]:
     for name in drift:
         if name not in LINES:
-            raise Problem("no such line", name, names_text(LINES), nearest(name, LINES), within=(name,))
+            raise unknown("no such line", name, LINES, (name,))
     return drift
 
 
@@ -81,12 +76,7 @@ points one wrong one cannot be told."""
 LEAST_PATCHES = 2
 """Patches of a field. One has no width, and the principal distance is open."""
 
-InteriorChange = Annotated[float, Quantity(LENGTH, largest="5 mm")]
-PointChange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)]
-FieldAltitude = Annotated[float, Quantity(DISTANCE, smallest="150 km", largest="2000 km")]
 FieldLength = Annotated[float, Quantity(DISTANCE, smallest="1 km", largest="500 km")]
-FieldSpan = Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")]
-TrackPlace = Annotated[float, Quantity(DISTANCE, largest="200 km")]
 Side = Annotated[Whole, Field(ge=16, le=20_000)]
 LineTime = Annotated[float, Quantity(TIME, above_zero=True, largest="1 s")]
 Count = Annotated[Whole, Field(le=5000)]
@@ -101,8 +91,8 @@ class InteriorChangeSpec(Spec):
         principal_point: change of x (flight) and y (along the line), metres.
     """
 
-    focal_length: InteriorChange = 0.0
-    principal_point: PointChange = (0.0, 0.0)
+    focal_length: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
+    principal_point: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)] = (0.0, 0.0)
 
 
 class FieldSpec(Spec):
@@ -143,9 +133,7 @@ class PointsSpec(Spec):
         if self.control < LEAST_POINTS:
             found = f"{self.control} control points"
             raise Problem("too few points to calibrate", found, f"{LEAST_POINTS} or more", within=("control",))
-        if not self.first < self.last:
-            found = f"first {self.first:g}, last {self.last:g}"
-            raise Problem("the field has no width", found, "a last pixel after the first", within=("last",))
+        check_ends(self.first, self.last, "the field has no width")
         return self
 
 
@@ -158,7 +146,7 @@ class PatchPlaceSpec(Spec):
     """
 
     pixel: Number
-    track: TrackPlace = 0.0
+    track: Annotated[float, Quantity(DISTANCE, largest="200 km")] = 0.0
 
 
 class CalibrationImagesSpec(Spec):
@@ -244,12 +232,6 @@ class MapLimitsSpec(Spec):
     height: Annotated[float, Quantity(LENGTH, above_zero=True, largest="1 km")] = 6.0
 
 
-def _some_fields(fields: Named[FieldSpec]) -> Named[FieldSpec]:
-    if not fields:
-        raise Problem("no fields", "an empty mapping", "at least one test field")
-    return fields
-
-
 def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, object]) -> None:
     """Raises Problem unless there are schemes, and each names some of the fields once."""
     if not schemes:
@@ -257,14 +239,13 @@ def checked_schemes(schemes: Sequence[Sequence[str]], fields: Mapping[str, objec
     for scheme in schemes:
         for name in scheme:
             if name not in fields:
-                hint = nearest(name, fields)
-                raise Problem("no such field", name, names_text(tuple(fields)), hint, within=("schemes",))
+                raise unknown("no such field", name, fields, ("schemes",))
         if not scheme or len(set(scheme)) != len(scheme):
             found = names_text(scheme) or "none"
             raise Problem("a scheme without fields, or with one twice", found, "each once", within=("schemes",))
 
 
-class OrbitCalibrationSpec(Spec):
+class OrbitCalibrationSpec(TitledSpec):
     """A calibration over several fields, tested on all of them without ground control.
 
     Attributes:
@@ -294,16 +275,14 @@ class OrbitCalibrationSpec(Spec):
         seed: of every random number.
     """
 
-    name: Name
-    description: Text = ""
     camera: Reference
     changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
-    altitude: FieldAltitude = 500e3
-    span: FieldSpan = 60.0
+    altitude: Altitude = 500e3
+    span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0
     line_time: LineTime = 0.7e-3
     attitude: AttitudeSpec = AttitudeSpec(steering="yaw")
-    fields: Annotated[Named[FieldSpec], AfterValidator(_some_fields)]
+    fields: Annotated[Named[FieldSpec], not_empty("no fields", "at least one test field")]
     schemes: tuple[tuple[Name, ...], ...]
     points: PointsSpec | None = None
     images: CalibrationImagesSpec | None = None
@@ -319,10 +298,8 @@ class OrbitCalibrationSpec(Spec):
 
     @model_validator(mode="after")
     def _has_points(self) -> "OrbitCalibrationSpec":
-        if (self.points is None) == (self.images is None):
-            found = "neither" if self.points is None else "both"
-            problem = "points are drawn or measured in images"
-            raise Problem(problem, found, "`points:` or `images:`", within=("points",))
+        problem = "points are drawn or measured in images"
+        one_given(self, ("points", "images"), problem, "`points:` or `images:`", ("points",))
         if self.images is not None and self.repeats:
             problem = "campaigns from images are not repeated, for each is rendered anew"
             raise Problem(problem, str(self.repeats), "0", within=("repeats",))

@@ -11,8 +11,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, WithJsonSchema, model_validator
 
 from scenes.yaml.errors import Problem, shown
-from scenes.yaml.quantity import Quantity, Vector
-from scenes.yaml.spec import Name, Number, Reference, Spec, Text
+from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
+from scenes.yaml.spec import Number, Reference, Spec, TitledSpec, one_given
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, SPEED, TIME, format_quantity
 
 FIRST_YEAR, LAST_YEAR = 1972, 2099
@@ -22,7 +22,8 @@ PATTERN = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}(:[0-9]{2}(\.[0-9]{1,6}
 
 
 def parse_utc(text: Any) -> str:
-    """The same text, checked; a value that is written another way than the pattern is refused, also a leap second.
+    """Check the text of an instant; a value that is written another way than the pattern is refused, also a leap
+    second.
 
     Raises:
         Problem: no text, another form, without its zone, or no such instant.
@@ -58,14 +59,8 @@ Longitude = Annotated[float, Quantity(ANGLE, largest="360 deg")]
 Inclination = Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="180 deg")]
 Altitude = Annotated[float, Quantity(DISTANCE, smallest="150 km", largest="2000 km")]
 Span = Annotated[float, Quantity(MOMENT, smallest="0 s", largest="240 h")]
-DayTime = Annotated[float, Quantity(MOMENT, smallest="0 h", largest="24 h")]
 Interval = Annotated[float, Quantity(TIME, above_zero=True, largest="1000 s")]
-Duration = Annotated[float, Quantity(MOMENT, above_zero=True, largest="240 h")]
-TimeDifference = Annotated[float, Quantity(TIME, largest="0.9 s")]
-PolarMotion = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="2 arcsec"), 2)]
-Offset = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="60 deg"))]
 AngleErrors = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="1 deg"))]
-AngleSigmas = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, smallest="0 arcsec", largest="1 deg"))]
 LengthSigmas = Annotated[tuple[float, float, float], Vector(Quantity(LENGTH, smallest="0 m", largest="10 km"))]
 SpeedSigmas = Annotated[tuple[float, float, float], Vector(Quantity(SPEED, smallest="0 m/s", largest="100 m/s"))]
 Position = Annotated[tuple[float, float, float], Vector(Quantity(DISTANCE, largest="100000 km"))]
@@ -82,8 +77,8 @@ class EarthSpec(Spec):
         polar_motion: x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
     """
 
-    ut1_utc: TimeDifference = 0.0
-    polar_motion: PolarMotion = (0.0, 0.0)
+    ut1_utc: Annotated[float, Quantity(TIME, largest="0.9 s")] = 0.0
+    polar_motion: Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="2 arcsec"), 2)] = (0.0, 0.0)
 
 
 class PassingSpec(Spec):
@@ -120,7 +115,7 @@ class ElementsSpec(Spec):
     eccentricity: Number = 0.0
     inclination: Inclination | None = None
     node: Longitude | None = None
-    node_local_time: DayTime | None = None
+    node_local_time: Annotated[float, Quantity(MOMENT, smallest="0 h", largest="24 h")] | None = None
     perigee: Longitude = 0.0
     argument: Longitude
 
@@ -166,14 +161,20 @@ class OrbitSpec(Spec):
 
     @model_validator(mode="after")
     def _is_one_orbit(self) -> "OrbitSpec":
-        given = [name for name in ("passing", "elements", "state") if getattr(self, name) is not None]
-        if len(given) != 1:
-            found = " and ".join(given) or "none of them"
-            raise Problem("the orbit is not given once", found, "one of passing, elements, state")
+        names = ("passing", "elements", "state")
+        one_given(self, names, "the orbit is not given once", "one of passing, elements, state")
         if self.before + self.after == 0.0:
             found = f"before and after are {format_quantity(0.0, MOMENT)}"
             raise Problem("the orbit has no length", found, "a time before or after the epoch", within=("after",))
         return self
+
+    def misses(self, time: float) -> Problem | None:
+        """What is wrong with a moment, seconds from the epoch, that lies outside the orbit; None within it."""
+        first, last = (format_quantity(end, MOMENT) for end in (-self.before, self.after))
+        if -self.before < time < self.after:
+            return None
+        allowed = f"between {first} and {last}, or a longer orbit"
+        return Problem("outside the orbit data", format_quantity(time, MOMENT), allowed)
 
 
 class AttitudeSpec(Spec):
@@ -188,7 +189,7 @@ class AttitudeSpec(Spec):
 
     nadir: Literal["geodetic", "geocentric"] = "geodetic"
     steering: Literal["none", "yaw"] = "none"
-    offset: Offset = _ZERO
+    offset: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="60 deg"))] = _ZERO
 
 
 class GpsErrorsSpec(Spec):
@@ -205,7 +206,7 @@ class GpsErrorsSpec(Spec):
     interval: Interval = 1.0
     noise: LengthSigmas = _ZERO
     drift: LengthSigmas = _ZERO
-    correlation_time: Duration = 1800.0
+    correlation_time: Annotated[float, Quantity(MOMENT, above_zero=True, largest="240 h")] = 1800.0
     velocity: SpeedSigmas = _ZERO
 
 
@@ -269,7 +270,7 @@ class ErrorsSpec(Spec):
     star_tracker: StarTrackerErrorsSpec = StarTrackerErrorsSpec()
 
 
-class PayloadTestSpec(Spec):
+class PayloadTestSpec(TitledSpec):
     """A test of a payload.
 
     Attributes:
@@ -278,6 +279,4 @@ class PayloadTestSpec(Spec):
         camera: name in scenes/library/payloads or path of a file.
     """
 
-    name: Name
-    description: Text = ""
     camera: Reference

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment
+from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.job import (
     AnalysisSpec,
@@ -22,12 +22,12 @@ from scenes.specs.job import (
     check_nodes,
     perturbation_issues,
 )
-from scenes.specs.orbit.angle import Flag, Relief, TerrainHeight
+from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.calibration import Count, FieldLength, LineTime
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, Text, Whole
+from scenes.yaml.spec import Flag, Name, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole
 from scenes.yaml.units import MOMENT
 
 _EVEN = 1e-6
@@ -76,7 +76,7 @@ class MotionSpec(Spec):
         return self
 
     def share(self, time: float) -> float:
-        """Of `rotate` and `shift`, at a time in seconds."""
+        """Share of `rotate` and `shift` that is there at a time in seconds."""
         passed = time - self.begin
         if self.period is not None:
             return math.sin(2.0 * math.pi * passed / self.period)
@@ -111,9 +111,7 @@ class GroundSpec(Spec):
 
     @model_validator(mode="after")
     def _has_width(self) -> "GroundSpec":
-        if not self.first < self.last:
-            found = f"first {self.first:g}, last {self.last:g}"
-            raise Problem("the strip has no width", found, "a last pixel after the first", within=("last",))
+        check_ends(self.first, self.last, "the strip has no width")
         return self
 
 
@@ -133,7 +131,7 @@ class MonitorErrorsSpec(ErrorsSpec):
     switched_on: Flag = True
 
 
-class OrbitMonitorSpec(Spec):
+class OrbitMonitorSpec(TitledSpec):
     """Height errors along an orbit with and without on-board monitoring.
 
     Attributes:
@@ -165,8 +163,6 @@ class OrbitMonitorSpec(Spec):
         seed: of every random number.
     """
 
-    name: Name
-    description: Text = ""
     instrument: Reference
     cameras: tuple[Name, ...] | None = None
     perturb: Paths[PlainPerturbationSpec] = Field(default_factory=FrozenMap)
@@ -202,20 +198,11 @@ class OrbitMonitorSpec(Spec):
                 raise Problem(
                     "the times are not evenly spaced", found, "equal steps", within=("course", "times", k + 1)
                 )
-        first, last = -self.orbit.before, self.orbit.after
         for k, time in enumerate(times):
-            if not first < time < last:
-                allowed = f"between {moment(first)} and {moment(last)}, or a longer orbit"
-                raise Problem("outside the orbit data", moment(time), allowed, within=("course", "times", k))
+            if wrong := self.orbit.misses(time):
+                raise wrong.below("course", "times", k)
         if self.reference not in times:
-            near = min(times, key=lambda time: abs(time - self.reference))
-            raise Problem(
-                "not one of the course's times",
-                moment(self.reference),
-                "one of course.times",
-                moment(near),
-                ("reference",),
-            )
+            raise no_such_time(self.reference, times, "one of course.times").below("reference")
         self._check_interval(self.interval, ("interval",))
         for k, interval in enumerate(self.intervals or ()):
             self._check_interval(interval, ("intervals", k))
@@ -272,9 +259,7 @@ class OrbitMonitorSpec(Spec):
             render=frames,
             analysis=self.analysis,
         )
-        moved = job.with_source(self.source)
-        assert isinstance(moved, JobSpec)
-        return moved
+        return job.with_source(self.source)
 
     def check_nodes(self, nodes: Mapping[str, NodeInfo]) -> None:
         """InputError unless every node exists and allows what is done to it."""

@@ -9,8 +9,9 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from optics.geometry.polygon import area, hull, intersect, sides
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import Diffusion, Spectrum, TdiSpec
+from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
 from scenes.yaml.errors import Problem
-from scenes.yaml.quantity import Quantity, Vector, Wavelength
+from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Number, Reference, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
@@ -26,15 +27,9 @@ def _is_even(term: str) -> str:
 
 EvenTerm = Annotated[str, AfterValidator(_is_even), WithJsonSchema({"type": "string", "enum": list(_EVEN_TERMS)})]
 TermSize = Annotated[float, Quantity(LENGTH, largest="1 um")]
-SceneHeight = Annotated[float, Quantity(LENGTH, smallest="-500 m", largest="9 km")]
-SceneRelief = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="3 km")]
 Spacing = Annotated[float, Quantity(LENGTH, smallest="0.1 m", largest="1 km")]
 GroundLength = Annotated[float, Quantity(LENGTH, smallest="1 m", largest="100 km")]
-GroundError = Annotated[float, Quantity(LENGTH, smallest="0 m", largest="1 km")]
-Shift2 = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="1 km"), 2)]
 Share = Annotated[Number, Field(ge=0.0, le=1.0)]
-Flag = Annotated[bool, Field(strict=True)]
-Azimuth = Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="360 deg")]
 Elevation = Annotated[float, Quantity(ANGLE, smallest="5 deg", largest="90 deg")]
 
 
@@ -120,8 +115,8 @@ class TerrainSpec(Spec):
     """
 
     kind: Literal["real", "fractal"] = "real"
-    height: SceneHeight = 500.0
-    relief: SceneRelief | None = None
+    height: TerrainHeight = 500.0
+    relief: Annotated[float, Quantity(LENGTH, smallest="0 m", largest="3 km")] | None = None
     exponent: Annotated[Number, Field(ge=1.0, le=4.0)] = 2.2
     post: Spacing = 30.0
     longest: GroundLength = 6000.0
@@ -168,26 +163,10 @@ class LightSpec(Spec):
     """
 
     elevation: Elevation = math.radians(50.0)
-    azimuth: Azimuth = math.radians(145.0)
+    azimuth: Annotated[float, Quantity(ANGLE, smallest="0 deg", largest="360 deg")] = math.radians(145.0)
     transmission: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.7
     sky: Share = 0.15
     path: Annotated[Number, Field(ge=0.0, le=0.5)] = 0.04
-
-
-class LightEffectsSpec(Spec):
-    """What happens to the light between ground and camera.
-
-    Attributes:
-        light_time: the Earth turns while the light is under way.
-        aberration: the satellite's velocity tilts what it sees.
-        refraction: the standard atmosphere bends the light.
-        wavelength: in vacuum, for the refraction, metres.
-    """
-
-    light_time: Flag = True
-    aberration: Flag = True
-    refraction: Flag = True
-    wavelength: Wavelength = 650e-9
 
 
 class GroundSpec(Spec):
@@ -214,7 +193,7 @@ class DemSpec(Spec):
     """
 
     post: Spacing = 25.0
-    sigma: GroundError = 2.0
+    sigma: GroundSigma = 2.0
     correlation: GroundLength = 200.0
 
 
@@ -238,8 +217,8 @@ class ControlSpec(Spec):
     noise: Annotated[Number, Field(ge=0.0, le=0.2)] = 0.004
     changed: Share = 0.15
     light: LightSpec = LightSpec.model_validate({"elevation": "60 deg", "azimuth": "160 deg"})
-    shift: Shift2 = (0.0, 0.0)
-    sigma: GroundError = 0.5
+    shift: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="1 km"), 2)] = (0.0, 0.0)
+    sigma: GroundSigma = 0.5
     correlation: GroundLength = 5000.0
     dem: DemSpec = DemSpec()
 
@@ -278,7 +257,7 @@ class ImagePointsSpec(Spec):
     template: Annotated[Whole, Field(ge=LEAST_TEMPLATE, le=101), AfterValidator(_is_odd)] = 31
     least_correlation: Annotated[Number, Field(gt=0.0, lt=1.0)] = 0.6
     largest_sigma: Annotated[Number, Field(gt=0.0, le=2.0)] = 0.2
-    height_sigma: GroundError = 2.0
+    height_sigma: GroundSigma = 2.0
     roughness: Annotated[Number, Field(ge=0.0, le=10.0)] = 0.15
     false_alarm: Annotated[Number, Field(gt=0.0, lt=0.5)] = 1e-3
 

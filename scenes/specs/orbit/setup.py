@@ -8,26 +8,12 @@ from pathlib import Path
 from pydantic import Field
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs import load
 from scenes.specs.camera import CameraSpec
 from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import (
-    INSTRUMENTS,
-    ORBIT,
-    PAYLOADS,
-    SpecType,
-    find_detector,
-    find_named,
-    library_names,
-    load_camera,
-    load_detector,
-    load_instrument,
-    load_named,
-    paths_of_cameras,
-    place_of,
-)
 from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.flight import PayloadTestSpec
@@ -36,48 +22,44 @@ from scenes.specs.orbit.scene import LineImageSpec
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
-from scenes.yaml.errors import KeyPath, names_text, nearest
+from scenes.yaml.errors import KeyPath, names_text, unknown
 from scenes.yaml.spec import Paths, Spec
-from scenes.yaml.units import ANGLE, MOMENT, format_quantity
+from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
 
 
-def load_orbit_test(model: type[SpecType], name_or_path: str | Path) -> SpecType:
-    """Read a test in orbit of that sort; arguments and errors as `load_instrument`."""
-    return load_named(model, ORBIT, name_or_path, None)
-
-
-def load_three_line_camera(name_or_path: str | Path, relative_to: str | Path | None = None) -> ThreeLineCameraSpec:
+def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
     """Read a three-line payload; arguments and errors as `load_instrument`."""
-    return load_named(ThreeLineCameraSpec, PAYLOADS, name_or_path, relative_to)
+    return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
 
 
-def find_payload(test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | PayloadTestSpec) -> Path:
-    """The file of the payload of a test in orbit. Raises InputError if there is none."""
-    return find_named(PAYLOADS, test.camera, test, ("camera",))
+def load_payload(
+    test: OrbitAngleSpec | OrbitCalibrationSpec | OrbitSimulateSpec | PayloadTestSpec,
+) -> ThreeLineCameraSpec:
+    """The payload of a test in orbit. Raises InputError if there is none, or it is not valid."""
+    return load_three_line_camera(load.find_named(load.PAYLOADS, test.camera, test, ("camera",)))
 
 
-def find_orbit_camera(test: OrbitAngleSpec) -> Path:
+def _find_orbit_camera(test: OrbitAngleSpec) -> Path:
     """The file of the payload or instrument of a test in orbit. Raises InputError if there is none."""
     reference, file = test.camera, test.source.file
-    for folder in (PAYLOADS, INSTRUMENTS):
-        if place_of(folder, reference, Path(file).parent if file else Path()) is not None:
-            return find_named(folder, reference, test, ("camera",))
-    payloads, instruments = library_names(PAYLOADS), library_names(INSTRUMENTS)
+    for folder in (load.PAYLOADS, load.INSTRUMENTS):
+        if load.place_of(folder, reference, Path(file).parent if file else Path()) is not None:
+            return load.find_named(folder, reference, test, ("camera",))
+    payloads, instruments = load.library_names(load.PAYLOADS), load.library_names(load.INSTRUMENTS)
     allowed = f"{names_text(payloads)}, an instrument ({names_text(instruments)}), or the path of a .yaml file"
-    meant = nearest(reference, (*payloads, *instruments))
     problem = "no such name in payloads or instruments"
-    raise test.error(problem, ("camera",), found=reference, allowed=allowed, suggestion=meant)
+    raise test.error(unknown(problem, reference, (*payloads, *instruments), allowed=allowed), ("camera",))
 
 
-def load_line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
+def _line_detectors(camera: ThreeLineCameraSpec) -> dict[str, DetectorSpec]:
     """Data sheets of a payload's line CCDs, by the name that the image sections give. Raises InputError as
     `load_instrument`.
     """
     sections: list[tuple[KeyPath, LineImageSpec | None]] = [(("image",), camera.image)]
     sections += [(("lines", name, "image"), line.image) for name, line in camera.lines.items()]
     return {
-        image.detector: load_detector(find_detector(image.detector, camera, (*key, "detector")))
+        image.detector: load.load_detector(load.find_named(load.DETECTORS, image.detector, camera, (*key, "detector")))
         for key, image in sections
         if image is not None
     }
@@ -106,12 +88,12 @@ class AngleSetup(ExperimentSetup[OrbitAngleSpec]):
 
     @property
     def usual_pixels(self) -> int:
-        """Of the line in whose pixels the test gives places."""
+        """Number of pixels of the line in whose pixels the test gives places."""
         return self.camera.pixels if self.camera is not None else next(iter(self.pixels.values()))
 
     @property
     def camera_name(self) -> str:
-        """Of the payload or instrument."""
+        """Name of the payload or instrument."""
         return (self.camera or self.instrument).name  # type: ignore[union-attr]
 
     @property
@@ -128,8 +110,8 @@ def resolve_angle(path: str | Path) -> AngleSetup:
     """
     setup = read_setup(AngleSetup, path)
     if setup is None:
-        test = load_orbit_test(OrbitAngleSpec, path)
-        setup = _with_camera(test, find_orbit_camera(test))
+        test = load.load_named(OrbitAngleSpec, load.ORBIT, path)
+        setup = _with_camera(test, _find_orbit_camera(test))
     if (setup.camera is None) == (setup.instrument is None):
         found = "neither" if setup.camera is None else "both"
         raise setup.error("one camera is tested", ("camera",), found=found, allowed="`camera:` or `instrument:`")
@@ -147,10 +129,9 @@ def _with_camera(test: OrbitAngleSpec, file: Path) -> AngleSetup:
         return AngleSetup.model_construct(
             test=test, camera=load_three_line_camera(file), instrument=None, cameras=FrozenMap()
         )
-    instrument = load_instrument(file)
-    files = paths_of_cameras(instrument)
-    cameras = {mounted.camera: load_camera(files[name]) for name, mounted in instrument.cameras.items()}
-    return AngleSetup.model_construct(test=test, camera=None, instrument=instrument, cameras=FrozenMap(cameras))
+    instrument = load.load_instrument(file)
+    cameras = load.load_cameras(instrument)
+    return AngleSetup.model_construct(test=test, camera=None, instrument=instrument, cameras=cameras)
 
 
 def _checked_angles(setup: AngleSetup) -> AngleSetup:
@@ -167,9 +148,7 @@ def _checked_angles(setup: AngleSetup) -> AngleSetup:
     for name, pair in angles.items():
         for k, line in enumerate(pair):
             if line not in lines:
-                key = ("angles", name, k)
-                meant = nearest(line, lines)
-                raise test.error("no such line", key, found=line, allowed=names_text(lines), suggestion=meant)
+                raise test.error(unknown("no such line", line, lines), ("angles", name, k))
     if setup.camera is not None:
         _require_turns(test, lines)
     ends = (test.strips.first, test.strips.last)
@@ -214,9 +193,9 @@ def resolve_calibration(path: str | Path) -> CalibrationSetup:
     """
     setup = read_setup(CalibrationSetup, path)
     if setup is None:
-        test = load_orbit_test(OrbitCalibrationSpec, path)
-        camera = load_three_line_camera(find_payload(test))
-        detectors = FrozenMap(load_line_detectors(camera)) if test.images is not None else FrozenMap()
+        test = load.load_named(OrbitCalibrationSpec, load.ORBIT, path)
+        camera = load_payload(test)
+        detectors = FrozenMap({} if test.images is None else _line_detectors(camera))
         setup = CalibrationSetup.model_construct(test=test, camera=camera, detectors=detectors)
     _require_calibration(setup.test, setup.camera)
     if setup.test.images is not None:
@@ -266,15 +245,10 @@ def resolve_monitor(path: str | Path) -> MonitorSetup:
     """
     setup = read_setup(MonitorSetup, path)
     if setup is None:
-        test = load_orbit_test(OrbitMonitorSpec, path)
-        job = resolve_job(test.job)
-        setup = MonitorSetup.model_construct(
-            test=test,
-            instrument=job.instrument,
-            cameras=FrozenMap(job.cameras),
-            detector=job.detector,
-            disturbances=job.disturbances,
-        )
+        test = load.load_named(OrbitMonitorSpec, load.ORBIT, path)
+        held = dict(resolve_job(test.job))
+        named = {key: held[key] for key in ("instrument", "cameras", "detector", "disturbances")}
+        setup = MonitorSetup.model_construct(test=test, **named)
     _require_pair(setup.test, setup.instrument, setup.cameras)
     return setup
 
@@ -294,8 +268,7 @@ def _require_pair(test: OrbitMonitorSpec, instrument: InstrumentSpec, cameras: P
     for name in pair:
         if name not in names:
             allowed = f"{names_text(names)}, which have monitors in {instrument.name}"
-            hint = nearest(name, names)
-            raise test.error("no camera with a monitor", ("cameras",), found=name, allowed=allowed, suggestion=hint)
+            raise test.error(unknown("no camera with a monitor", name, names, allowed=allowed), ("cameras",))
     looks = [instrument.cameras[name].look for name in pair]
     if abs(looks[0] - looks[1]) < _LEAST_ANGLE:
         found = " and ".join(format_quantity(look, ANGLE) for look in looks)
@@ -328,9 +301,9 @@ def resolve_simulate(path: str | Path) -> SimulateSetup:
     """
     setup = read_setup(SimulateSetup, path)
     if setup is None:
-        test = load_orbit_test(OrbitSimulateSpec, path)
-        camera = load_three_line_camera(find_payload(test))
-        detectors = FrozenMap(load_line_detectors(camera))
+        test = load.load_named(OrbitSimulateSpec, load.ORBIT, path)
+        camera = load_payload(test)
+        detectors = FrozenMap(_line_detectors(camera))
         setup = SimulateSetup.model_construct(test=test, camera=camera, detectors=detectors)
     _require_images(setup.test, setup.camera)
     _require_detectors(setup, setup.test.lines, setup.camera, setup.detectors)
@@ -344,16 +317,13 @@ def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> Non
     for key, name in [*((("lines",), name) for name in test.lines), *named]:
         if name not in names:
             allowed = f"{names_text(names)}, the lines of {camera.name}"
-            raise test.error("no such line", key, found=name, allowed=allowed, suggestion=nearest(name, names))
+            raise test.error(unknown("no such line", name, names, allowed=allowed), key)
     _require_places(test, test.changes, camera)
     _require_images_of(test, test.lines, camera)
     line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
     _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
-    first, end = -test.orbit.before, test.orbit.after
-    if not first < test.patch.time < end:
-        allowed = f"between {format_quantity(first, MOMENT)} and {format_quantity(end, MOMENT)}, or a longer orbit"
-        found = format_quantity(test.patch.time, MOMENT)
-        raise test.error("outside the orbit data", ("patch", "time"), found=found, allowed=allowed)
+    if wrong := test.orbit.misses(test.patch.time):
+        raise test.error(wrong, ("patch", "time"))
 
 
 def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
@@ -396,9 +366,7 @@ def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = 
     """InputError unless every change is one of a line."""
     for name in changes:
         if name not in lines:
-            raise test.error(
-                "no such line", ("changes", name), allowed=names_text(lines), suggestion=nearest(name, lines)
-            )
+            raise test.error(unknown("no such line", name, lines), ("changes", name))
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:

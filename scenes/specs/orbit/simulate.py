@@ -4,14 +4,12 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from scenes.specs.orbit.angle import Moment
-from scenes.specs.orbit.calibration import InteriorChangeSpec, LineTime
+from scenes.specs.orbit.angle import LightEffectsSpec, Moment
+from scenes.specs.orbit.calibration import InteriorChangeSpec, LineTime, Side
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
-from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec, LightEffectsSpec
+from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text
-from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, Whole
-
-Side = Annotated[Whole, Field(ge=16, le=20_000)]
+from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole
 
 
 def _each_once(lines: tuple[str, ...]) -> tuple[str, ...]:
@@ -37,7 +35,7 @@ class PatchSpec(Spec):
     pixels: Side = 1000
 
 
-class OrbitSimulateSpec(Spec):
+class OrbitSimulateSpec(TitledSpec):
     """A pass over a patch of ground.
 
     Attributes:
@@ -60,8 +58,6 @@ class OrbitSimulateSpec(Spec):
         seed: of every random number.
     """
 
-    name: Name
-    description: Text = ""
     camera: Reference
     lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "aft")
     changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)

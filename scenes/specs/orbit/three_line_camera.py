@@ -7,24 +7,20 @@ distortion) and by how it is mounted on the base.
 
 from typing import Annotated
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
+from scenes.specs.course import Rotation
 from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
-from scenes.yaml.spec import Name, Named, Spec, Text, Whole
+from scenes.yaml.spec import Named, Spec, TitledSpec, Whole, not_empty
 from scenes.yaml.units import ANGLE, LENGTH, Kind
 
 _PER_LENGTH2 = Kind("an inverse length squared", "1/m^2", ("1/m^2", "1/mm^2"), "0.02 1/m^2")
 _PER_LENGTH4 = Kind("an inverse length to the fourth", "1/m^4", ("1/m^4", "1/mm^4"), "1 1/m^4")
-Distortion3 = Annotated[float, Quantity(_PER_LENGTH2, largest="100 1/m^2")]
-Distortion5 = Annotated[float, Quantity(_PER_LENGTH4, largest="1e5 1/m^4")]
-Misalignment = Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="5 deg"))]
 LookCoefficient = Annotated[float, Quantity(ANGLE, largest="60 deg")]
-CcdShift = Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="50 mm"), 2)]
-CcdTurn = Annotated[float, Quantity(ANGLE, largest="1 deg")]
 LookAngles = Annotated[tuple[LookCoefficient, ...], Field(min_length=1, max_length=10)]
 LongestLine = Annotated[Whole, Field(ge=2, le=1_000_000)]
 
@@ -47,8 +43,8 @@ class CcdSpec(Spec):
 
     first: Annotated[Whole, Field(ge=0)]
     last: Annotated[Whole, Field(ge=0)]
-    shift: CcdShift = (0.0, 0.0)
-    rotate: CcdTurn = 0.0
+    shift: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="50 mm"), 2)] = (0.0, 0.0)
+    rotate: Annotated[float, Quantity(ANGLE, largest="1 deg")] = 0.0
     psi_x: LookAngles | None = None
     psi_y: LookAngles | None = None
 
@@ -87,12 +83,12 @@ class LineCameraSpec(Spec):
     """
 
     look: LookAngle
-    rotate: Misalignment = (0.0, 0.0, 0.0)
+    rotate: Rotation = (0.0, 0.0, 0.0)
     position: Vector3 = (0.0, 0.0, 0.0)
     focal_length: PositiveLength
     principal_point: Vector2 = (0.0, 0.0)
-    k1: Distortion3 = 0.0
-    k2: Distortion5 = 0.0
+    k1: Annotated[float, Quantity(_PER_LENGTH2, largest="100 1/m^2")] = 0.0
+    k2: Annotated[float, Quantity(_PER_LENGTH4, largest="1e5 1/m^4")] = 0.0
     pixels: LongestLine | None = None
     pitch: PixelPitch | None = None
     image: LineImageSpec | None = None
@@ -111,13 +107,7 @@ class LineCameraSpec(Spec):
         return self
 
 
-def _some_lines(lines: Named[LineCameraSpec]) -> Named[LineCameraSpec]:
-    if not lines:
-        raise Problem("no lines", "an empty mapping", "at least one line camera")
-    return lines
-
-
-class ThreeLineCameraSpec(Spec):
+class ThreeLineCameraSpec(TitledSpec):
     """The payload of a three-line mapping satellite.
 
     Attributes:
@@ -130,11 +120,9 @@ class ThreeLineCameraSpec(Spec):
         image: how lines that do not say it themselves form and record their images; only rendering needs it.
     """
 
-    name: Name
-    description: Text = ""
     pixels: LongestLine
     pitch: PixelPitch
-    lines: Annotated[Named[LineCameraSpec], AfterValidator(_some_lines)]
+    lines: Annotated[Named[LineCameraSpec], not_empty("no lines", "at least one line camera")]
     image: LineImageSpec | None = None
 
     @model_validator(mode="after")

@@ -13,7 +13,8 @@ from optics.materials.glass import N_BK7
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from scenes.lens.__main__ import app
-from scenes.lens.batoid_file import batoid_text, read_batoid
+from scenes.lens.batoid_reader import read_batoid
+from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
 from scenes.lens.codev_reader import read_codev

@@ -10,10 +10,11 @@ from optics.geometry.aperture import Circle, Rectangle
 from optics.geometry.surface import ZernikeFigure
 from optics.materials.glass import N_BK7
 from optics.raytrace.assembly import Interaction
-from scenes.lens.batoid_file import read_batoid
+from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.codev_reader import read_codev
 from scenes.lens.glass_catalogue import own_glasses, read_catalogue, read_catalogues
-from scenes.lens.prescription import Prescription, glass_key
+from scenes.lens.prescription import Prescription
+from scenes.lens.statements import glass_key
 from scenes.lens.zemax_reader import read_zemax
 from scenes.yaml.errors import InputError
 from tests.scenes.lens.files import AGF, BATOID, CODEV, SINGLET, TMA

@@ -27,24 +27,10 @@ from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.job import JobSpec, PerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError
 from twin.monitor.truth import trace_truth
+from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import (
-    NO_EFFECTS,
-    SPEED_OF_LIGHT,
-    LightEffects,
-    aberrated,
-    turned_with_earth,
-    unrefracted,
-)
-from twin.orbit.flight.line_camera import (
-    LineCamera,
-    along_track_angle,
-    dihedral_angle,
-    line_cameras,
-    line_normal,
-    look_angle,
-    traced_line_cameras,
-)
+from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import LineAngles, LineCamera, line_cameras, line_normal, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Attitude, Trajectory
@@ -91,7 +77,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
     if setup.instrument is None or backend is None:
         raise ValueError("an instrument's lines need a backend to be traced")
     instrument = build_instrument(setup.instrument, setup.cameras, backend)
-    state = changed_state(spec, instrument)
+    state = _changed_state(spec, instrument)
     laboratory = traced_line_cameras(instrument, backend)
     try:
         cameras = traced_line_cameras(instrument, backend, state)
@@ -102,7 +88,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
     return AngleCamera(FrozenMap(laboratory), FrozenMap(cameras), FrozenMap(trace))
 
 
-def changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
+def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
     """The state that a test's changes put an instrument into.
 
     Raises:
@@ -137,6 +123,7 @@ class Measurement:
     """What the analysis gets. Coordinates in one Cartesian frame, metres.
 
     Attributes:
+        pairs: angle -> the two lines that it lies between.
         station: measured, with its covariance.
         strips: line -> measured ground points with their covariance.
         tangent: line -> laboratory's tangents of the points' directions from the line's centre, across the line and
@@ -148,6 +135,7 @@ class Measurement:
             its middle direction, (n, 3): the image of a mirror camera's line is bent.
     """
 
+    pairs: Mapping[str, tuple[str, str]]
     station: Station
     strips: Mapping[str, Strip]
     tangent: Mapping[str, np.ndarray]
@@ -156,8 +144,32 @@ class Measurement:
     offset: Mapping[str, np.ndarray]
     bow: Mapping[str, np.ndarray]
 
+    @classmethod
+    def of(cls, laboratory: LineAngles, station: Station, strips: Mapping[str, Strip]) -> Measurement:
+        """Measured station and points, with what the laboratory knows of the lines' pixels.
+
+        Args:
+            laboratory: the lines as the laboratory measured them, and the places of the points on them.
+            station: measured.
+            strips: line -> measured ground points; angles are found between these lines.
+        """
+        inside = {name: _interior(laboratory.cameras[name], laboratory.pixel[name]) for name in strips}
+        known = {key: {name: one[key] for name, one in inside.items()} for key in next(iter(inside.values()))}
+        return cls(laboratory.pairs, station, strips, **known)
+
+    @property
+    def which(self) -> list[tuple[int, int]]:
+        """The pairs by the numbers of their lines among the strips."""
+        lines = list(self.strips)
+        return [(lines.index(a), lines.index(b)) for a, b in self.pairs.values()]
+
     def in_frame(self, axes: np.ndarray, origin: np.ndarray) -> Measurement:
-        """The same in another frame; axes: its axes as rows in the present one, (3, 3), origin: (3,)."""
+        """The measurement in another frame.
+
+        Args:
+            axes: of that frame as rows in the present one, (3, 3).
+            origin: of that frame in the present one, (3,), metres.
+        """
         station = Station((self.station.position - origin) @ axes.T, axes @ self.station.covariance @ axes.T)
         strips = {
             name: Strip((strip.points - origin) @ axes.T, axes @ strip.covariance @ axes.T)
@@ -166,20 +178,19 @@ class Measurement:
         return replace(self, station=station, strips=strips)
 
 
-@dataclass(frozen=True, eq=False)
-class AnglePass:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AnglePass(LineAngles):
     """The truth at the moment of exposure; made by `fly`. All coordinates in the ITRS, metres.
+
+    The cameras are those in orbit, and so the angles are the true ones.
 
     Attributes:
         spec: the test.
         earth: its rotation and ellipsoid.
         trajectory: true orbit and attitude.
         laboratory: line -> camera as it was measured before launch.
-        cameras: line -> camera as it is.
-        pairs: angle -> the two lines that it lies between.
         trace: angle -> its change by `twin.monitor.truth.trace_truth`, radians; empty where no trace of two cameras
             tells it.
-        pixel: line -> places of its points, (n,).
         height: line -> heights of its points above the ellipsoid, (n,).
     """
 
@@ -187,15 +198,12 @@ class AnglePass:
     earth: Earth
     trajectory: Trajectory
     laboratory: Mapping[str, LineCamera]
-    cameras: Mapping[str, LineCamera]
-    pairs: Mapping[str, tuple[str, str]]
     trace: Mapping[str, float]
-    pixel: Mapping[str, np.ndarray]
     height: Mapping[str, np.ndarray]
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Those that angles are measured of, in the order of the camera's file."""
+        """Lines that angles are measured of, in the order of the camera's file."""
         return tuple(self.pixel)
 
     @property
@@ -205,42 +213,23 @@ class AnglePass:
 
     @property
     def station(self) -> np.ndarray:
-        """(3,)."""
+        """True position of the satellite, (3,), metres."""
         return self.trajectory.position(self.spec.time)
 
     @property
     def velocity(self) -> np.ndarray:
-        """Against the stars, (3,), m/s."""
+        """True velocity against the stars, (3,), m/s."""
         return self.trajectory.inertial_velocity(self.spec.time)
 
     @property
     def effects(self) -> LightEffects:
-        """Those of the file."""
-        e = self.spec.effects
-        return LightEffects(e.light_time, e.aberration, e.refraction, e.wavelength)
+        """Effects on the light that the file switches on."""
+        return LightEffects.of(self.spec.effects)
 
     @property
-    def look(self) -> dict[str, float]:
-        """True angles between the lines of sight of the lines' centres, radians."""
-        return {name: look_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
-
-    @property
-    def laboratory_look(self) -> dict[str, float]:
-        """The same before launch."""
-        return {name: look_angle(self.laboratory[a], self.laboratory[b]) for name, (a, b) in self.pairs.items()}
-
-    @property
-    def along_track(self) -> dict[str, float]:
-        """Their signed part along the track, positive where the first line looks ahead of the second, radians."""
-        return {name: along_track_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
-
-    @property
-    def dihedral(self) -> dict[str, float]:
-        """True angles between the planes of the lines where the points are, radians."""
-        return {
-            name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
-            for name, (a, b) in self.pairs.items()
-        }
+    def before_launch(self) -> LineAngles:
+        """The angles as the laboratory measured them."""
+        return LineAngles(self.laboratory, self.pairs, self.pixel)
 
     @property
     def middle_point(self) -> np.ndarray:
@@ -305,16 +294,11 @@ class AnglePass:
         place = self.station + errors.station * noise[0]
         shift = np.array(errors.datum if datum is None else datum) @ self.local
         found = np.concatenate([points[name] for name in lines]) + shift + errors.points * noise[1:]
-        if corrected.light_time or corrected.aberration or corrected.refraction:
+        if corrected.names:
             found = without_effects(found, place, self.velocity, self.earth, corrected)
         sigma = max(errors.points, LEAST_SIGMA)
         strips = {name: Strip.of(p, sigma) for name, p in zip(lines, np.split(found, len(lines)), strict=True)}
-        inside = {name: interior(self.laboratory[name], self.pixel[name]) for name in lines}
-        return Measurement(
-            Station.of(place, errors.station),
-            strips,
-            **{key: {name: one[key] for name, one in inside.items()} for key in INTERIOR},
-        )
+        return Measurement.of(self.before_launch, Station.of(place, errors.station), strips)
 
     def height_per_arcsec(self) -> dict[str, float | None]:
         """How far a wrong angle of one arcsecond moves heights that are intersected from its two lines, metres.
@@ -388,25 +372,21 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
         name: _terrain(spec, above * _spread(camera.laboratory[name], pixel[name]), np.random.default_rng(stream))
         for name, stream in zip(used, seed.spawn(len(used)), strict=True)
     }
-    trajectory = Trajectory(orbit, Attitude.from_spec(spec.attitude))
     return AnglePass(
-        spec,
-        earth,
-        trajectory,
-        camera.laboratory,
-        camera.cameras,
-        FrozenMap(setup.angles),
-        camera.trace,
-        FrozenMap(pixel),
-        FrozenMap(height),
+        cameras=camera.cameras,
+        pairs=FrozenMap(setup.angles),
+        pixel=FrozenMap(pixel),
+        spec=spec,
+        earth=earth,
+        trajectory=Trajectory(orbit, Attitude.from_spec(spec.attitude)),
+        laboratory=camera.laboratory,
+        trace=camera.trace,
+        height=FrozenMap(height),
     )
 
 
-INTERIOR = ("tangent", "along", "look", "offset", "bow")
-
-
-def interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
-    """What the laboratory knows of a line's pixels (N,): the fields `INTERIOR` of a `Measurement`.
+def _interior(camera: LineCamera, pixel: np.ndarray) -> dict[str, Any]:
+    """What the laboratory knows of a line's pixels (N,): fields of a `Measurement`.
 
     Tangents count across (forward) and along (to the right) in the body's axes pitched to the line's centre; the angle
     within the line is positive to the right.
@@ -445,13 +425,13 @@ def without_effects(
         (N, 3), at the distances of the points.
     """
     source = points
-    way = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT * effects.light_time
-    place = turned_with_earth(np.broadcast_to(station, source.shape), way)
+    way = np.linalg.norm(source - station, axis=-1) / light_effects.SPEED_OF_LIGHT * effects.light_time
+    place = light_effects.turned_with_earth(np.broadcast_to(station, source.shape), way)
     if effects.refraction:
-        source = unrefracted(source, place, earth, effects.wavelength)
-    arm = turned_with_earth(source - place, -way)
+        source = light_effects.unrefracted(source, place, earth, effects.wavelength)
+    arm = light_effects.turned_with_earth(source - place, -way)
     if effects.aberration:
-        arm = aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
+        arm = light_effects.aberrated(arm / np.linalg.norm(arm, axis=-1, keepdims=True), velocity)
         arm = arm * np.linalg.norm(points - station, axis=-1, keepdims=True)
     return np.asarray(station + arm)
 

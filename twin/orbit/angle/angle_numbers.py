@@ -1,220 +1,171 @@
-"""Numbers of an intersection-angle test, as angle.json has them."""
+"""The quantities of an intersection-angle test, as angle.json has them.
+
+Keys below those that name a result begin with the name of an angle, such as alpha_deg and alpha_sigma_arcsec.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
+from analysis.orbit.angles import AlongTrackAngles, PlaneAngles
 from analysis.units import ARCSEC
-from twin.orbit.angle.angle_run import AngleRun, PassAngles, Scatter, SimulatedAngleRun, values_of
-from twin.run.plain_data import plain_data
+from twin.orbit.angle.angle_run import AngleRun, EffectRow, FrameRow, PassAngles, Scatter, SimulatedAngleRun, values_of
+from twin.run.quantity import Quantity, Record
 
-ByAngle = Mapping[str, float | None]
-"""A number for each angle of the test's file; what could not be computed is None."""
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+ByAngle = dict[str, float | None]
+"""A number for each angle of the test's file; None for what could not be computed."""
 
 
-def _arcsec(names: Iterable[str], values: Iterable[float]) -> ByAngle:
-    """Radians as arcseconds."""
-    return {name: _number(v / ARCSEC) for name, v in zip(names, values, strict=True)}
+def _by_angle(names: Iterable[str], values: Iterable[float]) -> ByAngle:
+    return {name: float(v) if np.isfinite(v) else None for name, v in zip(names, values, strict=True)}
 
 
 def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
-    """Radians as degrees; keys say so, since they stand beside those of sigmas."""
-    return {f"{name}_deg": _number(np.degrees(v)) for name, v in zip(names, values, strict=True)}
+    """Radians as degrees; the keys say so, since they stand beside those of sigmas."""
+    return _by_angle([f"{name}_deg" for name in names], np.degrees(list(values)))
 
 
-def _with_sigmas(names: Iterable[str], values: Iterable[float], sigmas: Iterable[float]) -> ByAngle:
+def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
     """Angles in degrees, then their sigmas in arcseconds."""
     names = tuple(names)
-    claimed = {f"{name}_sigma_arcsec": _number(v / ARCSEC) for name, v in zip(names, sigmas, strict=True)}
-    return {**_degrees(names, values), **claimed}
+    return _degrees(names, angles.values) | _by_angle([f"{n}_sigma_arcsec" for n in names], angles.sigma / ARCSEC)
 
 
-@dataclass(frozen=True)
-class TruthNumbers:
-    """Angles of the true camera, by each definition."""
-
-    look: ByAngle
-    dihedral: ByAngle
-    along_track: ByAngle
-
-    @classmethod
-    def of(cls, run: SimulatedAngleRun) -> Self:
-        """Of a run."""
-        angles = run.flight.look, run.flight.dihedral, run.flight.along_track
-        return cls(*(_degrees(run.names, values.values()) for values in angles))
+def _plane_chances(one: PassAngles) -> dict[str, float]:
+    fits = zip(one.measurement.strips, one.estimate.planes["tls"], strict=True)
+    return {line: float(chi2.sf(fit.chi_square, len(fit.residual) - 2)) for line, fit in fits}
 
 
-@dataclass(frozen=True)
-class ChangeNumbers:
-    """Changes of the look angles since the laboratory, arcseconds: from the ground, true, by the instrument's trace."""
-
-    ground: ByAngle
-    truth: ByAngle
-    trace: ByAngle
-
-    @classmethod
-    def of(cls, run: SimulatedAngleRun) -> Self:
-        """Of a run."""
-        flight = run.flight
-        return cls(
-            ground=_arcsec(run.names, run.change),
-            truth=_arcsec(run.names, values_of(flight.look) - values_of(flight.laboratory_look)),
-            trace=_arcsec(flight.trace, flight.trace.values()),
-        )
-
-
-@dataclass(frozen=True)
-class EffectNumbers:
-    """What an effect on the light does to the angles, and what its correction leaves."""
-
-    what: str
-    bias_arcsec: ByAngle
-    corrected_arcsec: ByAngle
-
-
-@dataclass(frozen=True)
-class ScatterNumbers:
-    """One estimator over the passes; p_value: chance of a spread as far off if the sigma is right."""
-
-    bias_arcsec: ByAngle
-    spread_arcsec: ByAngle
-    sigma_arcsec: ByAngle
-    p_value: ByAngle
-
-    @classmethod
-    def of(cls, names: Sequence[str], scatter: Scatter) -> Self:
-        """Of one estimator."""
-        rows = scatter.bias / ARCSEC, scatter.spread / ARCSEC, scatter.sigma / ARCSEC, scatter.tail
-        return cls(*(dict(zip(names, row.tolist(), strict=True)) for row in rows))
-
-
-@dataclass(frozen=True)
-class PassesNumbers:
-    """Passes with errors drawn anew."""
-
-    passes: int
-    planes: ScatterNumbers
-    along_track: ScatterNumbers
-    resection: ScatterNumbers
-
-    @classmethod
-    def of(cls, run: SimulatedAngleRun) -> Self:
-        """Of a run."""
-        estimators = run.planes, run.along, run.resection
-        return cls(len(run.planes.values), *(ScatterNumbers.of(run.names, scatter) for scatter in estimators))
+PASS: Record[PassAngles] = Record(
+    "The angles of one pass, and those of the laboratory's camera.",
+    Quantity("time_s", lambda one: one.time, "moment to which the points are brought, from the epoch"),
+    Quantity("points", lambda one: {k: len(ids) for k, ids in one.ids.items()}, "line -> number of its points"),
+    Quantity(
+        "dihedral",
+        lambda one: _with_sigmas(one.pairs, one.estimate.angles["tls"]),
+        "angles between the planes, which are fitted by total least squares",
+    ),
+    Quantity(
+        "along_track",
+        lambda one: _with_sigmas(one.pairs, one.estimate.along),
+        "angles between the lines of sight of the lines' centres, their signed part along the track",
+    ),
+    Quantity(
+        "resection", lambda one: _with_sigmas(one.pairs, one.estimate.resected), "angles by space resection, signed"
+    ),
+    Quantity(
+        "laboratory_dihedral",
+        lambda one: _degrees(one.pairs, one.laboratory.dihedral.values()),
+        "angles between the planes of the laboratory's camera",
+    ),
+    Quantity(
+        "laboratory_along_track",
+        lambda one: _degrees(one.pairs, one.laboratory.along_track.values()),
+        "angles along the track of the laboratory's camera",
+    ),
+    Quantity(
+        "change_arcsec",
+        lambda one: _by_angle(one.pairs, one.estimate.along.values - values_of(one.laboratory.along_track)),
+        "change of the angles along the track since the laboratory",
+    ),
+    Quantity("plane_p_value", _plane_chances, "line -> chance of a chi-square of its plane as large or larger"),
+    Quantity("resection_p_value", lambda one: one.estimate.resection.p_value, "the same for the resection"),
+)
+TRUTH: Record[SimulatedAngleRun] = Record(
+    "The angles of the true camera, by each definition.",
+    Quantity("look", lambda run: _degrees(run.names, run.flight.look.values()), "between the lines of sight"),
+    Quantity("dihedral", lambda run: _degrees(run.names, run.flight.dihedral.values()), "between the planes"),
+    Quantity("along_track", lambda run: _degrees(run.names, run.flight.along_track.values()), "along the track"),
+)
 
 
-@dataclass(frozen=True)
-class SimulatedNumbers:
-    """What angle.json has of a simulated test beside its pass; frames: of every form of the planes in every frame."""
-
-    seed: int
-    time_s: float
-    angles: Mapping[str, Sequence[str]]
-    planes: Mapping[str, ByAngle]
-    folded: Mapping[str, bool]
-    look: ByAngle
-    along_track: ByAngle
-    resection: ByAngle
-    truth: TruthNumbers
-    change_arcsec: ChangeNumbers
-    difference_arcsec: ByAngle
-    difference_sigma_arcsec: ByAngle
-    sensitivity: Sequence[Mapping[str, Any]]
-    effects: Sequence[EffectNumbers]
-    frames: Sequence[Mapping[str, Any]]
-    scatter: PassesNumbers
-    height_m_per_arcsec: ByAngle
-
-    @classmethod
-    def of(cls, run: SimulatedAngleRun) -> Self:
-        """Of a run."""
-        estimate, flight, names = run.estimate, run.flight, run.names
-        return cls(
-            seed=run.seed,
-            time_s=flight.spec.time,
-            angles=flight.pairs,
-            planes={
-                method: _with_sigmas(names, angles.values, angles.sigma) for method, angles in estimate.angles.items()
-            },
-            folded={name: bool(f) for name, f in zip(names, estimate.angles["tls"].folded, strict=True)},
-            look=_degrees(names, estimate.look),
-            along_track=_with_sigmas(names, estimate.along.values, estimate.along.sigma),
-            resection={
-                **_with_sigmas(names, run.resected, run.resected_sigma),
-                "p_value": estimate.resection.p_value,
-            },
-            truth=TruthNumbers.of(run),
-            change_arcsec=ChangeNumbers.of(run),
-            difference_arcsec=_arcsec(names, run.difference),
-            difference_sigma_arcsec=_arcsec(names, run.difference_sigma),
-            sensitivity=[row.to_dict() for row in run.table],
-            effects=[
-                EffectNumbers(row.what, _arcsec(names, row.bias), _arcsec(names, row.left)) for row in run.effects
-            ],
-            frames=[
-                {
-                    "frame": row.frame,
-                    "method": row.method,
-                    **_with_sigmas(names, row.values, row.sigma),
-                    "least_normal_z": row.steepest,
-                    "near_vertical": row.warned,
-                }
-                for row in run.frames
-            ],
-            scatter=PassesNumbers.of(run),
-            height_m_per_arcsec=run.height,
-        )
+def _changes(run: SimulatedAngleRun) -> dict[str, ByAngle]:
+    flight = run.flight
+    return {
+        "ground": _by_angle(run.names, run.change),
+        "truth": _by_angle(run.names, values_of(flight.look) - values_of(flight.before_launch.look)),
+        "trace": _by_angle(flight.trace, flight.trace.values()),
+    }
 
 
-@dataclass(frozen=True)
-class PassNumbers:
-    """Angles of a pass, simulated or measured; those of the laboratory's camera; time from the epoch."""
+SCATTER: Record[Scatter] = Record(
+    "One estimator over passes with errors drawn anew.",
+    Quantity("bias_arcsec", lambda one: _by_angle(one.names, one.bias), "mean over the passes minus truth"),
+    Quantity("spread_arcsec", lambda one: _by_angle(one.names, one.spread), "standard deviation over the passes"),
+    Quantity("sigma_arcsec", lambda one: _by_angle(one.names, one.sigma), "standard deviation that it claims"),
+    Quantity("p_value", lambda one: _by_angle(one.names, one.tail), "chance of such a spread if the sigma is right"),
+)
+EFFECT: Record[EffectRow] = Record(
+    "What an effect on the light, or a shift of all points, does to the angles between tls planes.",
+    Quantity("what", lambda row: row.what, "name of the effect"),
+    Quantity("bias_arcsec", lambda row: _by_angle(row.names, row.bias), "angles minus truth without correction"),
+    Quantity("corrected_arcsec", lambda row: _by_angle(row.names, row.left), "what the correction leaves of it"),
+)
+PASSES: Record[SimulatedAngleRun] = Record(
+    "Passes with errors drawn anew.",
+    Quantity("passes", lambda run: len(run.planes.values), "how many"),
+    Quantity("planes", lambda run: run.planes, "dihedral angles of tls planes", record=SCATTER),
+    Quantity("along_track", lambda run: run.along, "angles along the track from these planes", record=SCATTER),
+    Quantity("resection", lambda run: run.resection, "angles by resection", record=SCATTER),
+)
 
-    time_s: float
-    points: Mapping[str, int]
-    dihedral: ByAngle
-    along_track: ByAngle
-    resection: ByAngle
-    laboratory_dihedral: ByAngle
-    laboratory_along_track: ByAngle
-    change_arcsec: ByAngle
-    plane_p_value: Mapping[str, float]
-    resection_p_value: float
 
-    @classmethod
-    def of(cls, one: PassAngles) -> Self:
-        """Of one pass."""
-        names, pairs, estimate = tuple(one.pairs), tuple(one.pairs.values()), one.estimate
-        section, tls, along = estimate.resection, estimate.angles["tls"], estimate.along
-        sigma = np.sqrt(np.diag(section.angle_covariance(pairs)))
-        return cls(
-            time_s=one.time,
-            points={name: len(pixel) for name, pixel in one.pixel.items()},
-            dihedral=_with_sigmas(names, tls.values, tls.sigma),
-            along_track=_with_sigmas(names, along.values, along.sigma),
-            resection=_with_sigmas(names, section.angles(pairs), sigma),
-            laboratory_dihedral=_degrees(names, one.dihedral),
-            laboratory_along_track=_degrees(names, one.along_track),
-            change_arcsec=_arcsec(names, along.values - one.along_track),
-            plane_p_value={
-                line: float(chi2.sf(fit.chi_square, len(fit.residual) - 2))
-                for line, fit in zip(one.lines, estimate.planes["tls"], strict=True)
-            },
-            resection_p_value=section.p_value,
-        )
+def _frame(names: Iterable[str], row: FrameRow) -> dict[str, Any]:
+    normal = {"least_normal_z": row.steepest, "near_vertical": row.warned}
+    return {"frame": row.frame, "method": row.method, **_with_sigmas(names, row), **normal}
+
+
+ANGLE: Record[Any] = Record(
+    "angle.json. Measurements have no truth: of them there is the key `measured` alone.",
+    Quantity("seed", lambda run: run.seed, "of all random numbers"),
+    Quantity("time_s", lambda run: run.flight.spec.time, "moment of exposure, from the epoch"),
+    Quantity("angles", lambda run: run.flight.pairs, "the two lines that each angle lies between"),
+    Quantity(
+        "planes",
+        lambda run: {name: _with_sigmas(run.names, one) for name, one in run.estimate.angles.items()},
+        "dihedral angles by each form of the planes, in the Earth-fixed frame",
+    ),
+    Quantity(
+        "folded",
+        lambda run: dict(zip(run.names, run.estimate.angles["tls"].folded.tolist(), strict=True)),
+        "whether an angle is below three sigmas, where its noise pushes it up",
+    ),
+    Quantity("look", lambda run: _degrees(run.names, run.estimate.look), "between the lines of sight of the centres"),
+    Quantity("along_track", lambda run: _with_sigmas(run.names, run.estimate.along), "their part along the track"),
+    Quantity(
+        "resection",
+        lambda run: _with_sigmas(run.names, run.estimate.resected) | {"p_value": run.estimate.resection.p_value},
+        "angles by space resection, and the chance of its chi-square",
+    ),
+    Quantity("truth", lambda run: run, "the angles of the true camera", record=TRUTH),
+    Quantity("change_arcsec", _changes, "change of the look angles since launch: found, true, and by the trace"),
+    Quantity("difference_arcsec", lambda run: _by_angle(run.names, run.difference), "planes minus resection"),
+    Quantity(
+        "difference_sigma_arcsec",
+        lambda run: _by_angle(run.names, run.difference_sigma),
+        "standard deviation of the difference over the passes",
+    ),
+    Quantity("sensitivity", lambda run: [row.to_dict() for row in run.table], "answers of the angles to errors"),
+    Quantity("effects", lambda run: run.effects, "each effect alone and all together", record=EFFECT),
+    Quantity(
+        "frames", lambda run: [_frame(run.names, row) for row in run.frames], "every form of the planes in every frame"
+    ),
+    Quantity("scatter", lambda run: run, "passes with errors drawn anew", record=PASSES),
+    Quantity(
+        "height_m_per_arcsec",
+        lambda run: run.height,
+        "error of intersected heights for 1 arcsec of an angle",
+        converted=False,
+    ),
+    Quantity("measured", lambda run: {one.name: one for one in run.passes}, "pass -> its angles", record=PASS),
+)
+_MEASURED: Record[AngleRun] = Record(ANGLE.meaning, ANGLE["measured"])
 
 
 def angle_numbers(run: AngleRun) -> dict[str, Any]:
-    """Contents of angle.json without its frames. Keys of angles begin with their names."""
-    numbers = plain_data({"measured": {one.name: PassNumbers.of(one) for one in run.passes}})
-    return {**(plain_data(SimulatedNumbers.of(run)) if isinstance(run, SimulatedAngleRun) else {}), **numbers}
+    """Contents of angle.json without its frames."""
+    return ANGLE(run) if isinstance(run, SimulatedAngleRun) else _MEASURED(run)

@@ -12,9 +12,9 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
-from twin.orbit.angle.angle_plots import signs
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, values_of
-from twin.orbit.angle.angle_sections import listed, sections
+from twin.orbit.angle.angle_sections import listed, sections, signs
+from twin.orbit.flight.light_effects import LightEffects
 from twin.run.artefact import FAR, Cell, Table, fixed
 from twin.run.report import Report, Section, one_sentence
 
@@ -28,13 +28,14 @@ METHOD_NAMES = {
     "tls": "planes, total least squares",
 }
 _FALSE_ALARM = 1e-4
-"""Of a point that is named for its distance from its plane, over all points of a line."""
+"""Chance that a point of a line without errors is named for its distance from the plane."""
 
 
 def angle_report(run: AngleRun) -> Report:
     """Report of an intersection angle test."""
     first = run.passes[0]
-    along, change = first.estimate.along, first.estimate.along.values - first.along_track
+    along = first.estimate.along
+    change = along.values - values_of(first.laboratory.along_track)
     changed = [
         f"{name} has changed by {fixed(change[k] / ARCSEC, 2)} ± {along.sigma[k] / ARCSEC:.2f} arcsec"
         for k, name in enumerate(signs(first.pairs))
@@ -98,19 +99,18 @@ def _methods(run: AngleRun) -> Table:
     truth = () if flight is None else tuple(values_of(a) for a in (flight.dihedral, flight.look, flight.along_track))
     rows: list[tuple[Cell, ...]] = []
     for one in run.passes:
-        estimate, along, section = one.estimate, one.estimate.along, one.estimate.resection
-        pairs, known = tuple(one.pairs.values()), (one.dihedral, one.look, one.along_track)
-        resected = section.angles(pairs), np.sqrt(np.diag(section.angle_covariance(pairs)))
+        estimate, along, resected, lab = one.estimate, one.estimate.along, one.estimate.resected, one.laboratory
+        known = tuple(values_of(angles) for angles in (lab.dihedral, lab.look, lab.along_track))
         for k, name in enumerate(signs(one.pairs)):
             # across the track the sigma of the look is another one
-            mostly = abs(one.along_track[k]) > 0.99 * one.look[k]
+            mostly = abs(known[2][k]) > 0.99 * known[1][k]
             kinds: list[tuple[str, str, np.ndarray, np.ndarray | None, int]] = [
                 (METHOD_NAMES[method], "dihedral" + " (folded)" * bool(a.folded[k]), a.values, a.sigma, 0)
                 for method, a in estimate.angles.items()
             ]
             kinds.append((SIGHTED, "look", estimate.look, along.sigma if mostly else None, 1))
             kinds.append((SIGHTED, "along track", along.values, along.sigma, 2))
-            kinds.append(("resection", "along track", *resected, 2))
+            kinds.append(("resection", "along track", resected.values, resected.sigma, 2))
             for method, kind, value, sigma, which in kinds:
                 off = (float((value[k] - side[which][k]) / ARCSEC) for side in (known, truth) if side)
                 spread = None if sigma is None else float(sigma[k] / ARCSEC)
@@ -136,7 +136,7 @@ def _methods(run: AngleRun) -> Table:
 def _planes(run: AngleRun) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for one in run.passes:
-        for line, fit in zip(one.lines, one.estimate.planes["tls"], strict=True):
+        for line, fit in zip(one.measurement.strips, one.estimate.planes["tls"], strict=True):
             freedom = len(fit.residual) - 2
             rows.append(
                 (
@@ -178,7 +178,7 @@ def _planes(run: AngleRun) -> Section:
 def _measured_facts(run: AngleRun, setup: MeasuredAngleSetup) -> tuple[tuple[str, str], ...]:
     first = run.passes[0]
     tracker, gps, effects = setup.test.errors.star_tracker, setup.test.errors.gps, setup.test.effects
-    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
+    on = LightEffects.of(effects).names
     moments = ", ".join(f"{one.name} {one.time:.4g} s" for one in run.passes)
     return (
         ("Camera", f"{setup.camera.name}, {setup.camera.description}"),
@@ -201,7 +201,7 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
             f"{passing.direction} pass {passing.altitude / 1e3:g} km above "
             f"{np.degrees(passing.latitude):.4g}° N {np.degrees(passing.longitude):.4g}° E, {orbit}"
         )
-    on = [name.replace("_", " ") for name in ("light_time", "aberration", "refraction") if getattr(effects, name)]
+    on = LightEffects.of(effects).names
     state = ("corrected" if effects.corrected else "not corrected") + " in the analysis" if on else ""
     changed = "; ".join(f"{name} {_change_text(change)}" for name, change in test.changes.items())
     described = (setup.camera or setup.instrument).description  # type: ignore[union-attr]
@@ -218,10 +218,7 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
         ("Orbit", orbit),
         ("Exposure", f"{test.time:g} s from the epoch"),
         ("Points", f"{test.strips.points} on each strip, pixels {test.strips.first:g} to {test.strips.last:g}"),
-        (
-            "Terrain",
-            f"{format_quantity(test.terrain.height, LENGTH)} ± {format_quantity(test.terrain.relief, LENGTH)}",
-        ),
+        ("Terrain", f"{format_quantity(test.terrain.height, LENGTH)} ± {format_quantity(test.terrain.relief, LENGTH)}"),
         ("Effects on the light", f"{', '.join(on) or 'none'} {state}".strip()),
         (
             "Errors, σ of a coordinate",
@@ -245,10 +242,10 @@ def _change_text(change: PlainPerturbationSpec) -> str:
     return ", ".join(text) if text else "unchanged"
 
 
-def far_points(one: PassAngles) -> list[tuple[str, int, float]]:
+def _far_points(one: PassAngles) -> list[tuple[str, int, float]]:
     """Line, number on it and sigmas of points that lie farther from their plane than chance allows."""
     found = []
-    for line, fit in zip(one.lines, one.estimate.planes["tls"], strict=True):
+    for line, fit in zip(one.measurement.strips, one.estimate.planes["tls"], strict=True):
         sigma = np.sqrt(np.einsum("i,nij,j->n", fit.normal, fit.strip.covariance, fit.normal))
         away = np.abs(fit.residual) / sigma
         limit = np.sqrt(chi2.isf(_FALSE_ALARM / len(away), 1))
@@ -260,11 +257,11 @@ def _warnings(run: AngleRun) -> tuple[str, ...]:
     found = []
     if isinstance(run, SimulatedAngleRun):
         spec = run.flight.spec
-        left = [e for e in ("light_time", "aberration", "refraction") if getattr(spec.effects, e)]
+        left = run.flight.effects.names
         if left and not spec.effects.corrected:
             found.append(
-                f"the analysis leaves {', '.join(left).replace('_', ' ')} in the points; the angles are biased as the "
-                "table of effects says"
+                f"the analysis leaves {', '.join(left)} in the points; the angles are biased as the table of effects "
+                "says"
             )
         if any(spec.errors.datum):
             found.append(
@@ -277,7 +274,7 @@ def _warnings(run: AngleRun) -> tuple[str, ...]:
                 f"{one.name}: the planes of {listed(folded)} are parallel within their noise: the unsigned dihedral "
                 "angle folds at zero; use the angle along the track, which has a sign"
             )
-        far = far_points(one)
+        far = _far_points(one)
         if far:
             worst = max(far, key=lambda point: point[2])
             name = one.ids[worst[0]][worst[1]]

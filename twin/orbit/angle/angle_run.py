@@ -10,32 +10,22 @@ lines of sight onto straight lines.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import chi2
 
-from analysis.orbit.angles import (
-    AlongTrackAngles,
-    AngleError,
-    PlaneAngles,
-    Sensitivity,
-    along_track_angles,
-    angles_between,
-    line_frame,
-    look_angle,
-    sensitivity,
-)
+from analysis.orbit import angles as plane_angles
+from analysis.orbit.angles import AlongTrackAngles, AngleError, PlaneAngles, Sensitivity, angles_between
 from analysis.orbit.planes import METHODS, Method, NearVerticalWarning, PlaneError, PlaneFit, Strip, fit_plane
 from analysis.orbit.resection import ObservedLine, Resection, ResectionError, resect
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement, angle_camera, fly
 from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineCamera, along_track_angle, dihedral_angle
-from twin.orbit.flight.line_camera import look_angle as line_look_angle
+from twin.orbit.flight.line_camera import LineAngles
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
@@ -49,22 +39,6 @@ BEND = 0.01 * ARCSEC
 line of `gf7` by 1e-5 arcsec, and a turn of its focal plane by 2 arcsec about the rear node by 1e-3 arcsec."""
 
 
-class TestedLines(Protocol):
-    """Lines whose angles are estimated, of a simulated or a measured pass."""
-
-    @property
-    def lines(self) -> tuple[str, ...]:
-        """In the order of the camera's file."""
-
-    @property
-    def pairs(self) -> Mapping[str, tuple[str, str]]:
-        """Angle -> the two lines that it lies between."""
-
-    @property
-    def reference(self) -> str:
-        """The line whose look is zero in a resection."""
-
-
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """Angles from one measurement, in the order of the test's file.
@@ -75,6 +49,7 @@ class Estimate:
         look: angles between the lines of sight of the lines' centres, from tls planes and places on the line, radians.
         along: their signed part along the track.
         resection: the second method.
+        resected: its angles, signed like those along the track.
     """
 
     planes: Mapping[Method, tuple[PlaneFit, ...]]
@@ -82,6 +57,7 @@ class Estimate:
     look: np.ndarray
     along: AlongTrackAngles
     resection: Resection
+    resected: AlongTrackAngles
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +86,13 @@ class EffectRow:
     """What an effect on the light, or a common shift of the points, does to the angles of tls planes, radians.
 
     Attributes:
-        what: name.
+        names: of the angles.
+        what: name of the effect.
         bias: angles minus the truth without correction.
         left: the same after the analysis has taken it out; NaN where it cannot.
     """
 
+    names: tuple[str, ...]
     what: str
     bias: np.ndarray
     left: np.ndarray
@@ -125,14 +103,22 @@ class Scatter:
     """Repeated passes with errors drawn anew, of one estimator of m angles.
 
     Attributes:
+        names: of the angles.
         values: (passes, m), radians.
         covariance: that the estimator claims, mean over the passes, (m, m), rad^2.
         truth: what it estimates, (m,), radians.
     """
 
+    names: tuple[str, ...]
     values: np.ndarray
     covariance: np.ndarray
     truth: np.ndarray
+
+    @classmethod
+    def of(cls, passes: Sequence[PlaneAngles] | Sequence[AlongTrackAngles], truth: Mapping[str, float]) -> Scatter:
+        """The scatter of what one estimator found in each of the passes about the truth, radians."""
+        covariance = np.mean([one.covariance for one in passes], axis=0)
+        return cls(tuple(truth), np.array([one.values for one in passes]), covariance, values_of(truth))
 
     @property
     def sigma(self) -> np.ndarray:
@@ -164,9 +150,7 @@ class PassAngles:
     Attributes:
         name: of the pass.
         time: of the moment, seconds from the epoch.
-        pairs: angle -> the two lines that it lies between.
-        laboratory: line -> camera as the laboratory knows it.
-        pixel: line -> pixels of its points, (n,).
+        laboratory: angles between the lines as the laboratory knows them.
         ids: line -> names of its points, (n,).
         span: line -> first and last time of its points from the moment, seconds.
         measurement: points as the lines would see them at the moment.
@@ -175,42 +159,16 @@ class PassAngles:
 
     name: str
     time: float
-    pairs: Mapping[str, tuple[str, str]]
-    laboratory: Mapping[str, LineCamera]
-    pixel: Mapping[str, np.ndarray]
+    laboratory: LineAngles
     ids: Mapping[str, np.ndarray]
     span: Mapping[str, tuple[float, float]]
     measurement: Measurement
     estimate: Estimate
 
     @property
-    def lines(self) -> tuple[str, ...]:
-        """Those that angles are measured of."""
-        return tuple(self.pixel)
-
-    @property
-    def reference(self) -> str:
-        """The line whose look is zero in a resection: the second of the first angle."""
-        return next(iter(self.pairs.values()))[1]
-
-    @property
-    def look(self) -> np.ndarray:
-        """Angles between the lines of sight of the lines' centres in the laboratory, (m,), radians."""
-        return self._of(line_look_angle)
-
-    @property
-    def along_track(self) -> np.ndarray:
-        """Their signed part along the track, (m,), radians."""
-        return self._of(along_track_angle)
-
-    @property
-    def dihedral(self) -> np.ndarray:
-        """Angles between the planes of the lines where the points are in the laboratory, (m,), radians."""
-        cameras, pixel = self.laboratory, self.pixel
-        return np.array([dihedral_angle(cameras[a], cameras[b], (pixel[a], pixel[b])) for a, b in self.pairs.values()])
-
-    def _of(self, angle: Callable[[LineCamera, LineCamera], float]) -> np.ndarray:
-        return np.array([angle(self.laboratory[a], self.laboratory[b]) for a, b in self.pairs.values()])
+    def pairs(self) -> Mapping[str, tuple[str, str]]:
+        """Angle -> the two lines that it lies between."""
+        return self.laboratory.pairs
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -256,33 +214,23 @@ class SimulatedAngleRun(AngleRun):
 
     @property
     def measurement(self) -> Measurement:
-        """Of the pass that is shown."""
+        """Measurement of the pass that is shown."""
         return self.passes[0].measurement
 
     @property
     def estimate(self) -> Estimate:
-        """From the pass that is shown."""
+        """Estimate from the pass that is shown."""
         return self.passes[0].estimate
 
     @property
     def shown(self) -> np.random.SeedSequence:
-        """Of the errors of the pass that is shown."""
+        """Random stream of the errors of the pass that is shown."""
         return _streams(self.seed)[1]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the angles."""
+        """Names of the angles."""
         return tuple(self.flight.pairs)
-
-    @property
-    def resected(self) -> np.ndarray:
-        """The resection's angles, (m,), radians; signed like those along the track."""
-        return self.estimate.resection.angles(tuple(self.flight.pairs.values()))
-
-    @property
-    def resected_sigma(self) -> np.ndarray:
-        """Their sigma, (m,), radians."""
-        return np.sqrt(np.diag(self.estimate.resection.angle_covariance(tuple(self.flight.pairs.values()))))
 
     @property
     def narrow(self) -> np.ndarray:
@@ -292,18 +240,19 @@ class SimulatedAngleRun(AngleRun):
     @property
     def difference(self) -> np.ndarray:
         """Planes (tls) minus resection, (m,), radians: dihedral angles, but along the track where they are `narrow`."""
-        dihedral = self.estimate.angles["tls"].values - np.abs(self.resected)
-        return np.where(self.narrow, self.estimate.along.values - self.resected, dihedral)
+        estimate = self.estimate
+        dihedral = estimate.angles["tls"].values - np.abs(estimate.resected.values)
+        return np.where(self.narrow, estimate.along.values - estimate.resected.values, dihedral)
 
     @property
     def change(self) -> np.ndarray:
         """Look angles from the planes minus the laboratory's, (m,), radians."""
-        return self.estimate.look - values_of(self.flight.laboratory_look)
+        return self.estimate.look - values_of(self.flight.before_launch.look)
 
 
 def narrow(flight: AnglePass) -> np.ndarray:
     """Angles below 5 deg in the laboratory, (m,)."""
-    return values_of(flight.laboratory_look) < np.radians(5.0)
+    return values_of(flight.before_launch.look) < np.radians(5.0)
 
 
 def values_of(angles: Mapping[str, float]) -> np.ndarray:
@@ -327,40 +276,27 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
     """
     terrain, shown, repeats = _streams(seed)
     flight = fly(setup, angle_camera(setup, backend), terrain)
-    pairs = tuple(flight.pairs.values())
     count = setup.test.passes
     try:
         ground = flight.ground(flight.effects)
         removed = flight.effects if setup.test.effects.corrected else NO_EFFECTS
         measurement = flight.measure(ground, shown, removed)
-        estimate = estimated(measurement, flight)
-        planes, alongs, sections = [], [], []
+        estimate = estimated(measurement)
+        planes, alongs, resections = [], [], []
         for k, stream in enumerate(repeats.spawn(count)):
             once = flight.measure(ground, stream, removed)
-            section = resected(once, flight)
-            planes.append(tls_angles(centred(once, section), flight))
-            alongs.append(sighted(once, section, flight)[1])
-            sections.append(section)
+            section = resected(once)
+            planes.append(tls_angles(centred(once, section)))
+            alongs.append(sighted(once, section)[1])
+            resections.append(_resected_angles(once, section))
             advance("passes", k + 1, count)
-        first = Scatter(
-            np.array([p.values for p in planes]),
-            np.mean([p.covariance for p in planes], axis=0),
-            values_of(flight.dihedral),
-        )
-        along = values_of(flight.along_track)
-        second = Scatter(
-            np.array([r.angles(pairs) for r in sections]),
-            np.mean([r.angle_covariance(pairs) for r in sections], axis=0),
-            along,
-        )
-        third = Scatter(np.array([a.values for a in alongs]), np.mean([a.covariance for a in alongs], axis=0), along)
+        first, third = Scatter.of(planes, flight.dihedral), Scatter.of(alongs, flight.along_track)
+        second = Scatter.of(resections, flight.along_track)
         common = centred(measurement, estimate.resection)
         one = PassAngles(
             "pass 1",
             flight.spec.time,
-            flight.pairs,
-            {name: flight.laboratory[name] for name in flight.lines},
-            flight.pixel,
+            flight.before_launch,
             {name: np.array([f"point {k + 1}" for k in range(len(p))]) for name, p in flight.pixel.items()},
             dict.fromkeys(flight.lines, (0.0, 0.0)),
             measurement,
@@ -378,7 +314,7 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
             resection=second,
             along=third,
             difference_sigma=np.std(off, 0, ddof=1),
-            table=sensitivity(measurement.station, common.strips, flight.pairs),
+            table=plane_angles.sensitivity(measurement.station, common.strips, flight.pairs),
             height=flight.height_per_arcsec(),
         )
     except (PlaneError, AngleError, ResectionError) as error:
@@ -386,19 +322,25 @@ def run_angle(setup: AngleSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _streams(seed: int) -> tuple[np.random.SeedSequence, np.random.SeedSequence, np.random.SeedSequence]:
-    """Of the terrain, of the errors of the pass that is shown, of those of its repeats."""
+    """Random streams of the terrain, of the errors of the pass that is shown, and of those of its repeats."""
     terrain, shown, repeats = np.random.SeedSequence(seed).spawn(3)
     return terrain, shown, repeats
 
 
-def resected(measurement: Measurement, flight: TestedLines) -> Resection:
-    """Space resection. Raises ResectionError."""
+def resected(measurement: Measurement) -> Resection:
+    """Space resection, in which the look of the second line of the first angle is zero. Raises ResectionError."""
     m = measurement
     lines = {
         name: ObservedLine.of(strip, m.tangent[name], look=m.look[name], offset=m.offset[name])
         for name, strip in m.strips.items()
     }
-    return resect(m.station, lines, reference=flight.reference)
+    return resect(m.station, lines, reference=next(iter(m.pairs.values()))[1])
+
+
+def _resected_angles(measurement: Measurement, section: Resection) -> AlongTrackAngles:
+    """The angles of a resection, signed like those along the track."""
+    pairs = tuple(measurement.pairs.values())
+    return AlongTrackAngles(section.angles(pairs), section.angle_covariance(pairs))
 
 
 def centred(measurement: Measurement, section: Resection) -> Measurement:
@@ -412,30 +354,26 @@ def centred(measurement: Measurement, section: Resection) -> Measurement:
     )
 
 
-def tls_angles(common: Measurement, flight: TestedLines) -> PlaneAngles:
-    """Angles between the planes by total least squares; of a measurement that is `centred`."""
-    return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], _index(flight))
+def tls_angles(common: Measurement) -> PlaneAngles:
+    """Angles between the planes by total least squares, from a measurement that is `centred`."""
+    return angles_between([fit_plane(common.station, strip) for strip in common.strips.values()], common.which)
 
 
-def sighted(measurement: Measurement, section: Resection, flight: TestedLines) -> tuple[np.ndarray, AlongTrackAngles]:
+def sighted(measurement: Measurement, section: Resection) -> tuple[np.ndarray, AlongTrackAngles]:
     """Angles between the lines of sight of the lines' centres, (m,), radians, and their part along the track."""
     common, frames = centred(measurement, section), []
     for name, strip in common.strips.items():
         distance = np.linalg.norm(strip.points - common.station.position, axis=1)[:, None]
         straight = Strip(strip.points + distance * measurement.bow[name] @ section.axes(name).T, strip.covariance)
-        frames.append(line_frame(fit_plane(common.station, straight), measurement.along[name], BEND))
-    index = _index(flight)
-    look = np.array([float(look_angle(frames[a].central, frames[b].central)) for a, b in index])
-    return look, along_track_angles(frames, index)
+        plane = fit_plane(common.station, straight)
+        frames.append(plane_angles.line_frame(plane, measurement.along[name], BEND))
+    looks = [plane_angles.look_angle(frames[a].central, frames[b].central) for a, b in common.which]
+    return np.array(looks, np.float64), plane_angles.along_track_angles(frames, common.which)
 
 
-def _index(flight: TestedLines) -> list[tuple[int, int]]:
-    return [(flight.lines.index(a), flight.lines.index(b)) for a, b in flight.pairs.values()]
-
-
-def estimated(measurement: Measurement, flight: TestedLines) -> Estimate:
-    """All methods. Raises PlaneError, AngleError, ResectionError."""
-    section = resected(measurement, flight)
+def estimated(measurement: Measurement) -> Estimate:
+    """The angles by all methods. Raises PlaneError, AngleError, ResectionError."""
+    section = resected(measurement)
     common = centred(measurement, section)
     planes: dict[Method, tuple[PlaneFit, ...]] = {}
     with warnings.catch_warnings():
@@ -443,8 +381,8 @@ def estimated(measurement: Measurement, flight: TestedLines) -> Estimate:
         warnings.simplefilter("ignore", NearVerticalWarning)
         for method in METHODS:
             planes[method] = tuple(fit_plane(common.station, strip, method) for strip in common.strips.values())
-    angles = {method: angles_between(fits, _index(flight)) for method, fits in planes.items()}
-    return Estimate(planes, angles, *sighted(measurement, section, flight), section)
+    angles = {method: angles_between(fits, measurement.which) for method, fits in planes.items()}
+    return Estimate(planes, angles, *sighted(measurement, section), section, _resected_angles(measurement, section))
 
 
 def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
@@ -464,7 +402,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
                 warnings.simplefilter("always", NearVerticalWarning)
                 try:
                     fits = [fit_plane(moved.station, strip, method) for strip in moved.strips.values()]
-                    angles = angles_between(fits, _index(flight))
+                    angles = angles_between(fits, moved.which)
                     values, sigma = angles.values, angles.sigma
                     steepest = min(abs(float(fit.normal[2])) for fit in fits)
                 except PlaneError:
@@ -476,7 +414,7 @@ def frame_rows(flight: AnglePass, common: Measurement) -> tuple[FrameRow, ...]:
 
 def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
     """Each effect alone and all three, on the true points; and the datum's shift, if there is one."""
-    truth = values_of(flight.dihedral)
+    truth, names = values_of(flight.dihedral), tuple(flight.pairs)
     none = (0.0, 0.0, 0.0)
 
     def off(effects: LightEffects, removed: LightEffects) -> np.ndarray:
@@ -485,12 +423,12 @@ def effect_rows(flight: AnglePass) -> tuple[EffectRow, ...]:
     wavelength = flight.spec.effects.wavelength
     cases = {name: replace(NO_EFFECTS, wavelength=wavelength, **{name: True}) for name in EFFECTS}
     cases["all"] = LightEffects(wavelength=wavelength)
-    rows = [EffectRow(name, off(effects, NO_EFFECTS), off(effects, effects)) for name, effects in cases.items()]
+    rows = [EffectRow(names, name, off(effects, NO_EFFECTS), off(effects, effects)) for name, effects in cases.items()]
     if any(flight.spec.errors.datum):
         shifted = _off_truth(flight, flight.measure(flight.ground(NO_EFFECTS), None), truth)
-        rows.append(EffectRow("datum", shifted, np.full(len(truth), np.nan)))
+        rows.append(EffectRow(names, "datum", shifted, np.full(len(truth), np.nan)))
     return tuple(rows)
 
 
 def _off_truth(flight: AnglePass, measured: Measurement, truth: np.ndarray) -> np.ndarray:
-    return np.asarray(tls_angles(centred(measured, resected(measured, flight)), flight).values - truth)
+    return np.asarray(tls_angles(centred(measured, resected(measured))).values - truth)

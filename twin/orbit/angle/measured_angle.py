@@ -4,15 +4,18 @@ Lines see ground points at many moments, but a plane goes through one station. S
 moment to its ground point, freed of the effects on the light, is carried along in the body: from body axes then into
 those of one moment, S + R R_i' (G_i - S_i). Biases of the attitude turn all arms alike and leave the angles as they
 are; what differs from moment to moment is in the sigmas of the points.
+
+What a simulated test was made from can be written as such measurements, a folder of tables with a test file that reads
+them back.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from analysis.orbit.angles import AngleError
 from analysis.orbit.planes import PlaneError, Station, Strip
@@ -22,32 +25,22 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.measured.orbit_data_setup import AnyAngle, MeasuredAngleSetup
 from scenes.specs.orbit.angle import LEAST_POINTS, usual_angles
 from scenes.yaml.errors import names_text, nearest
-from twin.orbit.angle.angle_flight import INTERIOR, LEAST_SIGMA, Measurement, interior, without_effects
-from twin.orbit.angle.angle_run import AngleRun, PassAngles, estimated, run_angle
+from scenes.yaml.units import MOMENT, format_quantity
+from scenes.yaml.yaml_file import dump_yaml
+from twin.orbit.angle.angle_flight import LEAST_SIGMA, Measurement, without_effects
+from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, estimated, run_angle
 from twin.orbit.flight.earth import Earth
-from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
-from twin.orbit.flight.line_camera import LineCamera, line_cameras
-from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.light_effects import EARTH_RATE, NO_EFFECTS, LightEffects
+from twin.orbit.flight.line_camera import LineAngles, LineCamera, LineTimes, line_cameras
+from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.measured.measurement_tables import read_measurements
-from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
+from twin.orbit.measured.measurement_tables import CAMERA_FILE, campaign_files, read_measurements
+from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.run.procedure import Advance, BenchError, silent
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.specs.measured.orbit_data import ReadingErrorsSpec
-
-
-@dataclass(frozen=True, eq=False)
-class _Tested:
-    """Lines and angles before there is an estimate."""
-
-    lines: tuple[str, ...]
-    pairs: Mapping[str, tuple[str, str]]
-
-    @property
-    def reference(self) -> str:
-        return next(iter(self.pairs.values()))[1]
 
 
 def run_angle_test(setup: AnyAngle, backend: Backend | None, seed: int, advance: Advance = silent) -> AngleRun:
@@ -72,14 +65,14 @@ def run_measured_angle(setup: MeasuredAngleSetup, seed: int = 0, advance: Advanc
     passes = []
     for one in read_measurements(setup.data, setup.camera, advance, needed={}):
         try:
-            passes.append(measured_angles(setup, one))
+            passes.append(_measured_angles(setup, one))
         except (PlaneError, AngleError, ResectionError, ValueError) as error:
             remedy = "more points on each line, spread over its length, and the right conventions"
             raise BenchError(f"{one.name}: {error}", ("data",), remedy) from error
     return AngleRun(setup=setup, seed=seed, passes=tuple(passes))
 
 
-def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAngles:
+def _measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAngles:
     """Angles of one pass.
 
     Args:
@@ -97,37 +90,30 @@ def measured_angles(setup: MeasuredAngleSetup, one: PassMeasurements) -> PassAng
     enough = tuple(name for name in setup.camera.lines if name in points and len(points[name].point) >= LEAST_POINTS)
     pairs = _pairs(setup, one, enough)
     used = [name for name in enough if any(name in pair for pair in pairs.values())]
-    tested = _Tested(tuple(used), pairs)
     path = TabulatedTrajectory(one.platform)
     seconds = {name: one.line_times[name].at(points[name].line) for name in used}
-    moment = float(np.mean(seconds[tested.reference])) if test.time is None else test.time
+    moment = float(np.mean(seconds[next(iter(pairs.values()))[1]])) if test.time is None else test.time
     if not path.known(moment):
         allowed = f"a moment within the readings of {one.name}, {path.first:.9g} s to {path.last:.9g} s, and in no gap"
         raise test.error("orbit or attitude are not known then", ("time",), found=f"{moment:g} s", allowed=allowed)
-    e = test.effects
-    removed = LightEffects(e.light_time, e.aberration, e.refraction, e.wavelength) if e.corrected else NO_EFFECTS
-    laboratory = {name: camera for name, camera in line_cameras(setup.camera).items() if name in used}
+    removed = LightEffects.of(test.effects) if test.effects.corrected else NO_EFFECTS
+    pixel = FrozenMap({name: points[name].pixel for name in used})
+    laboratory = LineAngles(FrozenMap(line_cameras(setup.camera)), FrozenMap(pairs), pixel)
     strips = {
-        name: _strip(one, points[name], laboratory[name], path, (name, moment), removed, test.errors) for name in used
+        name: _strip(one, points[name], laboratory.cameras[name], path, (name, moment), removed, test.errors)
+        for name in used
     }
-    inside = {name: interior(laboratory[name], points[name].pixel) for name in used}
     noise = test.errors.gps
     sigma = float(np.sqrt(np.mean(np.square(noise.noise)) + np.mean(np.square(noise.drift))))
-    measurement = Measurement(
-        Station.of(path.position(moment), sigma),
-        strips,
-        **{key: {name: each[key] for name, each in inside.items()} for key in INTERIOR},
-    )
+    measurement = Measurement.of(laboratory, Station.of(path.position(moment), sigma), strips)
     return PassAngles(
         one.name,
         moment,
-        FrozenMap(pairs),
-        FrozenMap(laboratory),
-        FrozenMap({name: points[name].pixel for name in used}),
+        laboratory,
         FrozenMap({name: one.ground.ids[points[name].point] for name in used}),
         FrozenMap({k: (float(np.min(t) - moment), float(np.max(t) - moment)) for k, t in seconds.items()}),
         measurement,
-        estimated(measurement, tested),
+        estimated(measurement),
     )
 
 
@@ -214,3 +200,81 @@ def _of_readings(away: np.ndarray, interval: float, sigma: tuple[float, float, f
     number = np.round(away / interval).astype(int)
     _, which, count = np.unique(number, return_inverse=True, return_counts=True)
     return float(np.mean(np.square(sigma))) * count[which] * np.minimum(np.abs(away) / interval, 1.0)
+
+
+TEST_FILE = "angle.yaml"
+_LINE_TIME = 1e-3
+"""Seconds. All points are seen in the one line of the moment, which one on either side gives a time."""
+_SPAN, _READINGS = 20.0, 41
+"""Seconds before and after the moment, as far as the orbit goes, and readings in them; one is at the moment."""
+_IMAGE_SIGMA = 1e-6
+"""Pixels: the errors of the points are those on the ground, and a table's sigmas must be positive."""
+
+
+def angle_exported(run: AngleRun) -> dict[str, str]:
+    """Path -> text of the files: the pass that is shown, with the errors that were drawn for it.
+
+    Raises:
+        InputError: the measurements are files already, or the lines are an instrument's, which no payload's file says.
+    """
+    test = run.setup.test
+    if not isinstance(run, SimulatedAngleRun):
+        text = "measurements are files already; --export writes those of a simulation"
+        raise test.error(text, ("data",), allowed="the file of a simulated test")
+    if run.setup.camera is None:
+        text = "the lines of an instrument are traced, and no payload's file says where their pixels look"
+        raise test.error(text, ("camera",), found=str(test.camera), allowed="a payload to export measurements of")
+    files = campaign_files([_measurements(run)], run.setup.camera.plain())
+    return files | {TEST_FILE: dump_yaml(_test(run))}
+
+
+def _measurements(run: SimulatedAngleRun) -> PassMeasurements:
+    """The shown pass before anything was taken out of its points."""
+    flight, spec = run.flight, run.flight.spec
+    raw = flight.measure(flight.ground(flight.effects), run.shown, NO_EFFECTS)
+    station = raw.station.position
+    path, moment = flight.trajectory, spec.time
+    step = 2.0 * _SPAN / (_READINGS - 1)
+    around = moment + step * (np.arange(_READINGS) - _READINGS // 2)
+    times = around[(around >= path.first) & (around <= path.last)]
+    if len(times) < 5:
+        end = 0.9 * min(moment - path.first, path.last - moment)
+        times = moment + end * np.linspace(-1.0, 1.0, 5)
+    moved = station - path.position(moment)
+    # aberration goes by the velocity against the stars, which an error of the place does not change
+    velocity = path.velocity(times) - np.cross([0.0, 0.0, EARTH_RATE], moved)
+    turn = Rotation.from_matrix(path.body_to_itrs(times)).as_quat(canonical=False)
+    platform = PlatformTable.of(str(path.orbit.epoch), times, path.position(times) + moved, velocity, times, turn)
+    line_times = LineTimes.of([0.0, 1.0, 2.0], moment + _LINE_TIME * np.array([-1.0, 0.0, 1.0]))
+    ids = [f"{name}_{k}" for name in flight.lines for k in range(len(flight.pixel[name]))]
+    ground = GroundPoints.of(
+        ids,
+        np.concatenate([raw.strips[name].points for name in flight.lines]),
+        # the analysis adds its least sigma to all points
+        max(spec.errors.points**2 - LEAST_SIGMA**2, 0.0) * np.eye(3),
+        "control",
+    )
+    images, first = {}, 0
+    for name in flight.lines:
+        pixel = flight.pixel[name]
+        images[name] = ImagePoints.of(
+            first + np.arange(len(pixel)), np.ones(len(pixel)), pixel, _IMAGE_SIGMA**2 * np.eye(2)
+        )
+        first += len(pixel)
+    return PassMeasurements(spec.name, platform, dict.fromkeys(flight.lines, line_times), ground, images)
+
+
+def _test(run: SimulatedAngleRun) -> dict[str, Any]:
+    """The test file: the same angles, moment, effects and sigmas."""
+    spec = run.flight.spec
+    plain = spec.plain()
+    return {
+        "name": spec.name,
+        "description": spec.description,
+        "camera": f"./{CAMERA_FILE}",
+        "data": ".",
+        "angles": {name: list(pair) for name, pair in run.flight.pairs.items()},
+        "time": format_quantity(spec.time, MOMENT),
+        "effects": plain["effects"],
+        "errors": {"gps": {"noise": [plain["errors"]["station"]] * 3}, "star_tracker": {"noise": ["0 arcsec"] * 3}},
+    }

@@ -1,27 +1,20 @@
-"""Numbers of a check of conventions, as check.json has them."""
+"""The quantities of a check of conventions, as check.json has them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, changed
+from twin.orbit.conventions.reading_fit import Fit
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.run.plain_data import plain_data
+from twin.run.quantity import Quantity, Record
 
-
-def value_of(name: str, value: Any) -> Any:
-    """A value of a question as plain data."""
-    return list(value) if isinstance(value, tuple) else value
-
-
-def changes_data(changes: Changes) -> dict[str, Any]:
-    """Question -> value."""
-    return {name: value_of(name, value) for name, value in changes}
+Ranked = tuple[Check, Tried]
+Placed = tuple[Check, Changes]
 
 
 def changes_text(changes: Changes) -> str:
@@ -31,78 +24,50 @@ def changes_text(changes: Changes) -> str:
     return "; ".join(f"{QUESTIONS[name].title} {QUESTIONS[name].text(value)}" for name, value in changes)
 
 
-@dataclass(frozen=True)
-class ReadingNumbers:
-    """A reading and what it leaves of the points."""
-
-    changes: Mapping[str, Any]
-    possible: bool
-    why_impossible: str | None
-    rms_m: float | None
-    rms_px: float | None
-    chi_square: float | None
-    degrees_of_freedom: int | None
-    cost_above_best: float | None
-
-    @classmethod
-    def of(cls, one: Tried, run: Check) -> Self:
-        """Of one reading."""
-        fit = one.fit
-        if fit is None:
-            return cls(changes_data(one.changes), False, one.why, None, None, None, None, None)
-        excess = (fit.cost - run.best.cost) / run.factor
-        numbers = (fit.rms, fit.rms_pixels, fit.chi_square, fit.freedom, excess)
-        return cls(changes_data(one.changes), True, None, *numbers)
+def _of_fit(get: Callable[[Fit], Any]) -> Callable[[Ranked], Any]:
+    return lambda of: None if of[1].fit is None else get(of[1].fit)
 
 
-@dataclass(frozen=True)
-class AnswerNumbers:
-    """A value of a question."""
-
-    value: Any
-    stated: bool
-    best: bool
-    open: bool
-    cost_above_best: float | None
-    moves_points_by_m: float | None
-    why_impossible: str | None
-
-    @classmethod
-    def of(cls, name: str, one: Answer) -> Self:
-        """Of one value."""
-        excess = one.excess if np.isfinite(one.excess) else None
-        return cls(value_of(name, one.value), one.stated, one.best, one.possible, excess, one.moved, one.why or None)
-
-
-@dataclass(frozen=True)
-class QuestionNumbers:
-    """A convention: as stated, as found, and whether the points tell it."""
-
-    stated: Any
-    best: Any
-    told: bool
-    values: Sequence[AnswerNumbers]
-
-    @classmethod
-    def of(cls, name: str, answers: Sequence[Answer]) -> Self:
-        """Of one question."""
-        stated = next(one.value for one in answers if one.stated)
-        best = next(one.value for one in answers if one.best)
-        told = sum(one.possible for one in answers) == 1
-        return cls(value_of(name, stated), value_of(name, best), told, [AnswerNumbers.of(name, a) for a in answers])
-
-
-@dataclass(frozen=True)
-class PlaceNumbers:
-    """Where a reading puts the first points; north and east of the ground points that they show."""
-
-    changes: Mapping[str, Any]
-    why_impossible: str | None
-    points: Sequence[Mapping[str, Any]]
+READING: Record[Ranked] = Record(
+    "A reading, and what it leaves of the points.",
+    Quantity("changes", lambda of: dict(of[1].changes), "question -> value that is not the stated one"),
+    Quantity("possible", lambda of: of[1].fit is not None, "whether the points can have been imaged so"),
+    Quantity("why_impossible", lambda of: of[1].why or None, "why they cannot"),
+    Quantity("rms_m", _of_fit(lambda fit: fit.rms), "root mean square residual in plan", "rms", 1),
+    Quantity("rms_px", _of_fit(lambda fit: fit.rms_pixels), "the same along the lines' own axes", "rms", 1),
+    Quantity("chi_square", _of_fit(lambda fit: fit.chi_square), "of the residuals by their covariance"),
+    Quantity("degrees_of_freedom", _of_fit(lambda fit: fit.freedom), "number of residuals"),
+    Quantity(
+        "cost_above_best",
+        lambda of: None if of[1].fit is None else of[0].excess(of[1]),
+        "minus twice the log of the likelihood over that of the best reading",
+    ),
+)
+ANSWER: Record[Answer] = Record(
+    "What the points say of one value of a convention, the others as in the best reading.",
+    Quantity("value", lambda one: one.value, "what the convention may be"),
+    Quantity("stated", lambda one: one.stated, "whether it is the stated one"),
+    Quantity("best", lambda one: one.best, "whether it is that of the best reading"),
+    Quantity("open", lambda one: one.possible, "whether the points leave it open"),
+    Quantity(
+        "cost_above_best",
+        lambda one: one.excess if np.isfinite(one.excess) else None,
+        "minus twice the log of the likelihood over that of the best reading",
+    ),
+    Quantity("moves_points_by_m", lambda one: one.moved, "root mean square by which the points lie elsewhere"),
+    Quantity("why_impossible", lambda one: one.why or None, "why the points cannot have been imaged so"),
+)
+QUESTION: Record[tuple[Answer, ...]] = Record(
+    "A convention: as stated, as found, and whether the points tell it.",
+    Quantity("stated", lambda answers: next(one.value for one in answers if one.stated), "value in the test's file"),
+    Quantity("best", lambda answers: next(one.value for one in answers if one.best), "value in the best reading"),
+    Quantity("told", lambda answers: sum(one.possible for one in answers) == 1, "whether one value alone is possible"),
+    Quantity("values", lambda answers: answers, "what the points say of each value", record=ANSWER),
+)
 
 
 def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
-    """Of one reading, a row for each point: names, longitude and latitude, and how far from the ground point."""
+    """Where one reading puts the first points, a row for each: longitude, latitude, distance from the ground point."""
     found = run.places[changes]
     if isinstance(found, str):
         return []
@@ -120,49 +85,40 @@ def places_of(run: Check, changes: Changes) -> list[dict[str, Any]]:
     return rows
 
 
-@dataclass(frozen=True)
-class CheckNumbers:
-    """check.json."""
-
-    result: str
-    best: Mapping[str, Any]
-    alike: Sequence[Mapping[str, Any]]
-    reading: Mapping[str, Any]
-    readings_tried: int
-    decided_by_cost: float
-    factor_of_variance: float
-    ground_accuracy_m: float | None
-    image_points: Mapping[str, int]
-    gross_errors: Mapping[str, Sequence[str]]
-    questions: Mapping[str, QuestionNumbers]
-    ranking: Sequence[ReadingNumbers]
-    places: Sequence[PlaceNumbers]
-
-    @classmethod
-    def of(cls, run: Check) -> Self:
-        """Of a check."""
-        reading = changed(run.stated, run.best.changes)
-        places = [
-            PlaceNumbers(changes_data(one), at if isinstance(at, str) else None, places_of(run, one))
-            for one, at in run.places.items()
-        ]
-        return cls(
-            result=run.verdict,
-            best=changes_data(run.best.changes),
-            alike=[changes_data(one) for one in run.alike],
-            reading={name: value_of(name, QUESTIONS[name].get(reading)) for name in run.answers},
-            readings_tried=run.count,
-            decided_by_cost=DECIDED,
-            factor_of_variance=run.factor,
-            ground_accuracy_m=run.readings.ground.accuracy,
-            image_points={name: len(raw.line) for name, raw in run.readings.images.items()},
-            gross_errors={name: list(points) for name, points in run.wrong.items()},
-            questions={name: QuestionNumbers.of(name, answers) for name, answers in run.answers.items()},
-            ranking=[ReadingNumbers.of(one, run) for one in run.tried],
-            places=places,
-        )
+PLACE: Record[Placed] = Record(
+    "Where a reading puts the first points; east and north of the ground points that they show.",
+    Quantity("changes", lambda of: dict(of[1]), "question -> value that is not the stated one"),
+    Quantity(
+        "why_impossible",
+        lambda of: at if isinstance(at := of[0].places[of[1]], str) else None,
+        "why the points lie nowhere",
+    ),
+    Quantity("points", lambda of: places_of(*of), "row by row"),
+)
 
 
-def check_numbers(run: Check) -> dict[str, Any]:
-    """Contents of check.json without its frames."""
-    return dict(plain_data(CheckNumbers.of(run)))
+def _best(run: Check) -> dict[str, Any]:
+    reading = changed(run.stated, run.best.changes)
+    return {name: QUESTIONS[name].get(reading) for name in run.answers}
+
+
+CHECK: Record[Check] = Record(
+    "check.json. Which readings of a pass explain its ground points.",
+    Quantity("result", lambda run: run.verdict, "stands, another or none: what became of the stated reading"),
+    Quantity("best", lambda run: dict(run.best.changes), "what the best reading takes otherwise than stated"),
+    Quantity("alike", lambda run: [dict(one) for one in run.alike], "other readings that are as likely"),
+    Quantity("reading", _best, "every convention of the best reading"),
+    Quantity("readings_tried", lambda run: run.count, "how many readings were tried"),
+    Quantity("decided_by_cost", lambda run: DECIDED, "cost by which two readings are told apart"),
+    Quantity("factor_of_variance", lambda run: run.factor, "by how much the sigmas' squares are too small"),
+    Quantity("ground_accuracy_m", lambda run: run.readings.ground.accuracy, "of the way to the ITRS, as stated"),
+    Quantity(
+        "image_points",
+        lambda run: {name: len(raw.line) for name, raw in run.readings.images.items()},
+        "line -> number of its points",
+    ),
+    Quantity("gross_errors", lambda run: run.wrong, "line -> points that were left out"),
+    Quantity("questions", lambda run: run.answers, "every convention by itself", record=QUESTION),
+    Quantity("ranking", lambda run: [(run, one) for one in run.tried], "readings, likeliest first", record=READING),
+    Quantity("places", lambda run: [(run, one) for one in run.places], "where the first points fall", record=PLACE),
+)

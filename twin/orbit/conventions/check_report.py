@@ -6,7 +6,7 @@ import numpy as np
 
 from twin.orbit.conventions.check_numbers import changes_text, places_of
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
-from twin.orbit.conventions.pass_readings import QUESTIONS, Changes
+from twin.orbit.conventions.pass_readings import QUESTIONS
 from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, one_sentence
 
@@ -51,9 +51,7 @@ def _verdict(run: Check) -> str:
         return one_sentence(f"The stated conventions explain the points, leaving {size}", cannot)
     was = f"under them {stated.why}" if stated.fit is None else f"which leave {_metres(stated.fit.rms)}"
     return one_sentence(
-        f"The stated conventions are wrong, {was}",
-        f"right is {changes_text(run.best.changes)}, leaving {size}",
-        cannot,
+        f"The stated conventions are wrong, {was}", f"right is {changes_text(run.best.changes)}, leaving {size}", cannot
     )
 
 
@@ -98,7 +96,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
 def _row(one: Tried, run: Check) -> tuple[Cell, ...]:
     if one.fit is None:
         return changes_text(one.changes), None, None, None, None, one.why
-    excess = (one.fit.cost - run.best.cost) / run.factor
+    excess = run.excess(one)
     told = "best" if one is run.best else "fits alike" if excess < DECIDED else "excluded"
     ratio = one.fit.chi_square / one.fit.freedom
     return changes_text(one.changes), one.fit.rms, one.fit.rms_pixels, ratio, max(excess, 0.0), told
@@ -150,10 +148,10 @@ def _places(run: Check) -> Section:
     rows: list[tuple[Cell, ...]] = []
     for changes, found in run.places.items():
         if isinstance(found, str):
-            rows.append((_reading(changes), "", "", None, None, None, None, found))
+            rows.append((changes_text(changes), "", "", None, None, None, None, found))
         for k, place in enumerate(places_of(run, changes)):
             numbers = [place[key] for key in ("longitude_deg", "latitude_deg", "east_m", "north_m")]
-            rows.append((_reading(changes) if k == 0 else "", place["point"], place["camera"], *numbers, ""))
+            rows.append((changes_text(changes) if k == 0 else "", place["point"], place["camera"], *numbers, ""))
     table = Table(
         "places",
         "Where the first points fall",
@@ -164,10 +162,6 @@ def _places(run: Check) -> Section:
     )
     text = ("With one convention changed at a time, from the stated reading.",)
     return Section("Where the first points fall", text, (table,))
-
-
-def _reading(changes: Changes) -> str:
-    return changes_text(changes)
 
 
 def _warnings(run: Check) -> tuple[str, ...]:

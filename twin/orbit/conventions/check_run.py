@@ -10,21 +10,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.stats import chi2
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue
-from twin.orbit.conventions.pass_readings import (
-    QUESTIONS,
-    Changes,
-    PassConventions,
-    PassReadings,
-    asked,
-    changed,
-    read_pass,
-    singles_and_pairs,
-)
-from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, spread
+from twin.orbit.conventions import pass_readings
+from twin.orbit.conventions.pass_readings import QUESTIONS, Changes, PassConventions, PassReadings, changed
+from twin.orbit.conventions.reading_fit import Fit, ImpossibleError, PassBench, line_of, line_times, pixel_of, spread
 from twin.orbit.flight.light_effects import LightEffects
-from twin.orbit.flight.line_camera import line_cameras
+from twin.orbit.flight.line_camera import LineTimes, line_cameras
 from twin.orbit.measured.clock import epoch_before
+from twin.orbit.measured.measurement_tables import campaign_files
+from twin.orbit.measured.pass_measurements import ImagePoints, PassMeasurements
+from twin.orbit.measured.platform_files import platform_table
 from twin.run.procedure import Advance, silent
 
 if TYPE_CHECKING:
@@ -125,15 +121,17 @@ class Check:
     count: int
     wrong: dict[str, tuple[str, ...]]
 
+    def excess(self, one: Tried) -> float:
+        """Cost of a reading beyond that of the best one, over the factor of the sigmas; infinite for an impossible."""
+        return (one.cost - self.best.cost) / self.factor
+
     @property
     def alike(self) -> tuple[Changes, ...]:
         """Other readings with no more changes than the best one, as likely: the points cannot tell which it is."""
         return tuple(
             one.changes
             for one in self.tried
-            if one is not self.best
-            and len(one.changes) <= len(self.best.changes)
-            and (one.cost - self.best.cost) / self.factor < DECIDED
+            if one is not self.best and len(one.changes) <= len(self.best.changes) and self.excess(one) < DECIDED
         )
 
     @property
@@ -149,9 +147,9 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
         InputError: files that cannot be read, or fewer than three points.
     """
     advance("readings", 0, 3)
-    readings, stated = read_pass(setup.test, setup.camera, Path())
+    readings, stated = pass_readings.read_pass(setup.test, setup.camera, Path())
     bench = _bench(setup, readings, stated)
-    others = asked(stated, readings.platform.attitude.quaternion is not None)
+    others = pass_readings.asked(stated, readings.platform.attitude.quaternion is not None)
     best, tried, count = _searched(bench, stated, others)
     advance("readings", 1, 3)
     wrong: dict[str, tuple[str, ...]] = dict.fromkeys(readings.images, ())
@@ -178,8 +176,6 @@ def run_check(setup: CheckSetup, backend: Backend | None, seed: int, advance: Ad
 
 def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -> PassBench:
     cameras = line_cameras(setup.camera)
-    effects = setup.test.effects
-    light = LightEffects(effects.light_time, effects.aberration, effects.refraction, effects.wavelength)
     images = {}
     for name, raw in readings.images.items():
         order = np.lexsort((raw.line, raw.pixel))
@@ -187,11 +183,13 @@ def _bench(setup: CheckSetup, readings: PassReadings, stated: PassConventions) -
     total = sum(len(raw.line) for raw in images.values())
     if total < 3:
         file = setup.test.image_points.file
-        raise InputError(Issue("too few image points to tell anything", file, None, (), str(total), "three or more"))
+        raise InputError(
+            Issue("too few image points to tell anything", file, found=str(total), allowed="three or more")
+        )
     clock = next(iter(readings.lines.values())).clock
     epoch = epoch_before(clock.instants("TAI"))
     part = PassReadings(readings.platform, readings.lines, readings.ground, images)
-    return PassBench(part, cameras, setup.test.uncertainty, light, epoch)
+    return PassBench(part, cameras, setup.test.uncertainty, LightEffects.of(setup.test.effects), epoch)
 
 
 def _searched(
@@ -203,7 +201,7 @@ def _searched(
     seen: set[frozenset[str]] = set()
     for _ in range(_ROUNDS):
         rough = []
-        for changes in singles_and_pairs(others, start):
+        for changes in pass_readings.singles_and_pairs(others, start):
             key = _key(changes)
             if key in seen:
                 continue
@@ -296,3 +294,33 @@ def _first_places(
         return {name: at[:count] for name, at in bench.places(changed(stated, changes)).items()}
     except ImpossibleError as error:
         return str(error)
+
+
+def exported(run: Check) -> dict[str, str]:
+    """Path -> text of a folder of measurements, in the project's own conventions.
+
+    Raises:
+        InputError: the stated conventions do not stand.
+    """
+    if run.verdict != "stands":
+        problem = "nothing is exported of a pass whose stated conventions do not stand"
+        raise InputError(Issue(problem, run.setup.test.source.file, allowed="conventions that `check` confirms"))
+    return campaign_files([measurements(run)], run.setup.camera.plain())
+
+
+def measurements(run: Check) -> PassMeasurements:
+    """The pass in the project's own conventions, read as it is stated."""
+    readings, meant = run.readings, run.stated
+    table = platform_table(readings.platform, meant.platform)
+    times, images = {}, {}
+    for name, raw in readings.images.items():
+        clock = readings.lines[name]
+        middle, _ = line_times(clock, meant, table.epoch, clock.line)
+        times[name] = LineTimes.of(clock.line - clock.line[0], middle)
+        pixels = run.setup.camera.pixels_of(name)
+        # a mirrored axis turns the sign of the correlation
+        signs = np.array([-1.0 if meant.backward else 1.0, 1.0 if meant.sees == "right" else -1.0])
+        spread = raw.covariance * signs[:, None] * signs
+        line = line_of(meant, raw, clock) - clock.line[0]
+        images[name] = ImagePoints.of(raw.point, line, pixel_of(meant, raw, pixels), spread)
+    return PassMeasurements(run.setup.test.name, table, FrozenMap(times), readings.ground.points, FrozenMap(images))

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
-from scenes.yaml.csv_table import Column, Table, read_table
-from scenes.yaml.errors import InputError, Problem, names_text, nearest, shown
+from scenes.yaml.csv_table import Column, read_table
+from scenes.yaml.errors import nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
-from twin.orbit.measured.platform_files import Conventions, PlatformReadings, read_platform
+from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
+from twin.orbit.measured.pass_measurements import ImagePoints
+from twin.orbit.measured.platform_files import Conventions, PlatformReadings, clock_of, read_platform
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
 
 if TYPE_CHECKING:
@@ -28,15 +30,6 @@ _LINES = (
     Column("line"),
     Column("time", TIME, needed=False),
     Column("date_time", text=True, needed=False),
-)
-_POINTS = (
-    Column("point", text=True),
-    Column("camera", text=True),
-    Column("line"),
-    Column("pixel"),
-    Column("sigma_line", least=1e-6, most=1e3),
-    Column("sigma_pixel", least=1e-6, most=1e3),
-    Column("correlation", needed=False, least=-0.999999, most=0.999999),
 )
 _AROUND = 120.0
 """Seconds of orbit and attitude before and after the lines that are kept: time scales differ by 70 s."""
@@ -55,26 +48,6 @@ class LineClock:
 
     line: np.ndarray
     clock: Readings
-
-
-@dataclass(frozen=True, eq=False)
-class RawPoints:
-    """Image points of a line as they stand in the file.
-
-    Attributes:
-        point: (n,) rows of the ground points.
-        line, pixel: (n,) as written.
-        covariance: (n, 2, 2) of line and pixel as written, px^2.
-    """
-
-    point: np.ndarray
-    line: np.ndarray
-    pixel: np.ndarray
-    covariance: np.ndarray
-
-    def taken(self, keep: np.ndarray) -> RawPoints:
-        """Some of them, by mask or index."""
-        return RawPoints(self.point[keep], self.line[keep], self.pixel[keep], self.covariance[keep])
 
 
 @dataclass(frozen=True)
@@ -110,13 +83,13 @@ class PassReadings:
         platform: orbit and attitude about the lines' times.
         lines: camera -> line times.
         ground: points on the ground.
-        images: camera -> image points.
+        images: camera -> image points, line and pixel as they are written.
     """
 
     platform: PlatformReadings
     lines: Mapping[str, LineClock]
     ground: GroundFile
-    images: Mapping[str, RawPoints]
+    images: Mapping[str, ImagePoints]
 
 
 def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -> tuple[PassReadings, PassConventions]:
@@ -160,9 +133,9 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
             not rise.
     """
     table = read_table(folder / spec.file, _LINES, 2)
-    clock = _clock(table, spec)
+    clock = clock_of(table, spec)
     names = table["camera"].astype(str)
-    _known(table, "camera", names, cameras)
+    require_known(table, "camera", cameras)
     found = {}
     for name in dict.fromkeys(names.tolist()):
         rows = np.flatnonzero(names == name)
@@ -178,29 +151,13 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
     return found
 
 
-def _clock(table: Table, spec: LineTimesFileSpec) -> Readings:
-    if ("time" in table) == ("date_time" in table):
-        raise InputError(spec.issue("times are not said once", ("file",), allowed="a column time [s] or date_time"))
-    try:
-        if "date_time" in table:
-            return Readings.of_texts(table["date_time"].tolist())
-        if spec.epoch is None:
-            raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
-        return Readings.after(spec.epoch, table["time"])
-    except Problem as problem:
-        if problem.within:
-            row = int(problem.within[0])
-            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
-        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
-
-
 def _image_points(
     spec: ImagePointsFileSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
-) -> Mapping[str, RawPoints]:
-    table = read_table(folder / spec.file, _POINTS)
+) -> Mapping[str, ImagePoints]:
+    table = read_table(folder / spec.file, COLUMNS["image_points"])
     known = {str(name): k for k, name in enumerate(ground.points.ids)}
     names, cameras = table["point"].astype(str), table["camera"].astype(str)
-    _known(table, "camera", cameras, tuple(lines))
+    require_known(table, "camera", tuple(lines))
     number = np.array([known.get(name, -1) for name in names.tolist()])
     if np.any(number < 0):
         row = int(np.argmax(number < 0))
@@ -213,19 +170,9 @@ def _image_points(
         if len(first) != len(rows):
             row = int(rows[np.setdiff1d(np.arange(len(rows)), first)[0]])
             raise table.error(row, "point", f"twice in {camera}", shown(str(names[row])), "each point once")
-        a, b = table["sigma_line"][rows], table["sigma_pixel"][rows]
-        c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
-        spread = np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
-        found[camera] = RawPoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
+        spread = image_covariance(table, rows)
+        found[camera] = ImagePoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
     return FrozenMap(found)
-
-
-def _known(table: Table, column: str, names: np.ndarray, allowed: tuple[str, ...]) -> None:
-    wrong = ~np.isin(names, allowed)
-    if np.any(wrong):
-        row = int(np.argmax(wrong))
-        meant = nearest(str(names[row]), allowed)
-        raise table.error(row, column, f"no such {column}", shown(str(names[row])), names_text(allowed), meant)
 
 
 def _around(platform: PlatformReadings, lines: Mapping[str, LineClock]) -> PlatformReadings:
@@ -259,14 +206,7 @@ def _attitude_part(attitude: AttitudeReadings, part: slice) -> AttitudeReadings:
 
 _SCALES = ("UTC", "GPS", "TAI", "TT")
 _FRAMES = ("ITRS", "GCRS", "EME2000", "TEME")
-_TURNED = {
-    "forward": "back",
-    "back": "forward",
-    "right": "left",
-    "left": "right",
-    "down": "up",
-    "up": "down",
-}
+_TURNED = {"forward": "back", "back": "forward", "right": "left", "left": "right", "down": "up", "up": "down"}
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from optics.geometry.pose import rotation_matrix
 from scenes.yaml.errors import InputError, Problem
-from twin.orbit.conventions.pass_readings import LineClock, PassConventions, PassReadings, RawPoints
+from twin.orbit.conventions.pass_readings import LineClock, PassConventions, PassReadings
 from twin.orbit.flight.earth import Earth, east_north_up
 from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.measured.earth_orientation import constant_orientation
+from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, platform_table
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ class Fit:
     Attributes:
         residual: (n, 2) east and north, metres.
         rms: of both together, root mean square, metres.
-        rms_pixels: the same along lines' own axes, pixels.
+        rms_pixels: root mean square along the lines' own axes, pixels.
         left: (n, 2) of the residuals when the likeliest errors of camera and platform are taken out, metres.
         noise: (n, 2, 2) covariance of each point's residual without what it shares with others, m^2.
         chi_square: of the residuals by their covariance.
@@ -106,7 +107,7 @@ class PassBench:
     _paths: dict[Conventions, TabulatedTrajectory | ImpossibleError] = field(default_factory=dict)
 
     def without(self, wrong: Mapping[str, np.ndarray]) -> PassBench:
-        """The same without image points that are wrong: line -> mask (n,)."""
+        """The bench without image points that are wrong: line -> mask (n,)."""
         images = {name: raw.taken(~wrong[name]) for name, raw in self.readings.images.items()}
         kept = {name: raw for name, raw in images.items() if len(raw.line)}
         return replace(self, readings=replace(self.readings, images=kept), _paths=self._paths)
@@ -194,7 +195,7 @@ class PassBench:
         return Fit(residual, rms, pixels, left.reshape(-1, 2), np.concatenate(noise), chi_square, cost, len(r))
 
     def _steps(
-        self, name: str, meant: PassConventions, raw: RawPoints, path: TabulatedTrajectory
+        self, name: str, meant: PassConventions, raw: ImagePoints, path: TabulatedTrajectory
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Places as read, with turns, shifts, a delay, the next pixel and a height; pixels' steps and line times."""
         n, pixels = len(raw.line), self.cameras[name].pixels
@@ -213,7 +214,7 @@ class PassBench:
         self,
         name: str,
         meant: PassConventions,
-        raw: RawPoints,
+        raw: ImagePoints,
         platform: _Turned,
         delay: np.ndarray | float = 0.0,
         step: np.ndarray | float = 0.0,
@@ -277,13 +278,13 @@ def spread(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int))
 
 
-def line_of(meant: PassConventions, raw: RawPoints, clock: LineClock) -> np.ndarray:
+def line_of(meant: PassConventions, raw: ImagePoints, clock: LineClock) -> np.ndarray:
     """Lines of image points (n,) in the numbering of the table of times."""
     number = raw.line - meant.line_origin
     return clock.line[0] + clock.line[-1] - number if meant.backward else number
 
 
-def pixel_of(meant: PassConventions, raw: RawPoints, pixels: int) -> np.ndarray:
+def pixel_of(meant: PassConventions, raw: ImagePoints, pixels: int) -> np.ndarray:
     """Pixels of image points (n,), the middle of the one that looks farthest to the right of the track being 0."""
     number = raw.pixel - meant.pixel_origin
     return number if meant.sees == "right" else pixels - 1.0 - number
@@ -308,7 +309,7 @@ def _ground_noise(known: Any, point: np.ndarray, rise: np.ndarray) -> np.ndarray
 def _covariance(
     noise: list[np.ndarray], common: list[np.ndarray], own: list[np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of all residuals, and the part of it that they share, (2n, 2n) each, m^2."""
+    """Covariance of all residuals, and the part of it that they share, (2n, 2n) each, m^2."""
     every = np.concatenate(common).reshape(-1, common[0].shape[-1])
     shared = every @ every.T
     start = 0

@@ -1,94 +1,22 @@
-"""Files, numbers and report of an export."""
+"""Files, quantities and report of an export."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
 
 from twin.orbit.export.export_run import Export, ExportedLine
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.run.artefact import Cell, Table, significant
 from twin.run.data_files import FrameFacts, tiff
-from twin.run.plain_data import plain_data
+from twin.run.quantity import Quantity, Record
 from twin.run.report import Report, Section, one_sentence
 
 FOLDER = "models"
 
 
-@dataclass(frozen=True)
-class PolynomialNumbers:
-    """Agreement of rational polynomials with the rigorous sensor between the places that were fitted."""
-
-    largest_line_px: float
-    largest_sample_px: float
-    rms_line_px: float
-    rms_sample_px: float
-
-    @classmethod
-    def of(cls, model: RationalPolynomial) -> Self:
-        """Of one line."""
-        return cls(*model.error_px, *model.rms_px)
-
-
-@dataclass(frozen=True)
-class ExportedNumbers:
-    """One line's image and its models; files are paths in the run folder, None for those that were not written."""
-
-    lines: int
-    pixels: int
-    first_pixel: int
-    first_line_time_s: float
-    line_time_s: float
-    image: str | None
-    isd: str
-    rpc: str | None
-    isd_nodes: int
-    isd_errors: Sequence[ModelError]
-    rpc_errors: PolynomialNumbers | None
-    rpc_refused: str | None
-
-    @classmethod
-    def of(cls, line: ExportedLine) -> Self:
-        """Of one line."""
-        window, polynomial = line.window, line.polynomial
-        names = _names(line)
-        return cls(
-            lines=window.sensor.lines,
-            pixels=window.pixels,
-            first_pixel=window.first_pixel,
-            first_line_time_s=window.sensor.first_line_time,
-            line_time_s=window.sensor.line_time,
-            image=names.get("image"),
-            isd=names["isd"],
-            rpc=names.get("rpc"),
-            isd_nodes=len(line.scanner.camera.seconds),
-            isd_errors=line.scanner.errors,
-            rpc_errors=None if polynomial is None else PolynomialNumbers.of(polynomial),
-            rpc_refused=line.refused or None,
-        )
-
-
-@dataclass(frozen=True)
-class ExportNumbers:
-    """What export.json holds."""
-
-    epoch_utc: str
-    truth: bool
-    heights_m: Sequence[float]
-    lines: Mapping[str, ExportedNumbers]
-
-
-def export_numbers(run: Export) -> Mapping[str, Any]:
-    """As plain data."""
-    lines = {name: ExportedNumbers.of(line) for name, line in run.lines.items()}
-    return dict(plain_data(ExportNumbers(run.epoch, run.truth, run.heights, lines)))
-
-
 def _names(line: ExportedLine) -> dict[str, str]:
-    """Files of a line."""
+    """What is written of a line -> its path in the run folder."""
     stem = f"{FOLDER}/{line.window.name}"
     names = {"isd": f"{stem}.json"}
     if line.window.frame is not None:
@@ -96,6 +24,43 @@ def _names(line: ExportedLine) -> dict[str, str]:
     if line.polynomial is not None:
         names["rpc"] = f"{stem}_RPC.TXT"
     return names
+
+
+ISD_ERROR: Record[ModelError] = Record(
+    "How far the community sensor model is from the rigorous sensor at one height, the largest over the image.",
+    Quantity("height_m", lambda one: one.height_m, "above the ellipsoid"),
+    Quantity("sample_px", lambda one: one.sample_px, "along the line"),
+    Quantity("line_px", lambda one: one.line_px, "along the track"),
+)
+RPC_ERROR: Record[RationalPolynomial] = Record(
+    "How far the polynomials are from the rigorous sensor between the places that were fitted.",
+    Quantity("largest_line_px", lambda model: model.error_px[0], "largest difference along the track"),
+    Quantity("largest_sample_px", lambda model: model.error_px[1], "largest difference along the line"),
+    Quantity("rms_line_px", lambda model: model.rms_px[0], "root mean square along the track"),
+    Quantity("rms_sample_px", lambda model: model.rms_px[1], "root mean square along the line"),
+)
+LINE: Record[ExportedLine] = Record(
+    "One line's image and its models; files are paths in the run folder, None for those that were not written.",
+    Quantity("lines", lambda line: line.window.sensor.lines, "how many"),
+    Quantity("pixels", lambda line: line.window.pixels, "how many"),
+    Quantity("first_pixel", lambda line: line.window.first_pixel, "of the image on the line"),
+    Quantity("first_line_time_s", lambda line: line.window.sensor.first_line_time, "from the epoch"),
+    Quantity("line_time_s", lambda line: line.window.sensor.line_time, "from one line to the next"),
+    Quantity("image", lambda line: _names(line).get("image"), "GeoTIFF with the polynomials inside"),
+    Quantity("isd", lambda line: _names(line)["isd"], "image support data of the community sensor model"),
+    Quantity("rpc", lambda line: _names(line).get("rpc"), "rational polynomials"),
+    Quantity("isd_nodes", lambda line: len(line.scanner.camera.seconds), "times at which station and attitude stand"),
+    Quantity("isd_errors", lambda line: line.scanner.errors, "at every height", record=ISD_ERROR),
+    Quantity("rpc_errors", lambda line: line.polynomial, "over all heights", record=RPC_ERROR),
+    Quantity("rpc_refused", lambda line: line.refused or None, "why there are no polynomials"),
+)
+EXPORT: Record[Export] = Record(
+    "export.json. Line cameras for other software.",
+    Quantity("epoch_utc", lambda run: run.epoch, "second 0 of the orbit"),
+    Quantity("truth", lambda run: run.truth, "whether camera and orbit are the true ones"),
+    Quantity("heights_m", lambda run: run.heights, "of the ground that models were fitted to: lowest, middle, highest"),
+    Quantity("lines", lambda run: run.lines, "every line and its models", record=LINE),
+)
 
 
 def export_files(run: Export) -> dict[str, bytes]:

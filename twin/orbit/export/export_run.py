@@ -245,7 +245,7 @@ def _of_angle(setup: AngleSetup, backend: Backend, seed: int, truth: bool) -> di
 
 
 def _pitch(setup: AngleSetup, name: str) -> float:
-    """Of a line's pixels, metres."""
+    """Pitch of a line's pixels, metres."""
     if setup.camera is not None:
         return setup.camera.pitch_of(name)
     assert setup.instrument is not None

@@ -135,13 +135,13 @@ def line_scanner(
     Raises:
         ValueError: a look misses the Earth, or the trajectory is too rough for `_MOST` nodes.
     """
-    camera = effective_camera(sensor, pitch, heights[1], epoch)
+    camera = _effective_camera(sensor, pitch, heights[1], epoch)
     first, pixels = (0, camera.pixels) if window is None else window
     errors = tuple(_error(sensor, camera, height, (first, pixels)) for height in heights)
     return LineScanner(_isd(sensor, camera, name, epoch, heights, (first, pixels), errors), camera, errors)
 
 
-def effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
+def _effective_camera(sensor: Sensor, pitch: float, height: float, epoch: str) -> EffectiveCamera:
     """The camera with straight light that sees what a sensor sees at a height above the ellipsoid, metres.
 
     Args:
@@ -443,9 +443,7 @@ def _sun(sensor: Sensor, epoch: str, center: float) -> Array:
 
 def _notes(sensor: Sensor, heights: tuple[float, float, float], errors: tuple[ModelError, ...]) -> list[str]:
     """What the model cannot carry, and how much that is."""
-    effects = sensor.effects
-    names = {"light_time": "light time", "aberration": "aberration", "refraction": "refraction"}
-    on = [text for name, text in names.items() if getattr(effects, name)]
+    on = sensor.effects.names
     carried = (
         f"{', '.join(on)} stand in the attitude and the distortion as they are at {heights[1]:g} m above the ellipsoid"
         if on

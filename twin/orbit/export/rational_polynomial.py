@@ -30,9 +30,10 @@ _GRID = (24, 24, 9)
 """Lines, pixels and heights that are fitted; the checks lie between them."""
 _ROUNDS = 6
 _RANK = 1e-11
-"""Of singular values. A cubic ratio has more coefficients than an image has shape: the rest stay small."""
+"""Smallest singular value that counts, relative to the largest. A cubic ratio has more coefficients than an image has
+shape, and the rest stay small."""
 _DAMPING = (0.0, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)
-"""Of the denominators; the last leaves polynomials."""
+"""Damping of the denominators that is tried; the last leaves polynomials."""
 
 
 @dataclass(frozen=True, eq=False)

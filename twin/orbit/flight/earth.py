@@ -34,7 +34,6 @@ DAY = 86400.0
 RATE = 2.0 * np.pi * 1.00273781191135448 / DAY
 """The Earth's rate of rotation, rad/s (IERS Conventions 2010, eq. 5.15)."""
 
-_TT_FROM_TAI = 32.184
 _NODE_STEP = 3600.0
 _NODES_AROUND = 3
 _DIFFERENCE_STEP = 600.0
@@ -83,7 +82,7 @@ def ut1_of(epoch: str, dut1: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class EarthRotation:
-    """Rotation GCRS -> ITRS around an epoch; made by `rotation_over`. Seconds are SI seconds of atomic time.
+    """Rotation GCRS -> ITRS around an epoch; made by `Earth.rotation`. Seconds are SI seconds of atomic time.
 
     Attributes:
         pole: spline of the celestial pole's X and Y and of the locator s, radians, over seconds.
@@ -125,26 +124,18 @@ class EarthRotation:
         return tirs @ self.polar.T
 
 
-def rotation_over(
-    epoch: str, first: float, last: float, dut1: float = 0.0, polar_motion: tuple[float, float] = (0.0, 0.0)
-) -> EarthRotation:
-    """The Earth's rotation from `first` to `last`, seconds from the epoch.
+def celestial_pole(epoch: str, first: float, last: float) -> CubicSpline:
+    """Spline over time of the celestial pole's X and Y and of the locator s by IAU 2006/2000A, radians.
 
     Args:
         epoch: UTC, ISO 8601 text.
         first: begin of the span, seconds; nodes stand some hours beyond it on either side.
         last: its end, seconds.
-        dut1: UT1 - UTC at the epoch, seconds. UT1 runs on evenly from there, also over a leap second.
-        polar_motion: x and y of the pole, radians (x toward Greenwich, y toward 90 degrees west).
     """
     one, two = tai_of(epoch)
-    two += _TT_FROM_TAI / DAY
     around = np.ceil(0.5 * (last - first) / _NODE_STEP) + _NODES_AROUND
     node = 0.5 * (first + last) + _NODE_STEP * np.arange(-around, around + 1.0)
-    pole = np.stack(erfa.xys06a(one, two + node / DAY), axis=-1)
-    polar = np.asarray(erfa.pom00(*polar_motion, erfa.sp00(one, two)))
-    polar.setflags(write=False)
-    return EarthRotation(CubicSpline(node, pole), float(erfa.era00(*ut1_of(epoch, dut1))), polar)
+    return CubicSpline(node, np.stack(erfa.xys06a(one, two + erfa.TTMTAI / DAY + node / DAY), axis=-1))
 
 
 _WGS84 = pyproj.Geod(ellps="WGS84")
@@ -195,8 +186,20 @@ class Earth:
         return cls(spec.ut1_utc, spec.polar_motion)
 
     def rotation(self, epoch: str, first: float, last: float) -> EarthRotation:
-        """Its rotation from `first` to `last`, seconds from the epoch, for many look-ups."""
-        return rotation_over(epoch, first, last, self.dut1, self.polar_motion)
+        """The Earth's rotation from `first` to `last`, seconds from the epoch, for many look-ups.
+
+        UT1 runs on evenly from the epoch, also over a leap second.
+
+        Args:
+            epoch: UTC, ISO 8601 text.
+            first: begin of the span, seconds.
+            last: its end, seconds.
+        """
+        one, two = tai_of(epoch)
+        polar = np.asarray(erfa.pom00(*self.polar_motion, erfa.sp00(one, two + erfa.TTMTAI / DAY)))
+        polar.setflags(write=False)
+        angle = float(erfa.era00(*ut1_of(epoch, self.dut1)))
+        return EarthRotation(celestial_pole(epoch, first, last), angle, polar)
 
     def to_itrs(self, seconds: Any, epoch: str) -> np.ndarray:
         """Rotation GCRS -> ITRS.

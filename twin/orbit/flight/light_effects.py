@@ -8,10 +8,14 @@ aberration is v/c = 25 urad (5.2 arcsec), 12.7 m on the ground along the track; 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
+
+if TYPE_CHECKING:
+    from scenes.specs.orbit.angle import EffectsSpec, LightEffectsSpec
 
 SPEED_OF_LIGHT = 299_792_458.0
 """m/s."""
@@ -43,6 +47,17 @@ class LightEffects:
     aberration: bool = True
     refraction: bool = True
     wavelength: float = 650e-9
+
+    @classmethod
+    def of(cls, spec: EffectsSpec | LightEffectsSpec) -> LightEffects:
+        """The effects that a test's file switches on."""
+        return cls(spec.light_time, spec.aberration, spec.refraction, spec.wavelength)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects that are on, in words."""
+        on = {"light time": self.light_time, "aberration": self.aberration, "refraction": self.refraction}
+        return tuple(name for name, is_on in on.items() if is_on)
 
 
 NO_EFFECTS = LightEffects(light_time=False, aberration=False, refraction=False)

@@ -71,7 +71,7 @@ class LineTimes:
 
     @classmethod
     def even(cls, first_time: float, line_time: float, lines: int) -> LineTimes:
-        """Of lines that follow one another evenly, from line 0 on; times in seconds."""
+        """Times of lines that follow one another evenly, from line 0 on, seconds."""
         last = float(max(lines - 1, 1))
         return cls.of([0.0, last], [first_time, first_time + last * line_time])
 
@@ -132,7 +132,7 @@ _NOISE = 1e-14
 """Terms of a traced series below this share are rounding and are dropped (one pixel is 1e-6 rad)."""
 _PLANE_POINTS = 1001
 _LOOK_TERMS = 12
-"""Of the tangent of a look angle within 30 deg over one CCD: its series falls off by a thousandfold every few terms."""
+"""Terms for the tangent of a look angle within 30 deg over one CCD. They fall off by a thousandfold every few terms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,7 +239,7 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
     degree = 5 if line.k2 else 3
 
     def look(pixel: np.ndarray, ccd: CcdSpec | None = None) -> np.ndarray:
-        x, y = (ccd_places(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
+        x, y = (_ccd_places(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
         square = x**2 + y**2
         corrected = 1.0 + line.k1 * square + line.k2 * square**2
         return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.focal_length)], axis=-1) @ to_body.T
@@ -267,15 +267,15 @@ def pixel_places(line: LineCameraSpec, pixel: np.ndarray, pixels: int, pitch: fl
         (N, 2).
     """
     at = np.asarray(pixel, dtype=np.float64)
-    found = ccd_places(line, None, at, pixels, pitch)
+    found = _ccd_places(line, None, at, pixels, pitch)
     for ccd in line.ccds:
         here = (at >= ccd.first - 0.5) & (at <= ccd.last + 0.5)
-        found[here] = ccd_places(line, ccd, at[here], pixels, pitch)
+        found[here] = _ccd_places(line, ccd, at[here], pixels, pitch)
     return found
 
 
-def ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
-    """As `pixel_places`, of pixels of one CCD, or of a straight line without CCDs."""
+def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pixels: int, pitch: float) -> np.ndarray:
+    """Places of pixels of one CCD, or of a straight line without CCDs; see `pixel_places`."""
     straight = (pixel - 0.5 * (pixels - 1)) * pitch
     if ccd is None:
         return np.stack([np.zeros_like(straight), straight], axis=-1)
@@ -355,6 +355,39 @@ def dihedral_angle(
     """
     angle = _angle(*(line_normal(camera, place) for camera, place in zip((a, b), places, strict=True)))
     return min(angle, np.pi - angle)
+
+
+@dataclass(frozen=True, eq=False)
+class LineAngles:
+    """Angles between pairs of lines, radians, by the angle's name.
+
+    Attributes:
+        cameras: line -> camera.
+        pairs: angle -> the two lines that it lies between.
+        pixel: line -> places of its points, (n,), of the lines that angles are measured of.
+    """
+
+    cameras: Mapping[str, LineCamera]
+    pairs: Mapping[str, tuple[str, str]]
+    pixel: Mapping[str, np.ndarray]
+
+    @property
+    def look(self) -> dict[str, float]:
+        """Angles between the lines of sight of the lines' centres; see `look_angle`."""
+        return {name: look_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def along_track(self) -> dict[str, float]:
+        """Signed part of `look` along the track, positive where the first line looks ahead of the second."""
+        return {name: along_track_angle(self.cameras[a], self.cameras[b]) for name, (a, b) in self.pairs.items()}
+
+    @property
+    def dihedral(self) -> dict[str, float]:
+        """Angles between the planes of the lines where the points are; see `dihedral_angle`."""
+        return {
+            name: dihedral_angle(self.cameras[a], self.cameras[b], (self.pixel[a], self.pixel[b]))
+            for name, (a, b) in self.pairs.items()
+        }
 
 
 def line_normal(camera: LineCamera, pixel: np.ndarray | None = None) -> np.ndarray:

@@ -26,7 +26,7 @@ GM = 3.986004415e14
 J2 = 1.0826266835e-3
 """EGM96: -sqrt(5) times the normalised C20, -484.165371736e-6."""
 FIELD_RADIUS = 6378136.3
-"""Of the field's expansion, metres (EGM96)."""
+"""Reference radius of the field's expansion, metres (EGM96)."""
 SUN_RATE = 2.0 * math.pi / (365.2421897 * DAY)
 """Mean motion of the mean Sun in right ascension, rad/s; tropical year."""
 TOLERANCE = 1e-12
@@ -183,13 +183,6 @@ def propagate(spec: OrbitSpec, earth: Earth, tolerance: float = TOLERANCE) -> Or
         state = np.concatenate([to_gcrs.T @ spec.state.position, to_gcrs.T @ spec.state.velocity])
     parts = [_solve(state, end, tolerance) if end else None for end in (-spec.before, spec.after)]
     return Orbit(spec.epoch, earth, -spec.before, spec.after, to_gcrs, rotation, *parts)
-
-
-def descending_local_time(orbit: Orbit) -> float:
-    """Local mean solar time of the osculating orbit's descending node at the epoch, seconds of the day."""
-    r, v = orbit.equatorial(0.0)
-    h = np.cross(r, v)
-    return _local_time(math.atan2(h[0], -h[1]) + math.pi, orbit.rotation.angle, ut1_of(orbit.epoch, orbit.earth.dut1))
 
 
 def _local_time(right_ascension: float, angle: float, ut1: tuple[float, float]) -> float:

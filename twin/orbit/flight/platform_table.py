@@ -35,7 +35,7 @@ _SURELY = 1e3
 _GAP = 5.0
 """Median intervals: readings that are farther apart leave a gap, in which nothing is known."""
 _UNIT_TOLERANCE = 1e-3
-"""Of the norm of a quaternion: four decimals are enough to have measured one, and not a rotation vector."""
+"""Largest departure of a quaternion's norm from 1: four decimals pass, and a rotation vector does not."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class PlatformTable:
 
 
 def joined_quaternions(quaternion: Array) -> Array:
-    """The same rotations with neighbours on one side of the sphere, so that they can be interpolated.
+    """Quaternions of the same rotations whose neighbours lie on one side of the sphere, so that they interpolate.
 
     Args:
         quaternion: (N, 4), of which q and -q are one rotation.
@@ -159,7 +159,7 @@ class TabulatedTrajectory:
 
     @property
     def last(self) -> float:
-        """Its end, seconds."""
+        """End of the span that both orbit and attitude cover, seconds."""
         return float(min(self.table.orbit_time[-1], self.table.attitude_time[-1], self.table.usable[1]))
 
     @property

@@ -1,8 +1,6 @@
 """A line sensor in orbit: from pixel and time to the ground and back.
 
-Along the track nothing is interpolated, so that no smoothness of attitude or orbit is assumed: every line is computed
-by the rigorous model at a few Chebyshev points of the line. Between them the ground point is an analytic function of
-the pixel, and one matrix product takes a block of lines from the points to all pixels.
+Nothing is interpolated along the track, so that no smoothness of attitude or orbit is assumed.
 
 The two ways are written separately, each from the physics: `ground` follows a pixel's look down to a height, `image`
 looks for the line and the pixel on which the light from a point falls. They share no solution, so that the round trip
@@ -11,124 +9,15 @@ tests both.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
-from optics.numerics.physical_error import UnphysicalError
+from twin.orbit.flight import light_effects
 from twin.orbit.flight.earth import Earth, east_north_up
-from twin.orbit.flight.light_effects import (
-    SPEED_OF_LIGHT,
-    LightEffects,
-    aberrated,
-    refracted,
-    turned_with_earth,
-    unrefracted,
-)
+from twin.orbit.flight.light_effects import SPEED_OF_LIGHT, LightEffects, aberrated, turned_with_earth
 from twin.orbit.flight.line_camera import LineCamera, LineTimes
-
-_COUNTS = (8, 12, 16, 24, 32, 48)
-_TRIAL_LINES = 9
-
-
-@dataclass(frozen=True, eq=False)
-class GeolocationGrid:
-    """How the ground coordinates of an image are interpolated along its lines; made by `prepare`.
-
-    Attributes:
-        sensor: the rigorous model.
-        height: of the surface, above the ellipsoid, metres.
-        nodes: pixels where the rigorous model is evaluated, (K,).
-        error: largest difference between interpolation and rigorous model that was found half-way between the nodes
-            and at the line's ends, on lines over the whole image, metres.
-    """
-
-    sensor: Sensor
-    height: float
-    nodes: np.ndarray
-    error: float
-
-    @classmethod
-    def prepare(cls, sensor: Sensor, height: float = 0.0, tolerance: float = 1e-6) -> GeolocationGrid:
-        """Take as few nodes as keep the error below a tolerance, metres.
-
-        Raises:
-            ValueError: a look misses the Earth, or the camera's looks are too rough for the tolerance.
-        """
-        line = np.linspace(-0.5, sensor.lines - 0.5, _TRIAL_LINES)
-        error = np.inf
-        for count in _COUNTS:
-            grid = cls(sensor, height, _nodes(count, sensor.camera.pixels), error)
-            ends = np.array([-0.5, sensor.camera.pixels - 0.5])
-            between = np.concatenate([0.5 * (grid.nodes[1:] + grid.nodes[:-1]), ends])
-            exact = _rigorous(sensor, line, between, height)
-            error = float(np.max(np.linalg.norm(grid._interpolated(line, between) - exact, axis=-1)))
-            if error <= tolerance:
-                return cls(sensor, height, grid.nodes, error)
-        raise UnphysicalError(f"{_COUNTS[-1]} nodes leave an error of {error:.3g} m, more than {tolerance:.3g} m")
-
-    def blocks(self, lines: np.ndarray, pixels: np.ndarray, block: int = 128) -> Iterator[tuple[slice, np.ndarray]]:
-        """Ground points of all these lines and pixels, block by block.
-
-        Args:
-            lines: image coordinates, (L,), any real numbers inside the image.
-            pixels: likewise, (P,).
-            block: lines at a time; the memory is about 24 block P bytes.
-
-        Yields:
-            Which of the lines, and their points in the ITRS, (n, P, 3), metres (float64; a view whose coordinates lie
-            in planes, so that ``[..., 0]`` is contiguous).
-
-        Raises:
-            ValueError: a line or pixel outside the image, or a look that misses the Earth.
-        """
-        lines, pixels = np.asarray(lines, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
-        if not np.all((pixels >= -0.5) & (pixels <= self.sensor.camera.pixels - 0.5)):
-            raise ValueError(f"a pixel outside the line, which reaches from -0.5 to {self.sensor.camera.pixels - 0.5}")
-        weights = self._weights(pixels)
-        for start in range(0, len(lines), block):
-            part = slice(start, min(start + block, len(lines)))
-            yield part, self._spread(lines[part], weights)
-
-    def _interpolated(self, lines: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        return self._spread(lines, self._weights(pixels))
-
-    def _spread(self, lines: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        known = _rigorous(self.sensor, lines, self.nodes, self.height)
-        planes = np.ascontiguousarray(np.moveaxis(known, -1, 0))
-        return np.moveaxis((planes.reshape(-1, len(self.nodes)) @ weights).reshape(3, len(lines), -1), 0, -1)
-
-    def _weights(self, pixels: np.ndarray) -> np.ndarray:
-        """Values at the nodes -> values at pixels: (K, P)."""
-        count = len(self.nodes)
-        scale = np.full(count, 2.0 / count)
-        scale[0] = 1.0 / count
-        at_nodes, at_pixels = (
-            chebyshev.chebvander((2.0 * place + 1.0) / self.sensor.camera.pixels - 1.0, count - 1)
-            for place in (self.nodes, pixels)
-        )
-        return np.asarray((at_nodes * scale) @ at_pixels.T)
-
-
-def _nodes(count: int, pixels: int) -> np.ndarray:
-    return 0.5 * (chebyshev.chebpts1(count) + 1.0) * pixels - 0.5
-
-
-def _rigorous(sensor: Sensor, lines: np.ndarray, pixels: np.ndarray, height: float) -> np.ndarray:
-    """Points (L, P, 3).
-
-    Raises:
-        ValueError: a look misses the Earth; interpolation would spread it over the line.
-    """
-    line, pixel = np.meshgrid(lines, pixels, indexing="ij")
-    points = sensor.ground(line.ravel(), pixel.ravel(), height).reshape(*line.shape, 3)
-    if not np.all(np.isfinite(points)):
-        raise UnphysicalError("a look misses the Earth")
-    return points
-
 
 _MOST_STEPS = 30
 _ARRIVED = 1e-7
@@ -142,7 +31,7 @@ class Platform(Protocol):
     """
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """Of the body's origin, (N, 3), metres."""
+        """Position of the body's origin, (N, 3), metres."""
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
         """Against the stars, (N, 3), m/s."""
@@ -233,7 +122,7 @@ class Sensor:
             way = np.linalg.norm(point - station, axis=-1) / SPEED_OF_LIGHT
             point, station = turned_with_earth(point, way), turned_with_earth(station, way)
         if self.effects.refraction:
-            point = refracted(point, station, self.earth, self.effects.wavelength)
+            point = light_effects.refracted(point, station, self.earth, self.effects.wavelength)
         return point
 
     def image(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -298,7 +187,7 @@ class Sensor:
                 way = np.linalg.norm(source - station, axis=-1) / SPEED_OF_LIGHT
             left_station = turned_with_earth(station, way)
             if self.effects.refraction:
-                source = unrefracted(source, left_station, self.earth, self.effects.wavelength)
+                source = light_effects.unrefracted(source, left_station, self.earth, self.effects.wavelength)
             if self.effects.light_time:
                 way = np.linalg.norm(source - left_station, axis=-1) / SPEED_OF_LIGHT
                 source = turned_with_earth(source, -way)

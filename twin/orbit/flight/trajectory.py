@@ -127,7 +127,7 @@ def _drift(time: np.ndarray, sigma: np.ndarray, correlation_time: float, seed: n
 
 @dataclass(frozen=True, eq=False)
 class MeasurementErrors:
-    """Errors, measured minus true; made by `draw_errors`.
+    """Errors, measured minus true; made by `_draw_errors`.
 
     Attributes:
         position_terms: series of position errors in the orbital frame, metres.
@@ -170,7 +170,7 @@ class MeasurementErrors:
         return _sum(self.attitude_terms, seconds) + self.bias + shape[..., None] * self.thermal + drift
 
 
-def draw_errors(
+def _draw_errors(
     spec: ErrorsSpec, first: float, last: float, seed: int, terms: Collection[str] = TERMS
 ) -> MeasurementErrors:
     """Errors over a span of time.
@@ -290,11 +290,7 @@ class Trajectory:
         Raises:
             ValueError: an unknown term.
         """
-        return replace(self, errors=draw_errors(spec, self.first, self.last, seed, terms))
-
-    def without_errors(self) -> Trajectory:
-        """The truth."""
-        return replace(self, errors=None)
+        return replace(self, errors=_draw_errors(spec, self.first, self.last, seed, terms))
 
     def _motion(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         position, velocity, inertial = self.orbit.itrs(seconds)

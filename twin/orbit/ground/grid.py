@@ -42,16 +42,24 @@ class GroundFrame:
 
     def itrs(self, east: Any, north: Any, height: Any) -> np.ndarray:
         """Points in the ITRS: coordinates (...), metres -> (..., 3), metres."""
-        per_longitude, per_latitude = self.scale
-        longitude = self.longitude + np.asarray(east, dtype=np.float64) / per_longitude
-        return _EARTH.ecef(longitude, self.latitude + np.asarray(north, dtype=np.float64) / per_latitude, height)
+        return _EARTH.ecef(*self.geographic(east, north), height)
 
     def local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """East, north and height, metres, (...) each, of points (..., 3) in the ITRS; NaN stays NaN."""
         longitude, latitude, height = _EARTH.geodetic(points)
+        return *self.plane(longitude, latitude), height
+
+    def geographic(self, east: Any, north: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Longitude and latitude (...), radians, of east and north (...), metres."""
+        per_longitude, per_latitude = self.scale
+        longitude = self.longitude + np.asarray(east, dtype=np.float64) / per_longitude
+        return longitude, self.latitude + np.asarray(north, dtype=np.float64) / per_latitude
+
+    def plane(self, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """East and north (...), metres, of longitude, any turn of it, and latitude (...), radians."""
         per_longitude, per_latitude = self.scale
         turn = (longitude - self.longitude + np.pi) % (2.0 * np.pi) - np.pi
-        return turn * per_longitude, (latitude - self.latitude) * per_latitude, height
+        return turn * per_longitude, (latitude - self.latitude) * per_latitude
 
 
 _CORRELATION_MARGIN = 4.0

@@ -7,7 +7,7 @@ at that place minus the error.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, spline_filter
@@ -26,6 +26,44 @@ _PER_LENGTH = 8.0
 """Cells of the smooth error in plan, in its correlation length."""
 _MARGIN = 50.0
 """Metres of true ground that are kept about the map, beside ten sigmas of its error in plan."""
+
+
+class Map(Protocol):
+    """A raster whose places are known."""
+
+    @property
+    def values(self) -> np.ndarray:
+        """(rows, columns)."""
+
+    @property
+    def valid(self) -> np.ndarray | None:
+        """(rows, columns) bool: which values there are; None for all."""
+
+    @property
+    def spacing(self) -> float:
+        """Distance of rows and columns on the ground, metres."""
+
+    def east_north(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates of places (row, column), whole or not, metres, broadcast."""
+
+    def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column (whole or not) of coordinates, metres, broadcast: the inverse of `east_north`."""
+
+
+M = TypeVar("M", bound=Map, covariant=True)
+
+
+@dataclass(frozen=True, eq=False)
+class Maps(Generic[M]):
+    """What is known of the ground.
+
+    Attributes:
+        orthophoto: grey values; of a simulated one uint16, 10 000 for an apparent reflectance of 1.
+        dem: heights above the ellipsoid, metres.
+    """
+
+    orthophoto: M
+    dem: M
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,23 +92,19 @@ class Raster:
         return self.west + self.spacing * np.asarray(column), self.north - self.spacing * np.asarray(row)
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse."""
+        """Row and column of coordinates: the inverse of `east_north`."""
         return (self.north - np.asarray(north)) / self.spacing, (np.asarray(east) - self.west) / self.spacing
 
 
 @dataclass(frozen=True, eq=False)
-class Control:
-    """The control source.
+class Control(Maps[Raster]):
+    """The maps of a simulated patch, with their errors.
 
     Attributes:
-        orthophoto: uint16 grey values, 10 000 for an apparent reflectance of 1.
-        dem: float32 heights above the ellipsoid, metres.
         shift: constant error in plan, map minus true, east and north, metres; belongs to the truth.
         smooth: the rest of the error in plan, east and north, metres, over true coordinates; belongs to the truth.
     """
 
-    orthophoto: Raster
-    dem: Raster
     shift: tuple[float, float]
     smooth: tuple[SplineGrid, SplineGrid]
 
@@ -106,10 +140,7 @@ def make_control(
     full = apparent(reflectance(extent, texture, ground, spec.changed), terrain, spec.light)
 
     def shifted(east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return (
-            east - spec.shift[0] - smooth[0](east, north),
-            north - spec.shift[1] - smooth[1](east, north),
-        )
+        return (east - spec.shift[0] - smooth[0](east, north), north - spec.shift[1] - smooth[1](east, north))
 
     east, north = inside.axes(spec.spacing)
     values = np.empty((len(north), len(east)), np.float32)

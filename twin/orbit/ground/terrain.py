@@ -92,7 +92,7 @@ class Terrain:
         return self.surface(east, north)
 
     def on_grid(self, east: np.ndarray, north: np.ndarray) -> np.ndarray:
-        """The same on a regular grid: (E,), (N,) -> (N, E), metres."""
+        """Heights on a regular grid: (E,), (N,) -> (N, E), metres."""
         return self.surface.on_grid(east, north)
 
     def slopes(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 _DARKEST, _BRIGHTEST = 0.02, 0.85
 _EXPONENT = 1.25
-"""Of the fractal's amplitude spectrum. Images of land have power spectra near frequency^-2 to frequency^-3 (Burton and
-Moorhead, Appl. Opt. 26, 157 (1987): natural scenes in general)."""
+"""Exponent of the fractal's amplitude spectrum. Images of land have power spectra near frequency^-2 to frequency^-3
+(Burton and Moorhead, Appl. Opt. 26, 157 (1987): natural scenes in general)."""
 _WILD = 2.5
 """Longest wavelength of what grows wild, in fields."""
 _BLOCK = 8.0
@@ -34,7 +34,7 @@ _LANE = 0.97
 """Share of a field's side that is left between lanes."""
 _ROAD_WIDTH = 8.0
 _ROAD_BRIGHTNESS = 1.8
-"""Of a road over the mean."""
+"""Brightness of a road over the mean."""
 _SHIFT_BITS = 4
 _ROWS = 512
 _SPARE = 4

@@ -13,6 +13,7 @@ per patch and line is rejected.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -28,7 +29,8 @@ from analysis.matching.spline import resampled
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import PhysicalError
 from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.images.imaged_ground import Frame, ImagedGround, Map
+from twin.orbit.ground.orthophoto import Map
+from twin.orbit.images.imaged_ground import ImagedGround, LineFrame
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.scene import ImagePointsSpec
@@ -79,25 +81,25 @@ class ReferenceHeights:
 
     @property
     def mean(self) -> float:
-        """Of all posts, metres."""
+        """Mean height of all posts, metres."""
         valid = self.raster.valid
         return float(np.mean(self.raster.values if valid is None else self.raster.values[valid]))
 
 
-def predicted(image: Frame, points: np.ndarray) -> np.ndarray:
+def predicted(image: LineFrame, points: np.ndarray) -> np.ndarray:
     """Row and column (n, 2) of the frame at which the measured sensor has points (n, 3), ITRS; NaN beyond its image."""
     line, pixel = image.measured.image(points)
     return np.stack([line - image.window.first_line, pixel - image.window.first_pixel], axis=-1)
 
 
-def fits(image: Frame, place: np.ndarray, border: float) -> np.ndarray:
+def fits(image: LineFrame, place: np.ndarray, border: float) -> np.ndarray:
     """Which places (..., 2) lie in a frame, so far from its border; not a place that is NaN."""
     last = np.array(image.frame.shape) - 1.0 - border
     return np.asarray(np.all((place >= border) & (place <= last), axis=-1))
 
 
-def ground_of_samples(
-    image: Frame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
+def _ground_of_samples(
+    image: LineFrame, frame: GroundFrame, heights: ReferenceHeights, points: np.ndarray, place: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """East, north and height (n, side, side) each, metres, of what the pixels about places see.
 
@@ -132,14 +134,14 @@ def ground_of_samples(
     return e, n, height + above
 
 
-def templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
+def _templates_of_map(photo: Map, samples: tuple[np.ndarray, np.ndarray, np.ndarray], sample: float) -> np.ndarray:
     """Templates (n, k, k) from an orthophoto; sample: distance of the image's pixels on the ground, metres."""
     rows, columns = photo.row_column(samples[0], samples[1])
     return resampled(photo.values, rows, columns, smoothing=SOFTENING * sample / photo.spacing)
 
 
-def templates_of_image(
-    source: Frame,
+def _templates_of_image(
+    source: LineFrame,
     frame: GroundFrame,
     samples: tuple[np.ndarray, np.ndarray, np.ndarray],
     points: np.ndarray,
@@ -150,7 +152,7 @@ def templates_of_image(
     Args:
         source: the other image.
         frame: coordinates of the ground.
-        samples: of the ground, as `ground_of_samples` has them.
+        samples: of the ground, as `_ground_of_samples` has them.
         points: (n, 3) ITRS, metres, of the templates' middles.
         place: (n, 2) where the source has them, row and column.
     """
@@ -226,6 +228,22 @@ class MatchedLine:
         """(n, 2) line and pixel of the whole image."""
         return self.place + np.array(self.first)
 
+    @property
+    def moved(self) -> np.ndarray:
+        """(2,) from predicted to found, median of the accepted, lines and pixels."""
+        return np.asarray(np.median((self.place - self.predicted)[self.accepted], axis=0))
+
+    @property
+    def usual_sigma(self) -> np.ndarray:
+        """(2,) of lines and pixels, median of the accepted."""
+        return np.asarray(np.median(np.sqrt(np.diagonal(self.covariance[self.accepted], axis1=1, axis2=2)), axis=0))
+
+    @property
+    def lost(self) -> Mapping[str, int]:
+        """Why points were not accepted -> how many, the most frequent first."""
+        count = Counter(int(code) for code in self.status[~self.accepted])
+        return {status_text(code): number for code, number in count.most_common()}
+
     def displacement(self, place: np.ndarray, height: np.ndarray) -> np.ndarray:
         """(n, 2) from predicted to found, as its matches say, at places (n, 2) and heights (n,), metres."""
         if self.way is None:
@@ -258,6 +276,11 @@ class MatchedPoints:
     def source(self) -> str | None:
         """The line whose frame ties were chosen in."""
         return next((name for name, line in self.lines.items() if line.way is None), None)
+
+    @property
+    def sought_in(self) -> Mapping[str, MatchedLine]:
+        """The lines that were searched for the points: without the source of ties."""
+        return {name: line for name, line in self.lines.items() if name != self.source}
 
     @property
     def in_all(self) -> np.ndarray:
@@ -314,8 +337,8 @@ def map_points(patch: ImagedGround, spec: ImagePointsSpec) -> MatchedPoints:
     lines = {}
     for name, image in patch.images.items():
         at = predicted(image, ground)
-        samples = ground_of_samples(image, patch.frame, heights, ground, at, spec.template)
-        patterns = templates_of_map(patch.control.orthophoto, samples, float(np.mean(image.sample)))
+        samples = _ground_of_samples(image, patch.frame, heights, ground, at, spec.template)
+        patterns = _templates_of_map(patch.control.orthophoto, samples, float(np.mean(image.sample)))
         lines[name] = _matched(name, image, patterns, at, _rise(patch, image, ground, at), height, spec)
     which = np.arange(len(east))
     share = spec.check / max(wanted, 1)
@@ -368,8 +391,8 @@ def tie_points(
         if name == source:
             continue
         at = predicted(other, ground)
-        samples = ground_of_samples(other, patch.frame, heights, ground, at, spec.template)
-        patterns = templates_of_image(image, patch.frame, samples, ground, place)
+        samples = _ground_of_samples(other, patch.frame, heights, ground, at, spec.template)
+        patterns = _templates_of_image(image, patch.frame, samples, ground, place)
         rise = _rise(patch, other, ground, at)
         if control:
             at = at + control.lines[name].displacement(at, height)
@@ -420,7 +443,7 @@ def _distinct_map(
 
 
 def _followed(
-    patch: ImagedGround, image: Frame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
+    patch: ImagedGround, image: LineFrame, heights: ReferenceHeights, place: np.ndarray, known: MatchedLine | None
 ) -> np.ndarray:
     """Where the measured sensor's looks meet the reference heights, ITRS, (n, 3), metres; NaN beyond them.
 
@@ -438,7 +461,7 @@ def _followed(
     return np.asarray(points)
 
 
-def _rise(patch: ImagedGround, image: Frame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
+def _rise(patch: ImagedGround, image: LineFrame, ground: np.ndarray, at: np.ndarray) -> np.ndarray:
     """(n, 2) lines and pixels by which points that lie a metre higher have their image displaced."""
     east, north, height = patch.frame.local(ground)
     return (predicted(image, patch.frame.itrs(east, north, height + _RISE)) - at) / _RISE
@@ -446,7 +469,7 @@ def _rise(patch: ImagedGround, image: Frame, ground: np.ndarray, at: np.ndarray)
 
 def _matched(
     name: str,
-    image: Frame,
+    image: LineFrame,
     patterns: np.ndarray,
     at: np.ndarray,
     rise: np.ndarray,
@@ -489,7 +512,7 @@ def _matched(
 
 
 def _degree(count: int) -> int | None:
-    """Of the smooth displacement for so many matches: four a term with the term for height; None for too few."""
+    """Degree of the smooth displacement that so many matches carry, four for each term; None for too few."""
     for degree, terms in ((2, 7), (1, 4), (0, 2)):
         if count >= 4 * terms:
             return degree

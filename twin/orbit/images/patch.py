@@ -26,18 +26,10 @@ from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.orthophoto import Control, make_control
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import apparent, around, reflectance
+from twin.orbit.images import pushbroom
+from twin.orbit.images.imaged_ground import ImagedGround, LineFrame
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
-from twin.orbit.images.pushbroom import (
-    BORDER,
-    LookMap,
-    PushbroomScene,
-    SteepTerrainError,
-    Window,
-    extent_of,
-    look_map,
-    render_patch,
-    require_open,
-)
+from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window
 from twin.run.random_streams import stream
 from twin.sensors.area_detector import FixedPattern
 
@@ -78,52 +70,36 @@ class ImagedLine:
     pattern: FixedPattern
 
 
-@dataclass(frozen=True, eq=False)
-class LineImage:
-    """What one line recorded of a patch.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LineImage(LineFrame):
+    """What one line recorded of a patch, uint16, and what the truth knows of it.
 
     Attributes:
-        frame: grey values, uint16, (lines, pixels) of the window.
-        window: where it lies in the line's whole image.
         sensor: the true one.
-        measured: the one that the user knows.
         motion: of the image over the line, in the window's middle.
-        sample: distance of two pixels along the line, and of two lines, on the ground in the window's middle, metres.
         nyquist: modulation transfer at half a cycle per pixel, and per line.
         saturated: pixels at the end of the detector's range.
         error: of the renderer's interpolated geometry, pixels (see `RenderedPatch`).
     """
 
-    frame: np.ndarray
-    window: Window
     sensor: Sensor
-    measured: Sensor
     motion: ImageMotion
-    sample: tuple[float, float]
     nyquist: tuple[float, float]
     saturated: int
     error: float
 
-    def image_point(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Line and pixel of places of the frame (row, column), whole or not."""
-        return self.window.first_line + np.asarray(row), self.window.first_pixel + np.asarray(column)
-
 
 @dataclass(frozen=True, eq=False)
-class Patch:
-    """A patch of ground, imaged.
+class Patch(ImagedGround):
+    """A patch of simulated ground, imaged.
 
     Attributes:
-        frame: plane coordinates of the ground, metres east and north of the patch's middle.
         terrain: the true heights.
-        images: line -> what it recorded.
-        control: orthophoto and elevation model, with their errors.
     """
 
-    frame: GroundFrame
-    terrain: Terrain
     images: Mapping[str, LineImage]
     control: Control
+    terrain: Terrain
 
     def true_point(self, name: str, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """The place on the true terrain that places of a line's frame see, ITRS, (N, 3), metres: the exact inverse of
@@ -181,10 +157,10 @@ def fly_patch(
     looks, extents = {}, []
     for name, one in lines.items():
         try:
-            looks[name] = look_map(one.sensor, frame, terrain, windows[name])
-            extents.append(extent_of(looks[name]))
-            require_open(looks[name], extents[-1])
-        except SteepTerrainError as error:
+            looks[name] = pushbroom.look_map(one.sensor, frame, terrain, windows[name])
+            extents.append(pushbroom.extent_of(looks[name]))
+            pushbroom.require_open(looks[name], extents[-1])
+        except pushbroom.SteepTerrainError as error:
             raise PatchError(f"{name}: {error}", "terrain", name) from error
     extent = around(extents)
     seen = apparent(reflectance(extent, ground.texture, for_ground), terrain, ground.light)
@@ -193,7 +169,7 @@ def fly_patch(
     for k, (name, one) in enumerate(lines.items()):
         images[name] = _recorded(one, scene, windows[name], looks[name], oversampling, stream(for_frames, k))
     known = make_control(frame, extent, terrain, ground.texture, control, for_ground, for_control)
-    return Patch(frame, terrain, FrozenMap(images), known)
+    return Patch(frame, FrozenMap(images), known, terrain)
 
 
 def imaged_lines(
@@ -272,22 +248,20 @@ def _recorded(
     oversampling: int,
     seed: np.random.SeedSequence,
 ) -> LineImage:
-    done = render_patch(one.sensor, one.optics, scene, window, oversampling, looks)
+    done = pushbroom.render_patch(one.sensor, one.optics, scene, window, oversampling, looks)
     frame = one.optics.ccd.expose(done.photons[None], window.first_pixel, one.pattern, 1, seed)[0, 0]
     line, pixel = window.middle
     height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
-    points = one.sensor.ground(line + np.array([-0.5, 0.5, 0.0, 0.0]), pixel + np.array([0.0, 0.0, -0.5, 0.5]), height)
-    sample = float(np.linalg.norm(points[3] - points[2])), float(np.linalg.norm(points[1] - points[0]))
     half = np.array([0.5, 0.0])
     along, across = np.abs(one.optics.transfer(half, half[::-1], done.motion))
     return LineImage(
-        frame,
-        window,
-        one.sensor,
-        one.measured,
-        done.motion,
-        sample,
-        (float(along), float(across)),
-        int(one.optics.ccd.detector.saturated(frame[None]).pixels),
-        done.error,
+        frame=frame,
+        window=window,
+        measured=one.measured,
+        sample=window.sample(one.sensor, height),
+        sensor=one.sensor,
+        motion=done.motion,
+        nyquist=(float(along), float(across)),
+        saturated=int(one.optics.ccd.detector.saturated(frame[None]).pixels),
+        error=done.error,
     )

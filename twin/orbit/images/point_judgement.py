@@ -15,7 +15,7 @@ from twin.orbit.images.patch import Patch
 WRONG_PIXELS, WRONG_SIGMAS, WRONG_FLOOR = 3.0, 5.0, 1.0
 """A match is wrong that lies more than 3 pixels off, or more than 5 of its sigmas and 1 pixel."""
 WRONG = f"more than {WRONG_PIXELS:g} px off, or more than {WRONG_SIGMAS:g} sigmas and {WRONG_FLOOR:g} px"
-"""The same for readers."""
+"""When a match is wrong, for readers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,9 +101,7 @@ def judged(patch: Patch, points: MatchedPoints) -> Mapping[str, LineJudgement]:
     """Line -> judgement; the frame that ties were chosen in is left out."""
     truth = true_ground(patch, points)
     found = {}
-    for name, line in points.lines.items():
-        if name == points.source:
-            continue
+    for name, line in points.sought_in.items():
         true = np.stack(patch.images[name].sensor.image(truth), axis=-1)
         error = line.image - true
         size = np.linalg.norm(error, axis=1)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,11 +14,10 @@ from matplotlib.patheffects import Normal, Stroke
 
 from scenes.specs.orbit.scene import ImagePointsSpec
 from twin.orbit.images.image_points import CONSENSUS, MatchedPoints, PatchPoints, status_text
-from twin.orbit.images.imaged_ground import Frame, ImagedGround
+from twin.orbit.images.imaged_ground import ImagedGround, LineFrame
 from twin.orbit.images.patch import Patch
 from twin.orbit.images.point_judgement import WRONG, judged
-from twin.orbit.images.simulate_numbers import median_sigma, median_way, reasons
-from twin.run.artefact import Cell, Data, PngFigure, Table
+from twin.run.artefact import Artefact, Cell, Data, PngFigure, Table
 from twin.run.data_files import csv_table
 from twin.run.report import Section
 from twin.run.svg import SKY, VERMILION, YELLOW, look, new_figure, to_png
@@ -64,10 +64,7 @@ HEADS = (
 class PointListing(Data):
     """Rows under `HEADS`, kept as CSV and named in the report."""
 
-    @property
-    def kind(self) -> str:
-        """Ending of the file."""
-        return "csv"
+    kind: ClassVar[str] = "csv"
 
     def content(self) -> bytes:
         """The rows with all their digits; what there is not is empty."""
@@ -78,7 +75,7 @@ def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
     """A row for each point and line."""
     rows: list[list[Any]] = []
     for sort, one in points.sorts.items():
-        degrees = _degrees(patch, one)
+        degrees = np.degrees(patch.frame.geographic(one.east, one.north)).T
         for name, line in one.lines.items():
             image, expected = line.image, line.predicted + np.array(line.first)
             sigma = np.sqrt(np.diagonal(line.covariance, axis1=1, axis2=2))
@@ -89,17 +86,9 @@ def listing(patch: ImagedGround, points: PatchPoints) -> list[list[Any]]:
                 numbers = (*expected[k], *image[k], *sigma[k], together[k], line.correlation[k])
                 shown = [float(v) if np.isfinite(v) else None for v in numbers]
                 code = int(line.status[k])
-                ground = [*map(float, degrees[k]), *map(float, one.ground[k])]
+                ground = [*map(float, degrees[k]), float(one.height[k]), *map(float, one.ground[k])]
                 rows.append([kind, k, name, *ground, *shown, int(line.accepted[k]), status_text(code)])
     return rows
-
-
-def _degrees(patch: ImagedGround, points: MatchedPoints) -> np.ndarray:
-    """Longitude and latitude, degrees, and height, metres, (n, 3)."""
-    per_longitude, per_latitude = patch.frame.scale
-    longitude = np.degrees(patch.frame.longitude + points.east / per_longitude)
-    latitude = np.degrees(patch.frame.latitude + points.north / per_latitude)
-    return np.column_stack([longitude, latitude, points.height])
 
 
 _DPI = 110
@@ -113,7 +102,7 @@ def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> 
         f"image are brought into each line's geometry by the measured sensor, templates of {spec.template} pixels, "
         f"sought {spec.reach} pixels to each side of where it expects them, and fitted by least squares. Rejected is "
         "what fails a threshold of the matching, and what does not follow the smooth displacement of its neighbours. "
-        "Where orthophoto points have lain is taken into the prediction of tie points.",
+        "Where orthophoto points have lain is taken into the prediction of tie points."
     ]
     if points.control is not None:
         text.append(
@@ -122,35 +111,45 @@ def points_section(patch: Patch, points: PatchPoints, spec: ImagePointsSpec) -> 
             "The error that orthophoto and heights have in common in the whole patch is in none of these numbers: "
             "matches are judged against the place of what the orthophoto shows."
         )
+    shown = point_artefacts(patch, points, _NAMES, ("predicted", " as given", ""), _true(patch, points))
+    return Section("Measured points", tuple(text), shown)
+
+
+def point_artefacts(
+    patch: ImagedGround, points: PatchPoints, names: Mapping[str, str], words: tuple[str, str, str], *tables: Table
+) -> tuple[Artefact, ...]:
+    """What was matched, figures, what was lost, and the listing.
+
+    Args:
+        patch: images and what is known of the ground.
+        points: measured in them.
+        names: sort of points -> its name for readers.
+        words: what points are before they are found, and what else is said of ground coordinates and of sigmas.
+        tables: to stand after the table of what was matched.
+    """
+    before, ground, sigmas = words
     figures = [
         PngFigure(
             f"points-{sort}",
-            f"From predicted to found, {_NAMES[sort]} points",
+            f"From {before} to found, {names[sort]} points",
             "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
             "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
             points_png(patch, one),
         )
         for sort, one in points.sorts.items()
     ]
-    listed = PointListing(
-        "points",
-        "Points",
-        "Every point in every line: ground coordinates as given, image coordinates, sigmas, verdict.",
-        listing(patch, points),
-    )
-    tables = found_table(points), _true(patch, points)
-    return Section("Measured points", tuple(text), (*tables, *figures, lost_table(points), listed))
+    caption = f"Every point in every line: ground coordinates{ground}, image coordinates, sigmas{sigmas}, verdict."
+    listed = PointListing("points", "Points", caption, listing(patch, points))
+    return _found_table(points), *tables, *figures, _lost_table(points), listed
 
 
-def found_table(points: PatchPoints) -> Table:
+def _found_table(points: PatchPoints) -> Table:
     """How many points were matched, and what by."""
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
-        for name, line in one.lines.items():
-            if name == one.source:
-                continue
+        for name, line in one.sought_in.items():
             counts = len(line.status), int(line.matched.sum()), int(line.accepted.sum())
-            rows.append((_NAMES[sort], name, *counts, *_floats(median_way(line)), *_floats(median_sigma(line))))
+            rows.append((_NAMES[sort], name, *counts, *line.moved.tolist(), *line.usual_sigma.tolist()))
     return Table(
         "points-found",
         "Matching",
@@ -167,7 +166,7 @@ def _true(patch: Patch, points: PatchPoints) -> Table:
     for sort, one in points.sorts.items():
         for name, j in judged(patch, one).items():
             ratio = j.chi_square / max(j.degrees_of_freedom, 1)
-            numbers = (*_floats(j.rms), *_floats(j.mean), ratio)
+            numbers = (*j.rms.tolist(), *j.mean.tolist(), ratio)
             rows.append((_NAMES[sort], name, *j.wrong_shares, j.right_rejected_by_consensus, *numbers))
     return Table(
         "points-truth",
@@ -193,11 +192,11 @@ def _true(patch: Patch, points: PatchPoints) -> Table:
     )
 
 
-def lost_table(points: PatchPoints) -> Table:
+def _lost_table(points: PatchPoints) -> Table:
     """Why points were not accepted."""
     rows: list[tuple[Cell, ...]] = []
     for sort, one in points.sorts.items():
-        count = {name: reasons(line) for name, line in one.lines.items() if name != one.source}
+        count = {name: line.lost for name, line in one.sought_in.items()}
         total: Counter[str] = Counter()
         for found in count.values():
             total.update(found)
@@ -206,14 +205,10 @@ def lost_table(points: PatchPoints) -> Table:
     return Table("points-lost", "Why points were not accepted", "", ("points", "reason", "how many"), rows)
 
 
-def _floats(pair: np.ndarray) -> tuple[float, float]:
-    return float(pair[0]), float(pair[1])
-
-
 def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
     """PNG: every line's frame with its points and their displacements."""
     with look(f"points-{points.kind}"):
-        names = [n for n in points.lines if n != points.source]
+        names = list(points.sought_in)
         figure = new_figure(4.3 if len(names) > 2 else 5.6)
         panels = np.atleast_1d(figure.subplots(1, len(names)))
         for axes, name in zip(panels, names, strict=True):
@@ -227,7 +222,7 @@ def points_png(patch: ImagedGround, points: MatchedPoints) -> bytes:
         return to_png(figure, _DPI)
 
 
-def _panel(axes: Axes, name: str, image: Frame, points: MatchedPoints) -> None:
+def _panel(axes: Axes, name: str, image: LineFrame, points: MatchedPoints) -> None:
     line = points.lines[name]
     low, high = np.percentile(image.frame, (0.5, 99.5))
     row, column = line.first
@@ -236,7 +231,7 @@ def _panel(axes: Axes, name: str, image: Frame, points: MatchedPoints) -> None:
     axes.imshow(image.frame, cmap="gray", vmin=low, vmax=high, extent=ends, interpolation="antialiased", alpha=0.75)
     at, to = line.predicted + np.array(line.first), line.image
     # no minus before zero
-    middle = np.round(median_way(line), 1) + 0.0
+    middle = np.round(line.moved, 1) + 0.0
     rest = to - at - middle
     good, against = line.accepted, line.status == CONSENSUS
     longest = float(np.quantile(np.linalg.norm(rest[good], axis=1), 0.95))
@@ -257,6 +252,6 @@ def _panel(axes: Axes, name: str, image: Frame, points: MatchedPoints) -> None:
 
 
 def _round(value: float) -> float:
-    """To 1, 2 or 5 times a power of ten, not above."""
+    """The largest of 1, 2 and 5 times a power of ten that is not above the value."""
     power = 10.0 ** np.floor(np.log10(value))
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= value * (1.0 + 1e-9)))

@@ -249,14 +249,20 @@ class Window:
         """Line and pixel of its middle."""
         return self.first_line + 0.5 * (self.lines - 1), self.first_pixel + 0.5 * (self.pixels - 1)
 
-    def fits(self, sensor: Sensor, margin: int = BORDER) -> bool:
-        """Whether it lies inside a sensor's image with the margin that rendering needs."""
+    def fits(self, sensor: Sensor) -> bool:
+        """Whether it lies inside a sensor's image with the border that rendering needs."""
         return (
-            self.first_line >= margin
-            and self.first_pixel >= margin
-            and self.first_line + self.lines + margin <= sensor.lines
-            and self.first_pixel + self.pixels + margin <= sensor.camera.pixels
+            min(self.first_line, self.first_pixel) >= BORDER
+            and self.first_line + self.lines + BORDER <= sensor.lines
+            and self.first_pixel + self.pixels + BORDER <= sensor.camera.pixels
         )
+
+    def sample(self, sensor: Sensor, height: float) -> tuple[float, float]:
+        """Distance of two pixels along the line, and of two lines, on ground of a height in its middle, metres."""
+        line, pixel = self.middle
+        steps = np.array([-0.5, 0.5, 0.0, 0.0])
+        points = sensor.ground(line + steps, pixel + np.roll(steps, 2), height)
+        return float(np.linalg.norm(points[3] - points[2])), float(np.linalg.norm(points[1] - points[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,9 @@ from matplotlib.image import AxesImage
 
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.ground.orthophoto import Raster
+from twin.orbit.images import simulate_numbers
 from twin.orbit.images.patch import LineImage
 from twin.orbit.images.point_report import pixel_axes, points_section
-from twin.orbit.images.simulate_files import camera_data, georeference_data, trajectory_data, truth_data
-from twin.orbit.images.simulate_numbers import Georeference
 from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.data_files import FrameFacts, MapPlace
@@ -30,7 +29,7 @@ _DPI = 110
 _PARTS = {"lens": BLUE, "pixel": GREEN, "diffusion": ORANGE, "step": SKY, "stages": VERMILION}
 
 
-def images_png(run: Simulation) -> bytes:
+def _images_png(run: Simulation) -> bytes:
     """The lines' images side by side, each stretched between its 0.5% and 99.5% grey values."""
     with look("simulate-images"):
         images = run.patch.images
@@ -45,7 +44,7 @@ def images_png(run: Simulation) -> bytes:
         return to_png(figure, _DPI)
 
 
-def control_png(run: Simulation) -> bytes:
+def _control_png(run: Simulation) -> bytes:
     """Orthophoto and elevation model."""
     with look("simulate-control"):
         figure = new_figure(4.6)
@@ -59,14 +58,14 @@ def control_png(run: Simulation) -> bytes:
         return to_png(figure, _DPI)
 
 
-def transfer_svg(run: Simulation) -> str:
+def _transfer_svg(run: Simulation) -> str:
     """MTF along the line and along the track, all lines and the parts of the first that looks obliquely."""
     with look("simulate-transfer"):
         return to_svg(_transfer_figure(run))
 
 
 def _modulus(values: np.ndarray) -> np.ndarray:
-    """Of complex values; real ones keep their sign."""
+    """Modulus of complex values; real ones keep their sign."""
     return np.abs(values) if np.iscomplexobj(values) else values
 
 
@@ -149,7 +148,7 @@ def _images(run: Simulation) -> Section:
         "fixed pattern, and no radiometric correction has been made.",
     )
     figure = PngFigure(
-        "lines", "What the lines recorded", "Grey values between 0.5% and 99.5% of each image.", images_png(run)
+        "lines", "What the lines recorded", "Grey values between 0.5% and 99.5% of each image.", _images_png(run)
     )
     table = Table(
         "windows",
@@ -171,7 +170,7 @@ def _control(run: Simulation) -> Section:
         f"[{spec.shift[0]:g}, {spec.shift[1]:g}] m and a smooth part of {spec.sigma:g} m.",
     )
     figure = PngFigure(
-        "control", "Control", "East and north of the patch's middle; rows of the files go south.", control_png(run)
+        "control", "Control", "East and north of the patch's middle; rows of the files go south.", _control_png(run)
     )
     return Section("Orthophoto and elevation model", text, (figure,))
 
@@ -183,16 +182,16 @@ def _sharpness(run: Simulation) -> Section:
         "line.",
     )
     figure = SvgFigure(
-        "transfer", "Modulation transfer", "Up to half a cycle per sample; before any noise.", transfer_svg(run)
+        "transfer", "Modulation transfer", "Up to half a cycle per sample; before any noise.", _transfer_svg(run)
     )
     return Section("Sharpness", text, (figure,))
 
 
 def _data(run: Simulation) -> Section:
-    camera = described("camera", camera_data(run.laboratory))
-    path = described("trajectory", trajectory_data(run, run.measured))
-    rasters = described("georeference", georeference_data(run))
-    truth = described("simulate-truth", truth_data(run))
+    camera = described("camera", simulate_numbers.camera_data(run.laboratory))
+    path = described("trajectory", simulate_numbers.trajectory_data(run, run.measured))
+    rasters = described("georeference", simulate_numbers.georeference_data(run))
+    truth = described("simulate-truth", simulate_numbers.TRUTH(run))
     parts = (
         Data("camera", "Camera", "As the laboratory measured it.", camera),
         Data("trajectory", "Orbit and attitude", "As measured.", path),
@@ -242,9 +241,8 @@ def simulation_report(run: Simulation) -> Report:
 
 def map_facts(raster: Raster, note: str, heights: bool = False) -> FrameFacts:
     """What the TIFF of a map says of itself: a GeoTIFF."""
-    at = Georeference.of(raster)
-    step = (at.longitude_per_column_deg, at.latitude_per_row_deg)
-    return FrameFacts(note=note, place=MapPlace(at.first_longitude_deg, at.first_latitude_deg, *step, heights))
+    longitude, latitude, *steps = list(simulate_numbers.GEOREFERENCE(raster).values())[3:]
+    return FrameFacts(note=note, place=MapPlace(longitude, latitude, steps[0], steps[1], heights))
 
 
 def _summary(run: Simulation) -> Table:

@@ -39,43 +39,6 @@ _REMEDIES: Mapping[str, tuple[KeyPath, str]] = FrozenMap(
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation:
-    """A pass and what it gave.
-
-    Attributes:
-        setup: what its file says.
-        seed: of all random numbers.
-        truth: the camera as it is.
-        trajectory: the true one.
-        measured: what the satellite says of it.
-        lines: those that are rendered, by name.
-        place: longitude and latitude of the patch's middle, radians.
-        patch: images and control.
-        points: measured in the images; None where none were asked for.
-    """
-
-    setup: SimulateSetup
-    seed: int
-    truth: ThreeLineCameraSpec
-    trajectory: Trajectory
-    measured: Trajectory
-    lines: Mapping[str, ImagedLine]
-    place: tuple[float, float]
-    patch: Patch
-    points: PatchPoints | None
-
-    @property
-    def spec(self) -> OrbitSimulateSpec:
-        """The test."""
-        return self.setup.test
-
-    @property
-    def laboratory(self) -> ThreeLineCameraSpec:
-        """The camera as it was measured before launch."""
-        return self.setup.camera
-
-
-@dataclass(frozen=True, eq=False)
 class SimulatedFlight:
     """A pass without its images.
 
@@ -96,6 +59,37 @@ class SimulatedFlight:
     users: Mapping[str, Sensor]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Simulation(SimulatedFlight):
+    """A pass and what it gave.
+
+    Attributes:
+        setup: what its file says.
+        seed: of all random numbers.
+        lines: those that are rendered, by name.
+        place: longitude and latitude of the patch's middle, radians.
+        patch: images and control.
+        points: measured in the images; None where none were asked for.
+    """
+
+    setup: SimulateSetup
+    seed: int
+    lines: Mapping[str, ImagedLine]
+    place: tuple[float, float]
+    patch: Patch
+    points: PatchPoints | None
+
+    @property
+    def spec(self) -> OrbitSimulateSpec:
+        """The test."""
+        return self.setup.test
+
+    @property
+    def laboratory(self) -> ThreeLineCameraSpec:
+        """The camera as it was measured before launch."""
+        return self.setup.camera
+
+
 def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
     """Orbit and cameras of a pass; the same for the same seed as those of `run_simulation`.
 
@@ -111,8 +105,8 @@ def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
     measured = trajectory.with_errors(spec.errors, int(np.random.default_rng(stream(root, 0)).integers(2**31)))
     truth = changed_payload(spec, setup.camera)
     true, known = line_cameras(truth), line_cameras(setup.camera)
-    sensors = {name: sensor_of(true[name], trajectory, earth, spec) for name in spec.lines}
-    users = {name: sensor_of(known[name], measured, earth, spec) for name in spec.lines}
+    sensors = {name: _sensor(true[name], trajectory, earth, spec) for name in spec.lines}
+    users = {name: _sensor(known[name], measured, earth, spec) for name in spec.lines}
     return SimulatedFlight(earth, truth, trajectory, measured, FrozenMap(sensors), FrozenMap(users))
 
 
@@ -125,11 +119,9 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
     advance("images", 0, 1)
     spec, root = setup.test, np.random.SeedSequence(seed)
     flight = fly_simulation(setup, seed)
-    truth, trajectory, measured = flight.truth, flight.trajectory, flight.measured
-    sensors, users = flight.sensors, flight.users
     optics = optics_of(setup.camera, spec.lines, spec.line_time, setup.detectors)
-    lines = imaged_lines(sensors, users, optics, stream(root, 1))
-    looking = sensor_of(line_cameras(truth)[spec.patch.line], trajectory, flight.earth, spec)
+    lines = imaged_lines(flight.sensors, flight.users, optics, stream(root, 1))
+    looking = _sensor(line_cameras(flight.truth)[spec.patch.line], flight.trajectory, flight.earth, spec)
     place = _place(looking, spec)
     patch = spec.patch
     try:
@@ -141,7 +133,9 @@ def run_simulation(setup: SimulateSetup, backend: Backend | None, seed: int, adv
         raise BenchError(str(error), key, remedy) from error
     points = _points(done, spec)
     advance("images", 1, 1)
-    return Simulation(setup, seed, truth, trajectory, measured, FrozenMap(lines), place, done, points)
+    return Simulation(
+        **vars(flight), setup=setup, seed=seed, lines=FrozenMap(lines), place=place, patch=done, points=points
+    )
 
 
 def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
@@ -153,12 +147,10 @@ def _points(patch: Patch, spec: OrbitSimulateSpec) -> PatchPoints | None:
         raise BenchError(str(error), ("points",), POINTS_REMEDY) from error
 
 
-def sensor_of(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitSimulateSpec) -> Sensor:
+def _sensor(camera: LineCamera, trajectory: Trajectory, earth: Earth, spec: OrbitSimulateSpec) -> Sensor:
     """A line's image over the whole orbit."""
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
-    effects = LightEffects(
-        *(getattr(spec.effects, n) for n in ("light_time", "aberration", "refraction", "wavelength"))
-    )
+    effects = LightEffects.of(spec.effects)
     return Sensor(camera, trajectory, earth, spec.line_time, trajectory.first + 0.5 * spec.line_time, lines, effects)
 
 

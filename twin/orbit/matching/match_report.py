@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.orbit.images.point_report import PointListing, found_table, listing, lost_table, points_png
-from twin.orbit.images.simulate_numbers import median_sigma, median_way
+from twin.orbit.images.point_report import point_artefacts
 from twin.orbit.matching.match_run import Match
-from twin.run.artefact import Cell, PngFigure, Table
+from twin.run.artefact import Cell, Table
 from twin.run.report import Report, Section, one_sentence
 
 _FAR = 0.5
-"""Of the reach: matches that lie farther from where they were expected leave the search little room."""
+"""Share of the reach: matches that lie farther from where they were expected leave the search little room."""
 
 
 def match_report(run: Match) -> Report:
@@ -31,7 +30,7 @@ def _verdict(run: Match) -> str:
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     ways = [
-        (float(np.linalg.norm(median_way(line))), name)
+        (float(np.linalg.norm(line.moved)), name)
         for one in run.points.sorts.values()
         for name, line in one.lines.items()
         if one.kind == "map" and line.accepted.any()
@@ -54,12 +53,10 @@ def _verdict(run: Match) -> str:
 def _summary(run: Match) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for sort, one in run.points.sorts.items():
-        for name, line in one.lines.items():
-            if name == one.source or not line.accepted.any():
-                continue
-            way, sigma = median_way(line), median_sigma(line)
-            counts = len(line.status), int(line.accepted.sum())
-            rows.append((sort, name, *counts, *map(float, way), *map(float, sigma)))
+        for name, line in one.sought_in.items():
+            if line.accepted.any():
+                counts = len(line.status), int(line.accepted.sum())
+                rows.append((sort, name, *counts, *line.moved.tolist(), *line.usual_sigma.tolist()))
     return Table(
         "matched",
         "Points",
@@ -91,23 +88,9 @@ def _measured(run: Match) -> Section:
         f"Rejected is what fails a "
         "threshold of the matching, and what does not follow the smooth displacement of its neighbours.",
     )
-    figures = [
-        PngFigure(
-            f"points-{sort}",
-            f"From expected to found, {sort} points",
-            "Arrows as long as they are in the image, after the median displacement in the title was taken off, "
-            "enlarged as the title says; crosses: rejected by the neighbours; points: not matched.",
-            points_png(run.ground, one),
-        )
-        for sort, one in run.points.sorts.items()
-    ]
-    listed = PointListing(
-        "points",
-        "Points",
-        "Every point in every line: ground coordinates, image coordinates, sigmas of the fit, verdict.",
-        listing(run.ground, run.points),
-    )
-    return Section("Measured points", text, (found_table(run.points), *figures, lost_table(run.points), listed))
+    names = {sort: sort for sort in run.points.sorts}
+    shown = point_artefacts(run.ground, run.points, names, ("expected", "", " of the fit"))
+    return Section("Measured points", text, shown)
 
 
 def _images(run: Match) -> Section:
@@ -131,7 +114,7 @@ def _warnings(run: Match) -> tuple[str, ...]:
     found, reach = [], run.setup.test.points.reach
     for one in run.points.sorts.values():
         for name, line in one.lines.items():
-            if one.kind == "map" and line.accepted.any() and np.max(np.abs(median_way(line))) > _FAR * reach:
+            if one.kind == "map" and line.accepted.any() and np.max(np.abs(line.moved)) > _FAR * reach:
                 found.append(f"points of {name} lie near the end of the reach; a larger `points.reach` may find more")
     if run.accuracy is None or run.accuracy < 0.0:
         found.append("how good the way of the maps' system to WGS 84 is, is not stated by its authority")

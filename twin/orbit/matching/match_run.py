@@ -1,13 +1,13 @@
 """Points of an orthophoto, and tie points, in a user's line images: ``python -m twin.orbit match``.
 
 The images are brought together with what is known before: the laboratory's camera, orbit and attitude, line times. From
-there on all is as in a simulated patch (`twin.orbit.images.image_points`).
+there on all is as in a simulated patch (`twin.orbit.images.image_points`). What match.json holds stands at the end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,20 +24,18 @@ from twin.orbit.flight.line_camera import LineCamera, LineTimes, line_cameras
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
-from twin.orbit.images.image_points import (
-    POINTS_REMEDY,
-    MatchedPoints,
-    PatchPoints,
-    PointsError,
-    measure_points,
-)
-from twin.orbit.images.imaged_ground import BEYOND
+from twin.orbit.ground.orthophoto import Maps
+from twin.orbit.images.image_points import POINTS_REMEDY, MatchedPoints, PatchPoints, PointsError, measure_points
+from twin.orbit.images.imaged_ground import BEYOND, ImagedGround, LineFrame
 from twin.orbit.images.pushbroom import Window
+from twin.orbit.images.simulate_numbers import POINTS
 from twin.orbit.measured.geotiff import LARGEST_PART
 from twin.orbit.measured.map_part import MapPart, UserMap
+from twin.orbit.measured.measurement_tables import campaign_files
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.orbit.measured.platform_files import platform_table, read_platform
 from twin.run.procedure import Advance, BenchError, silent
+from twin.run.quantity import Quantity, Record
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
@@ -51,41 +49,10 @@ _SPARE = 300.0
 
 
 @dataclass(frozen=True, eq=False)
-class UserImage:
-    """A line's image; see `twin.orbit.images.imaged_ground.Frame`.
+class UserGround(ImagedGround):
+    """A piece of ground in a user's images and maps."""
 
-    Attributes:
-        frame: grey values, (lines, pixels), columns as pixels of the line.
-        window: where it lies in the line's whole image.
-        measured: the line as it is known.
-        sample: distance of pixels and of lines on the ground, metres.
-    """
-
-    frame: np.ndarray
-    window: Window
-    measured: Sensor
-    sample: tuple[float, float]
-
-    def image_point(self, row: np.ndarray, column: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Line and pixel of places of the frame (row, column), whole or not."""
-        return self.window.first_line + np.asarray(row), self.window.first_pixel + np.asarray(column)
-
-
-@dataclass(frozen=True, eq=False)
-class UserMaps:
-    """Orthophoto and elevation model."""
-
-    orthophoto: MapPart
-    dem: MapPart
-
-
-@dataclass(frozen=True, eq=False)
-class UserGround:
-    """A piece of ground in a user's images; see `twin.orbit.images.imaged_ground.ImagedGround`."""
-
-    frame: GroundFrame
-    images: Mapping[str, UserImage]
-    control: UserMaps
+    control: Maps[MapPart]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +88,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     path = TabulatedTrajectory(table)
     clocks = read_line_clocks(spec.lines, tuple(setup.camera.lines), folder)
     cameras = line_cameras(setup.camera)
-    light = LightEffects(*(getattr(spec.effects, n) for n in ("light_time", "aberration", "refraction", "wavelength")))
+    light = LightEffects.of(spec.effects)
     times = {}
     for name in spec.images:
         if name not in clocks:
@@ -134,9 +101,11 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
     images = {name: _image(one, name, sensors[name], folder) for name, one in spec.images.items()}
     limits = dem.limits()
     frame, ends = _extent(spec, images, limits)
-    maps = UserMaps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
+    maps = Maps(photo.part(frame, ends), dem.part(frame, ends, heights=True))
     height = float(np.median(maps.dem.values if maps.dem.valid is None else maps.dem.values[maps.dem.valid]))
-    images = {name: _sampled(image, height) for name, image in images.items()}
+    images = {
+        name: replace(image, sample=image.window.sample(image.measured, height)) for name, image in images.items()
+    }
     ground = UserGround(frame, FrozenMap(images), maps)
     advance("points", 1, 3)
     try:
@@ -151,7 +120,7 @@ def run_match(setup: MatchSetup, backend: Backend | None, seed: int, advance: Ad
 
 
 def _times(spec: OrbitMatchSpec, clock: LineClock, epoch: str) -> LineTimes:
-    """Of a line's own numbers, its first line in the table being 0."""
+    """Line times by a line's own numbers, its first line in the table being 0."""
     meant = PassConventions(None, spec.lines.time_scale, 0.0, spec.lines.moment, 0.0, 0.0, "right")  # type: ignore[arg-type]
     try:
         middle, _ = line_times(clock, meant, epoch, clock.line)
@@ -175,7 +144,7 @@ def _sensor(
         raise spec.lines.error(problem, ("file",), allowed="times within those of orbit and attitude") from None
 
 
-def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> UserImage:
+def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> LineFrame:
     """The image, with columns along the line's pixels."""
     path = folder / spec.file
     part = spec.window
@@ -200,7 +169,7 @@ def _image(spec: LineImageFileSpec, name: str, sensor: Sensor, folder: Path) -> 
         raise InputError(
             spec.issue("an image longer than its line times", ("first_line",), found=found, allowed=allowed)
         )
-    return UserImage(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
+    return LineFrame(frame, Window(first_line, first_pixel, rows, columns), sensor, (1.0, 1.0))
 
 
 def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
@@ -227,14 +196,14 @@ def _read_image(path: Path, spec: LineImageFileSpec) -> np.ndarray:
             )
         values = np.asarray(source.read(spec.band, window=Part(column, row, columns, rows)))
     if values.dtype.kind not in "uif":
-        raise InputError(Issue("values that are no grey values", file, None, (), str(values.dtype), "real numbers"))
+        raise InputError(Issue("values that are no grey values", file, found=str(values.dtype), allowed="real numbers"))
     if not np.all(np.isfinite(values)):
         raise InputError(Issue("grey values that are not finite", file, allowed="images without gaps, or a `window:`"))
     return values if values.dtype == np.uint16 else values.astype(np.float32)
 
 
 def _extent(
-    spec: OrbitMatchSpec, images: Mapping[str, UserImage], heights: tuple[float, float]
+    spec: OrbitMatchSpec, images: Mapping[str, LineFrame], heights: tuple[float, float]
 ) -> tuple[GroundFrame, tuple[float, float, float, float]]:
     """Plane coordinates of the ground, and west, east, south and north end of what the images can show, metres."""
     seen, reach = [], spec.points.reach + spec.points.template
@@ -257,14 +226,6 @@ def _extent(
     east, north, _ = frame.local(every)
     ends = (east.min() - _SPARE, east.max() + _SPARE, north.min() - _SPARE, north.max() + _SPARE)
     return frame, (float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3]))
-
-
-def _sampled(image: UserImage, height: float) -> UserImage:
-    """With the distances of pixels and lines in its middle."""
-    line, pixel = image.window.middle
-    at = image.measured.ground(line + np.array([-0.5, 0.5, 0, 0]), pixel + np.array([0, 0, -0.5, 0.5]), height)
-    sample = float(np.linalg.norm(at[3] - at[2])), float(np.linalg.norm(at[1] - at[0]))
-    return UserImage(image.frame, image.window, image.measured, sample)
 
 
 def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, Mapping[str, ImagePoints]]:
@@ -291,7 +252,7 @@ def _measured(points: PatchPoints, spec: OrbitMatchSpec) -> tuple[GroundPoints, 
     each = np.ones(int(given.sum()))
     covariance[given] = level_covariance(itrs[given], plan * each, height * each)
     return GroundPoints.of(np.array(ids, object), itrs, covariance, role), FrozenMap(
-        {name: _joined(parts) for name, parts in rows.items()}
+        {name: ImagePoints.joined(parts) for name, parts in rows.items()}
     )
 
 
@@ -301,7 +262,49 @@ def _used(points: MatchedPoints) -> np.ndarray:
     return np.asarray(seen >= (2 if points.kind == "tie" else 1))
 
 
-def _joined(parts: list[ImagePoints]) -> ImagePoints:
-    return ImagePoints(
-        *(np.concatenate([getattr(p, n) for p in parts]) for n in ("point", "line", "pixel", "covariance"))
-    )
+IMAGE: Record[LineFrame] = Record(
+    "A line's image: which part was matched, and its samples on the ground.",
+    Quantity("first_line", lambda image: image.window.first_line, "counted from the first of the table of times"),
+    Quantity("first_pixel", lambda image: image.window.first_pixel, "from the one that sees farthest to the right"),
+    Quantity("lines", lambda image: image.window.lines, "how many"),
+    Quantity("pixels", lambda image: image.window.pixels, "how many"),
+    Quantity("sample_along_line_m", lambda image: image.sample[0], "distance of two pixels on the ground"),
+    Quantity("sample_along_track_m", lambda image: image.sample[1], "distance of two lines on the ground"),
+)
+MAP: Record[MapPart] = Record(
+    "The part of a map that was used.",
+    Quantity("system", lambda part: part.raster.crs.name, "coordinate reference system"),
+    Quantity("first_row", lambda part: part.first[0], "of the part in the map"),
+    Quantity("first_column", lambda part: part.first[1], "of the part in the map"),
+    Quantity("rows", lambda part: part.values.shape[0], "how many"),
+    Quantity("columns", lambda part: part.values.shape[1], "how many"),
+    Quantity("spacing_m", lambda part: part.spacing, "of rows and columns on the ground, geometric mean"),
+    Quantity(
+        "share_without_values",
+        lambda part: 0.0 if part.valid is None else 1.0 - float(np.mean(part.valid)),
+        "share of the pixels that hold nothing",
+    ),
+)
+MATCH: Record[Match] = Record(
+    "match.json. Points measured in a user's images.",
+    Quantity("epoch_utc", lambda run: run.measurements.platform.epoch, "from which times count"),
+    Quantity("images", lambda run: run.ground.images, "every line's image", record=IMAGE),
+    Quantity("orthophoto", lambda run: run.ground.control.orthophoto, "map of grey values", record=MAP),
+    Quantity("dem", lambda run: run.ground.control.dem, "the elevation model", record=MAP),
+    Quantity("map_accuracy_m", lambda run: run.accuracy, "of the maps' way to WGS 84, as its authority states it"),
+    Quantity(
+        "control_points",
+        lambda run: np.sum(run.measurements.ground.role == "control"),
+        "points whose coordinates are used",
+    ),
+    Quantity(
+        "check_points", lambda run: np.sum(run.measurements.ground.role == "check"), "points that only test the result"
+    ),
+    Quantity("tie_points", lambda run: np.sum(run.measurements.ground.role == "tie"), "points without coordinates"),
+    Quantity("points", lambda run: run.points.sorts, "sort -> points measured in the images", record=POINTS),
+)
+
+
+def exported(run: Match) -> dict[str, str]:
+    """Path -> text of a folder of measurements."""
+    return campaign_files([run.measurements], run.setup.camera.plain())

@@ -131,25 +131,13 @@ class Instants:
 
     def since(self, epoch: str) -> np.ndarray:
         """SI seconds (N,) from an epoch in UTC, ISO 8601 text, leap seconds counted; exact to 1e-11 s within a day."""
-        (start,) = _utc(epoch)
+        start = Readings.of_texts([epoch.strip()]).instants("UTC")
         day, second = start.day[0], start.second[0]
         return np.asarray((self.day - day) * DAY + (self.second - second))
 
     def later(self, seconds: float) -> Instants:
         """So many seconds later."""
         return Instants(self.day, self.second + seconds)
-
-    def utc_mjd(self) -> np.ndarray:
-        """Modified Julian dates (N,) in UTC, days; not exact within a leap second. For tables over days."""
-        rough = self.day + self.second / DAY
-        days = np.unique(np.floor(rough).astype(np.int64))
-        ahead = {int(day): tai_minus_utc(int(day)) for day in days}
-        offset = np.array([ahead[int(d)] for d in days])[np.searchsorted(days, np.floor(rough))]
-        return np.asarray(self.day + (self.second - offset) / DAY)
-
-
-def _utc(epoch: str) -> tuple[Instants]:
-    return (Readings.of_texts([epoch.strip()]).instants("UTC"),)
 
 
 def epoch_before(instants: Instants) -> str:

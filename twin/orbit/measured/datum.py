@@ -16,13 +16,14 @@ import numpy as np
 import pyproj
 from pyproj.crs import GeocentricCRS
 from pyproj.exceptions import CRSError, ProjError
+from scipy.ndimage import map_coordinates
 
 from scenes.yaml.errors import InputError, Issue, Problem, shown
 from twin.orbit.measured.geotiff import GeoRaster, open_raster
 
 _ALLOWED = "a code or a text that PROJ knows, as EPSG:4979 (WGS 84 with ellipsoidal height), EPSG:32650, OGC:CRS84"
 CGCS2000 = "China 2000"
-"""As EPSG calls its datum."""
+"""Name of the datum of CGCS2000 in EPSG's registry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,14 @@ class Geoid:
         if np.any(np.abs(values[valid]) > 150.0):
             found = f"{np.max(np.abs(values[valid])):g}"
             raise InputError(Issue("no heights of a geoid", self.raster.file, None, (), found, "metres, within 150 m"))
-        return np.where(valid, values, np.nan)
+        known = np.where(valid, values, np.nan).astype(np.float64)
+        # beyond the last column the first one comes again, or that column itself, which then has no weight
+        return np.pad(known, ((0, 0), (0, 1)), mode="wrap" if self._whole_turn else "edge")
+
+    @property
+    def _whole_turn(self) -> bool:
+        step = abs(self.raster.transform[0])
+        return abs(self.raster.shape[1] * step - 360.0) < 0.6 * step
 
     def __call__(self, longitude: Any, latitude: Any) -> np.ndarray:
         """Height of the geoid, metres, (...).
@@ -63,12 +71,10 @@ class Geoid:
             Problem: a place beyond the grid.
         """
         lon, lat = np.broadcast_arrays(np.asarray(longitude, float), np.asarray(latitude, float))
-        values = self._values
-        rows, columns = values.shape
-        step, first = self.raster.transform[0], self.raster.transform[2]
+        rows, columns = self.raster.shape
+        first, around = self.raster.transform[2], self._whole_turn
         turn = (lon - first) % 360.0
         row, column = self.raster.row_column_of(first + turn, lat)
-        around = abs(columns * step - 360.0) < 0.6 * abs(step)
         inside = (row >= -1e-6) & (row <= rows - 1.0 + 1e-6)
         if not around:
             inside &= (column >= -1e-6) & (column <= columns - 1.0 + 1e-6)
@@ -76,14 +82,8 @@ class Geoid:
             k = int(np.argmin(np.ravel(inside)))
             found = f"{np.ravel(lat)[k]:.6g} deg N, {np.ravel(lon)[k]:.6g} deg E"
             raise Problem("a place beyond the grid of the geoid", found, self.raster.file)
-        r0 = np.clip(np.floor(row).astype(int), 0, max(rows - 2, 0))
-        c0 = np.floor(column).astype(int)
-        c0 = c0 % columns if around else np.clip(c0, 0, max(columns - 2, 0))
-        c1 = (c0 + 1) % columns
-        u, v = np.clip(row - r0, 0.0, 1.0), column - np.floor(column) if around else np.clip(column - c0, 0.0, 1.0)
-        upper = (1.0 - v) * values[r0, c0] + v * values[r0, c1]
-        lower = (1.0 - v) * values[r0 + 1, c0] + v * values[r0 + 1, c1]
-        height = (1.0 - u) * upper + u * lower
+        at = np.clip(row, 0.0, rows - 1.0), column % columns if around else np.clip(column, 0.0, columns - 1.0)
+        height = map_coordinates(self._values, at, order=1, mode="nearest")
         if not np.all(np.isfinite(height)):
             raise Problem("a place where the grid of the geoid holds nothing", None, self.raster.file)
         return np.asarray(height)
@@ -173,7 +173,7 @@ class Datum:
 
     @property
     def accuracy(self) -> float | None:
-        """Of the way to the ITRS as its authority states it, metres, known after the first `itrs`; None: not stated."""
+        """Accuracy of the way to the ITRS as its authority states it, metres; None if it does not, or before `itrs`."""
         stated = self.forward.accuracy
         if stated < 0.0:
             try:

@@ -13,20 +13,16 @@ from typing import Any
 
 import erfa
 import numpy as np
-from scipy.interpolate import CubicSpline
 
+from analysis.units import ARCSEC
 from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, TIME
-from twin.orbit.flight.earth import DAY, tai_of
+from twin.orbit.flight.earth import DAY, celestial_pole, tai_of
 from twin.orbit.measured.clock import FIRST_DAY, LAST_DAY, calendar, calendar_reading, tai_minus_utc
 from twin.orbit.measured.text_file import first_lines, numbers, text_lines
 
 WHAT = "a table of Earth orientation: finals2000A or C04 as the IERS gives them, or CSV"
-_ARCSEC = np.pi / 648000.0
-_MAS = 1e-3 * _ARCSEC
-_TT_FROM_TAI = 32.184
-_NODE_STEP = 3600.0
 _RATE_STEP = 1.0
 """Seconds to either side for the rate of rotation: rounding is 1e-16 rad/s, curvature far less."""
 _COLUMNS = (
@@ -71,11 +67,7 @@ class EarthOrientation:
             raise InputError(
                 Issue("the table of Earth orientation ends before the data", self.file, None, (), found, needed)
             )
-        one, two = tai_of(epoch)
-        around = np.ceil(0.5 * (last - first) / _NODE_STEP) + 3.0
-        node = 0.5 * (first + last) + _NODE_STEP * np.arange(-around, around + 1.0)
-        pole = np.stack(erfa.xys06a(one, two + (node + _TT_FROM_TAI) / DAY), axis=-1)
-        return TableRotation(self, epoch, CubicSpline(node, pole))
+        return TableRotation(self, epoch, celestial_pole(epoch, first, last))
 
     def at(self, mjd: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """UT1 - TAI (N,), seconds, pole (N, 2) and offsets (N, 2), radians, at dates in UTC (N,)."""
@@ -137,7 +129,7 @@ class TableRotation:
 
     def _polar(self, t: np.ndarray, pole: np.ndarray) -> np.ndarray:
         one, two = tai_of(self.epoch)
-        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(one, two + (t + _TT_FROM_TAI) / DAY)))
+        return np.asarray(erfa.pom00(pole[..., 0], pole[..., 1], erfa.sp00(one, two + (t + erfa.TTMTAI) / DAY)))
 
 
 def rate_of(matrix: Any, seconds: np.ndarray) -> np.ndarray:
@@ -208,11 +200,11 @@ def _c04(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
     late = table[:, 0] >= FIRST_DAY
     lines = [k for k, one in zip(lines, late, strict=True) if one]
     table = table[late]
-    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _ARCSEC)
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * ARCSEC, table[:, 4:6] * ARCSEC)
 
 
 _FINAL = {"x": (134, 144), "y": (144, 154), "UT1-UTC": (154, 165), "dX": (165, 175), "dY": (175, 185)}
-"""Of Bulletin B, which is final; later days have Bulletin A alone."""
+"""Columns of Bulletin B, which is final; later days have Bulletin A alone."""
 _FINALS = {"MJD": (7, 15), "x": (18, 27), "y": (37, 46), "UT1-UTC": (58, 68), "dX": (97, 106), "dY": (116, 125)}
 
 
@@ -231,7 +223,7 @@ def _finals(file: str, rows: list[tuple[int, str]]) -> EarthOrientation:
             cells.append([text or "0" for text in cut])
             lines.append(k)
     table = numbers(file, cells, lines, tuple(_FINALS))
-    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * _ARCSEC, table[:, 4:6] * _MAS)
+    return _checked(file, lines, table[:, 0], table[:, 3], table[:, 1:3] * ARCSEC, table[:, 4:6] * 1e-3 * ARCSEC)
 
 
 def _checked(

@@ -51,7 +51,7 @@ class GroundFile:
 
 @dataclass(eq=False)
 class _Rows:
-    """Of a file: names, places in its own system, sigmas (NaN where there are none), roles, lines."""
+    """Rows of a file: names, places in its own system, sigmas (NaN where there are none), roles, lines."""
 
     ids: list[str]
     places: np.ndarray

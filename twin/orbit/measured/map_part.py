@@ -27,7 +27,7 @@ _WGS84 = "EPSG:4326"
 
 @dataclass(frozen=True, eq=False)
 class MapPart:
-    """A part of a map; see `twin.orbit.images.imaged_ground.Map`.
+    """A part of a map; see `twin.orbit.ground.orthophoto.Map`.
 
     Attributes:
         values: (rows, columns); grey values float32 with NaN where there are none, or heights above the ellipsoid.
@@ -51,31 +51,19 @@ class MapPart:
         """Coordinates of places (row, column), whole or not, metres, broadcast."""
         row, column = np.broadcast_arrays(np.asarray(row, float), np.asarray(column, float))
         x, y = self.raster.coordinates_of(row + self.first[0], column + self.first[1])
-        return plane_of(self.frame, *self.way.transform(x, y))
+        return self.frame.plane(*np.radians(self.way.transform(x, y)))
 
     def row_column(self, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The inverse."""
         east, north = np.broadcast_arrays(np.asarray(east, float), np.asarray(north, float))
-        x, y = self.way.transform(*degrees_of(self.frame, east, north), direction="INVERSE")
+        longitude, latitude = np.degrees(self.frame.geographic(east, north))
+        x, y = self.way.transform(longitude, latitude, direction="INVERSE")
         if self.raster.crs.is_geographic:
             # the turn of longitude that the map has
             middle = self.raster.coordinates_of(0.5 * self.raster.shape[0], 0.5 * self.raster.shape[1])[0]
             x = middle + (x - middle + 180.0) % 360.0 - 180.0
         row, column = self.raster.row_column_of(x, y)
         return row - self.first[0], column - self.first[1]
-
-
-def plane_of(frame: GroundFrame, longitude: np.ndarray, latitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """East and north (...), metres, of longitude and latitude (...), degrees."""
-    per_longitude, per_latitude = frame.scale
-    turn = (np.radians(longitude) - frame.longitude + np.pi) % (2.0 * np.pi) - np.pi
-    return turn * per_longitude, (np.radians(latitude) - frame.latitude) * per_latitude
-
-
-def degrees_of(frame: GroundFrame, east: np.ndarray, north: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Longitude and latitude (...), degrees, of east and north (...), metres."""
-    per_longitude, per_latitude = frame.scale
-    return np.degrees(frame.longitude + east / per_longitude), np.degrees(frame.latitude + north / per_latitude)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +154,8 @@ class UserMap:
         for place, count in ((row[good], self.raster.shape[0]), (column[good], self.raster.shape[1])):
             low, high = int(max(np.floor(place.min()) - 2, 0)), int(min(np.ceil(place.max()) + 3, count))
             if high - low < 4:
-                lon, lat = degrees_of(frame, np.array(0.0), np.array(0.0))
-                found = f"images near {float(lat):.4f} deg N, {float(lon):.4f} deg E"
+                lon, lat = np.degrees((frame.longitude, frame.latitude))
+                found = f"images near {lat:.4f} deg N, {lon:.4f} deg E"
                 allowed = "a map of the ground that the images show; its own longitude and latitude are "
                 x, y = self.way.transform(*self.raster.coordinates_of(*(0.5 * n for n in self.raster.shape)))
                 raise InputError(
@@ -196,7 +184,7 @@ class UserMap:
             for k in range(0, len(rows), 256):  # a part at a time: a geoid needs several numbers a post
                 east, north = part.east_north(rows[k : k + 256, None], columns[None])
                 try:
-                    values[k : k + 256] += self.geoid(*degrees_of(part.frame, east, north))
+                    values[k : k + 256] += self.geoid(*np.degrees(part.frame.geographic(east, north)))
                 except Problem as problem:
                     raise InputError(
                         Issue(problem.problem, self.raster.file, None, (), problem.found, problem.allowed)

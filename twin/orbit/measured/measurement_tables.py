@@ -8,7 +8,6 @@ checked.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -72,117 +71,76 @@ CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
 """Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
 
 
-@dataclass(frozen=True, eq=False)
-class PassTables:
-    """The tables of a pass as they were read, for whoever reads them in other conventions.
+def read_pass(
+    name: str,
+    spec: PassFilesSpec,
+    conventions: ConventionsSpec,
+    camera: ThreeLineCameraSpec,
+    needed: Mapping[str, int] = CALIBRATING,
+) -> PassMeasurements:
+    """What the tables of a pass say.
 
-    Attributes:
+    Args:
         name: of the pass.
-        epoch: of all times.
-        orbit, attitude, lines, ground, image_points: the tables; the first two are None where files of other formats
-            take their place.
-        files: those, with what they do not say themselves.
-        tie_points: likewise, None where there are none.
+        spec: its epoch and files, with paths that hold from here.
+        conventions: of all tables.
+        camera: whose lines they name.
+        needed: role -> in how many line cameras one of its points must be seen.
+
+    Raises:
+        InputError: a table cannot be read or is not as `COLUMNS` says, or what it says cannot be, with file, line and
+            column.
     """
+    files = spec.files
+    platform = _platform(spec, conventions)
+    lines, known, pixels = (read_table(files[key], COLUMNS[key]) for key in ("lines", "ground", "image_points"))
+    times, origins = _line_times_of(lines, conventions, camera, platform)
+    ground = ground_of(known)
+    number = {name: k for k, name in enumerate(ground.ids.tolist())}
+    tables = [(pixels, number)]
+    if "tie_points" in files:
+        ties = read_table(files["tie_points"], COLUMNS["image_points"])
+        for row in np.flatnonzero([name in number for name in ties["point"]])[:1]:
+            allowed = "a point without coordinates, or another name"
+            raise ties.error(int(row), "point", f"this point has coordinates in {known.file}", allowed=allowed)
+        names = list(dict.fromkeys(ties["point"].tolist()))
+        tables.append((ties, {name: len(ground) + k for k, name in enumerate(names)}))
+        ground = ground.with_ties(names)
+    trajectory = TabulatedTrajectory(platform)
+    parts: dict[str, list[ImagePoints]] = {line: [] for line in times}
+    for table, numbers in tables:
+        for line, row in _image_points_of(table, numbers, times, origins, conventions, camera, trajectory).items():
+            parts[line].append(row)
+    images = {line: ImagePoints.joined(rows) for line, rows in parts.items() if any(len(r.point) for r in rows)}
+    rays = np.zeros(len(ground), int)
+    for row in images.values():
+        np.add.at(rays, row.point, 1)
+    for role, least in needed.items():
+        if not np.any((ground.role == role) & (rays >= least)):
+            seen = "one line camera" if least == 1 else "two line cameras"
+            allowed = f"{role} points in the ground table whose image points are measured"
+            raise InputError(Issue(f"no {role} point is seen by {seen}", pixels.file, allowed=allowed))
+    if len(images) < 2:
+        found = f"of {names_text(tuple(images)) or 'none'}"
+        allowed = "image points of two line cameras or more"
+        raise InputError(Issue("too few line cameras", pixels.file, found=found, allowed=allowed))
+    return PassMeasurements(name, platform, {line: times[line] for line in images}, ground, images)
 
-    name: str
-    epoch: str
-    orbit: Table | None
-    attitude: Table | None
-    files: PlatformFilesSpec | None
-    lines: Table
-    ground: Table
-    image_points: Table
-    tie_points: Table | None
 
-    @classmethod
-    def read(cls, name: str, spec: PassFilesSpec) -> PassTables:
-        """Read all tables of a pass.
-
-        Args:
-            name: of the pass.
-            spec: its epoch and files, with paths that hold from here.
-
-        Raises:
-            InputError: a table cannot be read or is not as `COLUMNS` says.
-        """
-        files = spec.files
-        other = spec.platform if isinstance(spec.platform, PlatformFilesSpec) else None
-        orbit: Table | None = None
-        attitude: Table | None = None
-        if other is None and "platform" in files:
-            orbit = attitude = read_table(files["platform"], COLUMNS["platform"], 2)
-        elif other is None:
-            orbit, attitude = (read_table(files[key], COLUMNS[key], 2) for key in ("orbit", "attitude"))
-        lines, ground, images = (read_table(files[key], COLUMNS[key]) for key in ("lines", "ground", "image_points"))
-        ties = read_table(files["tie_points"], COLUMNS["image_points"]) if "tie_points" in files else None
-        return cls(name, spec.epoch, orbit, attitude, other, lines, ground, images, ties)
-
-    def measurements(
-        self, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, needed: Mapping[str, int] = CALIBRATING
-    ) -> PassMeasurements:
-        """What they say in these conventions.
-
-        Args:
-            conventions: of all tables.
-            camera: whose lines they name.
-            needed: role -> in how many line cameras one of its points must be seen.
-
-        Raises:
-            InputError: what they say cannot be, with file, line and column.
-        """
-        platform = self._platform(conventions)
-        times, origins = line_times_of(self.lines, conventions, camera, platform)
-        ground = ground_of(self.ground)
-        number = {name: k for k, name in enumerate(ground.ids.tolist())}
-        tables = [(self.image_points, number)]
-        if self.tie_points is not None:
-            ties = list(dict.fromkeys(self.tie_points["point"].tolist()))
-            for row in np.flatnonzero([name in number for name in self.tie_points["point"]])[:1]:
-                allowed = "a point without coordinates, or another name"
-                raise self.tie_points.error(
-                    int(row), "point", f"this point has coordinates in {self.ground.file}", allowed=allowed
-                )
-            count = len(ground)
-            empty = GroundPoints.of(ties, np.full((len(ties), 3), np.nan), np.zeros((3, 3)), "tie")
-            ground = _joined(ground, empty)
-            tables.append((self.tie_points, {name: count + k for k, name in enumerate(ties)}))
-        trajectory = TabulatedTrajectory(platform)
-        parts: dict[str, list[ImagePoints]] = {name: [] for name in times}
-        for table, names in tables:
-            for name, row in image_points_of(table, names, times, origins, conventions, camera, trajectory).items():
-                parts[name].append(row)
-        images = {name: _all_of(rows) for name, rows in parts.items() if any(len(r.point) for r in rows)}
-        rays = np.zeros(len(ground), int)
-        for row in images.values():
-            np.add.at(rays, row.point, 1)
-        for role, least in needed.items():
-            if not np.any((ground.role == role) & (rays >= least)):
-                seen = "one line camera" if least == 1 else "two line cameras"
-                allowed = f"{role} points in the ground table whose image points are measured"
-                raise InputError(Issue(f"no {role} point is seen by {seen}", self.image_points.file, allowed=allowed))
-        if len(images) < 2:
-            found = f"of {names_text(tuple(images)) or 'none'}"
-            allowed = "image points of two line cameras or more"
-            raise InputError(Issue("too few line cameras", self.image_points.file, found=found, allowed=allowed))
-        return PassMeasurements(self.name, platform, {k: times[k] for k in images}, ground, images)
-
-    def _platform(self, conventions: ConventionsSpec) -> PlatformTable:
-        if self.files is None:
-            assert self.orbit is not None
-            assert self.attitude is not None
-            return platform_of(self.epoch, self.orbit, self.attitude, conventions)
+def _platform(spec: PassFilesSpec, conventions: ConventionsSpec) -> PlatformTable:
+    """Orbit and attitude of a pass, from tables or from files of other formats."""
+    if isinstance(spec.platform, PlatformFilesSpec):
         # what reads them waits for libraries that tables do not need
         from twin.orbit.measured.platform_files import platform_table, read_platform
 
-        return platform_table(*read_platform(self.files, Path()), self.epoch)
+        return platform_table(*read_platform(spec.platform, Path()), spec.epoch)
+    keys = ("platform",) if "platform" in spec.files else ("orbit", "attitude")
+    tables = [read_table(spec.files[key], COLUMNS[key], 2) for key in keys]
+    return platform_of(spec.epoch, tables[0], tables[-1], conventions)
 
 
 def read_measurements(
-    data: OrbitDataSpec,
-    camera: ThreeLineCameraSpec,
-    advance: Advance = silent,
-    needed: Mapping[str, int] = CALIBRATING,
+    data: OrbitDataSpec, camera: ThreeLineCameraSpec, advance: Advance = silent, needed: Mapping[str, int] = CALIBRATING
 ) -> tuple[PassMeasurements, ...]:
     """All passes of a test.
 
@@ -197,12 +155,12 @@ def read_measurements(
     """
     found = []
     for name, files in data.passes.items():
-        found.append(PassTables.read(name, files).measurements(data.conventions, camera, needed))
+        found.append(read_pass(name, files, data.conventions, camera, needed))
         advance("read", len(found), len(data.passes))
     return tuple(found)
 
 
-def line_times_of(
+def _line_times_of(
     table: Table, conventions: ConventionsSpec, camera: ThreeLineCameraSpec, platform: PlatformTable
 ) -> tuple[dict[str, LineTimes], dict[str, float]]:
     """Line camera -> its line times with the first line as 0, and the number of that line in the file.
@@ -216,7 +174,7 @@ def line_times_of(
     Raises:
         InputError: a camera that is none, a line twice, times that do not rise, lines outside the readings.
     """
-    _known(table, "camera", tuple(camera.lines))
+    require_known(table, "camera", tuple(camera.lines))
     path = TabulatedTrajectory(platform)
     found, origins = {}, {}
     for name in dict.fromkeys(table["camera"].tolist()):
@@ -257,7 +215,7 @@ def ground_of(table: Table) -> GroundPoints:
             two ways, or no covariance.
     """
     _once(table, "point")
-    _known(table, "role", ("control", "check"))
+    require_known(table, "role", ("control", "check"))
     place = table.stacked("x", "y", "z")
     radius = np.linalg.norm(place, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -304,7 +262,7 @@ def _covariance(table: Table, place: Array) -> Array:
     return np.asarray(sigma[:, :, None] * like * sigma[:, None, :])
 
 
-def image_points_of(
+def _image_points_of(
     table: Table,
     names: Mapping[str, int],
     times: Mapping[str, LineTimes],
@@ -328,7 +286,7 @@ def image_points_of(
         InputError: a point or camera that is none, a point twice in a camera, a place outside the image or exposed
             where orbit or attitude are not known.
     """
-    _known(table, "camera", tuple(times))
+    require_known(table, "camera", tuple(times))
     number = np.array([names.get(name, -1) for name in table["point"].tolist()])
     if np.any(number < 0):
         row = int(np.argmax(number < 0))
@@ -363,17 +321,22 @@ def image_points_of(
             row = int(order[np.argmin(known)])
             problem = "exposed in a gap of the readings of orbit or attitude"
             raise table.error(row, "line", problem, allowed="points where readings are at most 5 intervals apart")
-        sense = 1.0
+        spread = image_covariance(table, order)
         if conventions.first_pixel_sees == "left":
-            pixel, sense = pixels - 1.0 - pixel, -1.0
-        a, b = table["sigma_line"][order], table["sigma_pixel"][order]
-        c = sense * table["correlation"][order] if "correlation" in table else np.zeros(len(order))
-        spread = np.stack([np.stack([a * a, a * b * c], -1), np.stack([a * b * c, b * b], -1)], axis=1)
+            # a mirrored axis turns the sign of the correlation
+            pixel, spread = pixels - 1.0 - pixel, spread * np.array([[1.0, -1.0], [-1.0, 1.0]])
         found[name] = ImagePoints.of(number[order], line, pixel, spread)
     return found
 
 
-def _known(table: Table, column: str, names: tuple[str, ...]) -> None:
+def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
+    """Covariances of line and pixel in some rows of a table of image points, (n, 2, 2), pixels squared."""
+    a, b = table["sigma_line"][rows], table["sigma_pixel"][rows]
+    c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
+    return np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
+
+
+def require_known(table: Table, column: str, names: tuple[str, ...]) -> None:
     """InputError unless every cell is one of these names."""
     for row in np.flatnonzero(~np.isin(table[column].astype(str), names))[:1]:
         cell = str(table[column][row])
@@ -390,16 +353,6 @@ def _once(table: Table, column: str) -> None:
         seen[name] = row
 
 
-def _joined(one: GroundPoints, other: GroundPoints) -> GroundPoints:
-    names = ("ids", "itrs", "covariance", "role")
-    return GroundPoints(*(np.concatenate([getattr(one, k), getattr(other, k)]) for k in names))
-
-
-def _all_of(parts: list[ImagePoints]) -> ImagePoints:
-    names = ("point", "line", "pixel", "covariance")
-    return ImagePoints(*(np.concatenate([getattr(p, k) for p in parts]) for k in names))
-
-
 CONVENTIONS: Mapping[str, Any] = {
     "frame": "itrs",
     "quaternion": {"scalar": "last", "turns": "body_to_frame"},
@@ -410,7 +363,7 @@ CONVENTIONS: Mapping[str, Any] = {
     "first_pixel": 0,
     "first_pixel_sees": "right",
 }
-"""Of the files that are written: the project's own."""
+"""Conventions of the files that are written: the project's own."""
 CAMERA_FILE = "camera.yaml"
 
 
@@ -423,14 +376,14 @@ def campaign_files(passes: Sequence[PassMeasurements], camera: Mapping[str, Any]
     """
     files, listed = {CAMERA_FILE: dump_yaml(camera)}, {}
     for one in passes:
-        tables = pass_tables(one)
+        tables = _pass_tables(one)
         files |= {f"{one.name}/{key}.csv": text for key, text in tables.items()}
         listed[one.name] = {"epoch": one.platform.epoch, **{key: f"{one.name}/{key}.csv" for key in tables}}
     files[DATA_FILE] = dump_yaml({"conventions": dict(CONVENTIONS), "passes": listed})
     return files
 
 
-def pass_tables(one: PassMeasurements) -> dict[str, str]:
+def _pass_tables(one: PassMeasurements) -> dict[str, str]:
     """Key of a pass -> text of its table, with all digits."""
     platform = one.platform
     orbit = {"time [s]": platform.orbit_time, **_columns(("x [m]", "y [m]", "z [m]"), platform.position)}

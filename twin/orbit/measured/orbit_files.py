@@ -17,17 +17,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest, shown
+from twin.orbit.measured import platform_readings
 from twin.orbit.measured.clock import Readings, known_scale
-from twin.orbit.measured.platform_readings import (
-    AttitudeReadings,
-    OrbitReadings,
-    Scalar,
-    Segment,
-    Turns,
-    known_frame,
-    require_orbit,
-    require_unit,
-)
+from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, Segment, known_frame
 from twin.orbit.measured.text_file import numbers, readings, require_rising, text_lines
 
 _COVARIANCE = ("COVARIANCE_START", "COVARIANCE_STOP")
@@ -73,7 +65,7 @@ def read_oem(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     cells = [row[1:7] for row in rows] if widths <= {7, 10} else [row[1:] for row in rows]
     found = 1e3 * numbers(file, cells, lines, ("X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"))
     clock = readings(file, [row[0] for row in rows], lines)
-    require_orbit(file, found[:, :3], lines)
+    platform_readings.require_orbit(file, found[:, :3], lines)
     parts = _parts(file, segments)
     for part, segment in zip(parts, segments, strict=True):
         own = slice(part.first, part.last + 1)
@@ -102,16 +94,16 @@ def read_aem(path: str | Path, satellite: str | None = None) -> AttitudeReadings
     if direction.upper() not in ("A2B", "B2A"):
         raise InputError(Issue("no such direction", file, turn_line, ("ATTITUDE_DIR",), shown(direction), "A2B, B2A"))
     to_body = (direction.upper() == "A2B") == (body[0] == "REF_FRAME_B")
-    turns: Turns = "body_to_frame" if to_body else "frame_to_body"
+    turns: platform_readings.Turns = "body_to_frame" if to_body else "frame_to_body"
     first, type_line = _same(file, segments, "QUATERNION_TYPE", "LAST")
     if first.upper() not in ("FIRST", "LAST"):
         raise InputError(Issue("no such type", file, type_line, ("QUATERNION_TYPE",), shown(first), "FIRST, LAST"))
-    scalar: Scalar = "first" if first.upper() == "FIRST" else "last"
+    scalar: platform_readings.Scalar = "first" if first.upper() == "FIRST" else "last"
     rows, lines = _joined(segments)
     cells = [row[1:5] if len(row) >= 5 else row[1:] for row in rows]
     heads = ("QC", "Q1", "Q2", "Q3") if scalar == "first" else ("Q1", "Q2", "Q3", "QC")
     quaternion = numbers(file, cells, lines, heads)
-    require_unit(file, quaternion, lines)
+    platform_readings.require_unit(file, quaternion, lines)
     clock = readings(file, [row[0] for row in rows], lines)
     require_rising(file, clock, lines)
     frame = known_frame(reference, file, at, "REF_FRAME_A")
@@ -191,7 +183,7 @@ def _from_xml(file: str, text: str, kind: str) -> Iterator[_Segment]:
 
 
 def _chosen(file: str, segments: list[_Segment], satellite: str | None) -> list[_Segment]:
-    """Those of one satellite."""
+    """The segments of one satellite."""
     names: dict[str, Mapping[str, None]] = {}
     for segment in segments:
         known = {segment.keys[k][0]: None for k in ("OBJECT_ID", "OBJECT_NAME") if k in segment.keys}
@@ -334,7 +326,7 @@ def read_sp3(path: str | Path, satellite: str | None = None) -> OrbitReadings:
     clock = readings(file, texts, where)
     require_rising(file, clock, where)
     position = 1e3 * numbers(file, places, rows, ("x", "y", "z"))
-    require_orbit(file, position, rows)
+    platform_readings.require_orbit(file, position, rows)
     velocity = None
     if speeds:
         if len(speeds) != len(rows):
@@ -353,7 +345,7 @@ def _only_satellite(file: str, lines: list[str]) -> str:
 
 
 def _name(wanted: str, lines: list[str], old: bool) -> str:
-    """As a file spells it: in the old versions 5, 05 and G05 are one."""
+    """A satellite's name as the file spells it: in the old versions 5, 05 and G05 are one."""
     names = {line[1:4].strip() for line in lines if line[:1] == "P"}
     if wanted in names or not old:
         return wanted

@@ -5,8 +5,8 @@ Whatever files it came from, and whether a satellite or the simulation made it, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from twin.orbit.flight.platform_table import PlatformTable
 
 Array = NDArray[np.float64]
 ROLES = ("control", "check", "tie")
-"""Of ground points: their coordinates are used; only test the result; are not known."""
+"""Roles of ground points: their coordinates are used; they only test the result; they are not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +70,11 @@ class GroundPoints:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def with_ties(self, names: Sequence[str]) -> GroundPoints:
+        """These points, and after them tie points of these names, of which nothing is known."""
+        ties = GroundPoints.of(names, np.full((len(names), 3), np.nan), np.zeros((3, 3)), "tie")
+        return GroundPoints(*(np.concatenate([getattr(one, k.name) for one in (self, ties)]) for k in fields(self)))
+
     def taken(self, keep: ArrayLike) -> GroundPoints:
         """Some of them, by mask or index."""
         where = np.asarray(keep)
@@ -116,6 +121,11 @@ class ImagePoints:
         """Some of them, by mask or index."""
         where = np.asarray(keep)
         return ImagePoints(self.point[where], self.line[where], self.pixel[where], self.covariance[where])
+
+    @classmethod
+    def joined(cls, parts: Sequence[ImagePoints]) -> ImagePoints:
+        """Several sets one after the other; at least one."""
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
         """The same, their ground points counted from ``first``."""

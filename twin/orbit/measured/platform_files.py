@@ -20,19 +20,14 @@ from scenes.yaml.errors import InputError, Issue, Problem
 from scenes.yaml.units import ANGLE, DISTANCE, SPEED, TIME
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.trajectory import Attitude
+from twin.orbit.measured import earth_orientation, orbit_files
 from twin.orbit.measured.clock import Instants, Readings, calendar_reading, epoch_before, tai_minus_utc
-from twin.orbit.measured.earth_orientation import (
-    EarthOrientation,
-    TableRotation,
-    constant_orientation,
-    rate_of,
-    read_earth_orientation,
-)
-from twin.orbit.measured.orbit_files import is_sp3, message_kind, read_aem, read_oem, read_sp3
+from twin.orbit.measured.earth_orientation import EarthOrientation, TableRotation
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings, require_orbit, require_unit
 from twin.orbit.measured.text_file import first_lines, require_rising
 
 if TYPE_CHECKING:
+    from scenes.specs.measured.orbit_data import LineTimesFileSpec
     from scenes.specs.measured.pass_files import AttitudeFileSpec, OrbitFileSpec, PlatformFilesSpec
 
 _ORBIT = tuple(Column(name, DISTANCE) for name in "xyz") + tuple(Column(f"v{n}", SPEED, needed=False) for n in "xyz")
@@ -215,7 +210,7 @@ def _in_itrs(
     position = np.einsum("nij,nj->ni", matrix, orbit.position)
     if orbit.velocity is None:
         return position, None
-    carried = np.cross(rate_of(turn, time), position)
+    carried = np.cross(earth_orientation.rate_of(turn, time), position)
     return position, np.einsum("nij,nj->ni", matrix, orbit.velocity) - carried
 
 
@@ -262,22 +257,22 @@ def _stated(spec: Any, key: str, said: str | None, found: str | None, what: str)
 
 def _earth(spec: PlatformFilesSpec, folder: Path, orbit: OrbitReadings, meant: Conventions) -> EarthOrientation | None:
     if spec.earth_orientation is not None:
-        return read_earth_orientation(folder / spec.earth_orientation)
+        return earth_orientation.read_earth_orientation(folder / spec.earth_orientation)
     if spec.earth is not None:
         first = epoch_before(_instants(orbit.file, orbit.clock, meant.orbit_scale, meant.orbit_offset))
-        return constant_orientation(first, spec.earth.ut1_utc, spec.earth.polar_motion)
+        return earth_orientation.constant_orientation(first, spec.earth.ut1_utc, spec.earth.polar_motion)
     return None
 
 
 def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
     path = folder / spec.file
     head = list(first_lines(path, "an orbit: SP3, CCSDS OEM, or CSV"))
-    if head and is_sp3(head[0]):
-        return read_sp3(path, spec.satellite)
-    if (kind := message_kind(head)) is not None:
+    if head and orbit_files.is_sp3(head[0]):
+        return orbit_files.read_sp3(path, spec.satellite)
+    if (kind := orbit_files.message_kind(head)) is not None:
         if kind != "OEM":
             raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "OEM"))
-        return read_oem(path, spec.satellite)
+        return orbit_files.read_oem(path, spec.satellite)
     table = read_table(path, (*_CLOCK, *_ORBIT), 2)
     clock, scale = _clock(table, spec)
     have = [name for name in ("vx", "vy", "vz") if name in table]
@@ -294,10 +289,10 @@ def _orbit(spec: OrbitFileSpec, folder: Path) -> OrbitReadings:
 def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
     path = folder / spec.file
     head = list(first_lines(path, "an attitude: CCSDS AEM, or CSV"))
-    if (kind := message_kind(head)) is not None:
+    if (kind := orbit_files.message_kind(head)) is not None:
         if kind != "AEM":
             raise InputError(Issue("a CCSDS message of another kind", str(path), 1, (), kind, "AEM"))
-        return read_aem(path, spec.satellite)
+        return orbit_files.read_aem(path, spec.satellite)
     table = read_table(path, (*_CLOCK, *_TURN), 2)
     clock, scale = _clock(table, spec)
     sets = [names for names in (_NAMED, _PLACED, _ANGLES) if any(n in table for n in names)]
@@ -312,46 +307,53 @@ def _attitude(spec: AttitudeFileSpec, folder: Path) -> AttitudeReadings:
     return AttitudeReadings(str(path), clock, values, None, None, scale, "last" if sets[0] == _NAMED else None)
 
 
-def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
-    """Readings of a table; with the scale UTC where each of them says so by a Z."""
+def clock_of(table: Table, spec: OrbitFileSpec | AttitudeFileSpec | LineTimesFileSpec) -> Readings:
+    """What the clock read in each row of a table, by its column time or date_time.
+
+    Raises:
+        InputError: times that are not said once, a text that is no date and time, seconds without their epoch.
+    """
     if ("time" in table) == ("date_time" in table):
-        found = ", ".join(table.columns)
-        raise InputError(
-            Issue("times are not said once", table.file, None, (), found, "time [s] with `epoch:`, or date_time")
-        )
-    lines = [int(v) for v in table.lines]
+        found, allowed = ", ".join(table.columns), "time [s] with `epoch:`, or date_time"
+        raise InputError(Issue("times are not said once", table.file, None, (), found, allowed))
+    try:
+        if "date_time" in table:
+            return Readings.of_texts(table["date_time"].tolist())
+        if spec.epoch is None:
+            raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
+        return Readings.after(spec.epoch, table["time"])
+    except Problem as problem:
+        if problem.within:
+            row = int(problem.within[0])
+            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
+        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+
+
+def _clock(table: Table, spec: OrbitFileSpec | AttitudeFileSpec) -> tuple[Readings, str | None]:
+    """Rising readings of a table; with the scale UTC where each of them says so by a Z."""
+    clock = clock_of(table, spec)
     if "date_time" in table:
         if spec.epoch is not None:
             raise spec.error("an epoch for times of the day", ("epoch",), allowed="no epoch, or a column time [s]")
-        texts = table["date_time"]
-        try:
-            clock = Readings.of_texts(texts.tolist())
-        except Problem as problem:
-            row = int(problem.within[0])
-            raise table.error(row, "date_time", problem.problem, problem.found, problem.allowed) from None
-        require_rising(table.file, clock, lines)
-        return clock, "UTC" if all(text.endswith("Z") for text in texts) else None
-    if spec.epoch is None:
-        raise spec.error("times in seconds without their epoch", ("epoch",), allowed="reading of the clock at 0 s")
-    try:
-        clock, between = Readings.after(spec.epoch, table["time"]), 0.0
-        zoned = "UTC" if spec.epoch.endswith("Z") else None
+        zoned = "UTC" if all(text.endswith("Z") for text in table["date_time"]) else None
+    else:
+        zoned = "UTC" if str(spec.epoch).endswith("Z") else None
         if (spec.time_scale or zoned) == "UTC":
-            clock, between = _counted(spec, clock)
-    except Problem as problem:
-        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
-    if between and spec.leap_seconds is None:
-        count = f"{between:g} leap seconds lie between the epoch and the times"
-        raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
-    require_rising(table.file, clock, lines)
+            clock = _counted(spec, clock)
+    require_rising(table.file, clock, [int(v) for v in table.lines])
     return clock, zoned
 
 
-def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> tuple[Readings, float]:
-    """Readings of a clock that shows UTC, and leap seconds between its epoch and the first of them."""
-    days, where = np.unique(clock.day, return_inverse=True)
-    start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
-    since = np.array([tai_minus_utc(int(day)) for day in days]) - start
-    if spec.leap_seconds != "counted":
-        return clock, float(np.max(np.abs(since)))
-    return Readings(clock.day, clock.second - since[where]), float(np.max(np.abs(since)))
+def _counted(spec: OrbitFileSpec | AttitudeFileSpec, clock: Readings) -> Readings:
+    """Readings of a clock that shows UTC, for which its file says whether leap seconds since the epoch are counted."""
+    try:
+        days, where = np.unique(clock.day, return_inverse=True)
+        start = tai_minus_utc(calendar_reading(str(spec.epoch))[0])
+        since = np.array([tai_minus_utc(int(day)) for day in days]) - start
+    except Problem as problem:
+        raise spec.error(problem.problem, ("epoch",), found=problem.found, allowed=problem.allowed) from None
+    between = float(np.max(np.abs(since)))
+    if between and spec.leap_seconds is None:
+        count = f"{between:g} leap seconds lie between the epoch and the times"
+        raise spec.error(count, ("leap_seconds",), allowed="counted or skipped")
+    return Readings(clock.day, clock.second - since[where]) if spec.leap_seconds == "counted" else clock

@@ -16,7 +16,6 @@ from twin.orbit.flight.platform_table import PlatformTable
 from twin.orbit.measured.clock import Readings
 
 Frame = Literal["ITRS", "GCRS", "EME2000", "TEME"]
-AttitudeFrame = Literal["ITRS", "GCRS", "EME2000", "TEME", "orbital"]
 Scalar = Literal["last", "first"]
 Turns = Literal["body_to_frame", "frame_to_body"]
 FRAMES: tuple[str, ...] = get_args(Frame)
@@ -131,7 +130,8 @@ Array = NDArray[np.float64]
 _LEAST_RADIUS, _MOST_RADIUS = 6.45e6, 5.0e7
 """Metres from the Earth's centre: of satellites that map the Earth."""
 _SPEED_TOLERANCE = 0.02
-"""Of a velocity: positions of 1 m noise 1 s apart differ by less; that against the stars differs by 6 % and more."""
+"""Relative tolerance of a velocity. Positions of 1 m noise 1 s apart differ by less, and the velocity against the stars
+differs by 6 % and more."""
 _UNIT_TOLERANCE = 1e-3
 _FALL, _JUMP = 12.0, 0.05
 """Largest acceleration, m/s^2, and share of the speed by which readings one interval apart may change it by noise."""
@@ -177,12 +177,12 @@ def platform_of(epoch: str, orbit: Table, attitude: Table, conventions: Conventi
     if len(far):
         found = f"a norm of {norm[far[0]]:.6g}"
         raise attitude.error(int(looks[far[0]]), "q1", "no unit quaternion", found, "four numbers of norm 1")
-    quaternion = quaternions_of(numbers, conventions)
+    quaternion = _quaternions_of(numbers, conventions)
     _check_turns(attitude, looks, quaternion)
     return PlatformTable.of(epoch, time, place, speed, attitude["time"][looks], quaternion)
 
 
-def quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
+def _quaternions_of(numbers: Array, conventions: ConventionsSpec) -> Array:
     """Quaternions x, y, z, w that turn the project's body axes into those of the frame.
 
     Args:

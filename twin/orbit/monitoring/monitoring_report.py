@@ -15,7 +15,7 @@ from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
 from twin.run.report import Report, Section, one_sentence
-from twin.sensors.grey_steps import coarse_warnings
+from twin.sensors.area_detector import coarse_warnings
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup

@@ -33,7 +33,7 @@ from twin.study.runs.render_base import monitor_results
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
 """Largest steps of differences, SI: they move the beam on the mirrors by a few millimetres at most."""
 ROUNDING = 1e-9
-"""Of a motion's size per step: motions that are smaller come from rounding in a composition of motions."""
+"""Motions smaller than this share of a motion's size come from rounding in a composition of motions."""
 
 Slopes = Mapping[ElementaryMotion, float]
 
@@ -132,7 +132,7 @@ class Chain:
 
 
 SHARES = (1.0, -1.0, 0.5, -0.5)
-"""Of a step: where values for ``extrapolated`` are taken."""
+"""Shares of a step at which values for ``extrapolated`` are taken."""
 
 
 def extrapolated(values: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:

@@ -1,26 +1,31 @@
-"""The Jacobian of a study as figures, tables and a report."""
+"""``python -m twin.study --gradient``: the Jacobian of a study as data, figures, tables and a report."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from rich.console import Console
 
+from scenes.kinds.file_kinds import read_for
+from scenes.models.camera_sharpness import blur_warnings
 from scenes.yaml.errors import key_text
+from twin.run import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
 from twin.run.artefact import Cell, SvgFigure, Table, plain, significant
-from twin.run.page import links, report_page, write_artefacts
+from twin.run.quantity import Quantity, Record
 from twin.run.report import Report, Section, one_sentence
 from twin.run.run_folder import RunFolder
-from twin.run.svg import BLUE, INK, LIGHT, VERMILION, look, new_figure, to_svg
-from twin.study.gradient.gradient_numbers import doubtful, unit_text
-from twin.study.gradient.study_gradient import AD, Gradient
+from twin.sensors.area_detector import coarse_warnings
+from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
 from twin.study.report.study_plots import finish
-from twin.study.report.study_runs import typeset
-from twin.study.runs.setup import StudySetup
+from twin.study.report.study_statistics import typeset
+from twin.study.runs.setup import StudySetup, base_of, resolve_study
 from twin.study.runs.study_folder import PROGRAM
 
 DOUBTFUL_TEXT = (
@@ -29,7 +34,7 @@ DOUBTFUL_TEXT = (
 )
 
 
-def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
+def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings: Sequence[str] = ()) -> None:
     """Write report.html, its figures and tables into an open run folder.
 
     Args:
@@ -38,21 +43,21 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
         folder: where.
         warnings: what is wrong with what the study is given.
     """
-    with look("gradient"):
+    with svg.look("gradient"):
         figures = (
             SvgFigure(
                 "heat-map",
                 "Which factor moves which response",
                 "Change of each response per spread of each factor, as a share of the response's largest one; the "
                 "scale is logarithmic above 0.001.",
-                to_svg(heat_map(found)),
+                svg.to_svg(_heat_map(found)),
             ),
             SvgFigure(
                 "tornado",
                 "Largest changes",
                 "Change of each response when a factor rises by its spread, the largest first; in brackets the root of "
                 "the sum of squares over all factors.",
-                to_svg(tornado(found)),
+                svg.to_svg(_tornado(found)),
             ),
         )
     study = setup.study
@@ -68,14 +73,14 @@ def write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warnings
         verdict(found),
         (*([study.description] if study.description else ()), *about),
         (),
-        response_table(found),
-        (Section("Sensitivity", (), figures), Section("Factors", (), (factor_rows(found),))),
-        warnings=(*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := doubtful(found)) else ())),
+        _response_table(found),
+        (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(found),))),
+        warnings=(*warnings, *([f"{DOUBTFUL_TEXT}: {'; '.join(bad)}"] if (bad := _doubtful(found)) else ())),
     )
-    write_artefacts(report.artefacts, folder)
-    numbers = links(("gradient.csv", "gradient.json", "config.yaml"))
+    page.write_artefacts(report.artefacts, folder)
+    numbers = page.links(("gradient.csv", "gradient.json", "config.yaml"))
     folder.write_text(
-        "report.html", report_page(report, (PROGRAM, "config.yaml", "--gradient"), [("Numbers", numbers)])
+        "report.html", page.report_page(report, (PROGRAM, "config.yaml", "--gradient"), [("Numbers", numbers)])
     )
 
 
@@ -107,7 +112,7 @@ def verdict(found: Gradient) -> str:
     )
 
 
-def response_table(found: Gradient) -> Table:
+def _response_table(found: Gradient) -> Table:
     """Per response: the factor that moves it most, its derivative, and how well AD and differences agree."""
     rows: list[list[Cell]] = []
     change, relative = found.change, found.relative
@@ -124,7 +129,7 @@ def response_table(found: Gradient) -> Table:
                 response,
                 "none" if none else factor.name,
                 "" if none else significant(float(found.best[i, k]), 6, floor=0.0),
-                "" if none else unit_text(typeset(found.units[i]), typeset(factor.unit)),
+                "" if none else _unit_text(typeset(found.units[i]), typeset(factor.unit)),
                 "" if none else significant(float(change[i, k]), 3, floor=0.0),
                 significant(total, 3, floor=0.0),
                 typeset(found.units[i]),
@@ -151,7 +156,7 @@ def response_table(found: Gradient) -> Table:
     return Table("responses", "Responses", caption, heads, rows)
 
 
-def factor_rows(found: Gradient) -> Table:
+def _factor_rows(found: Gradient) -> Table:
     """What was differentiated by."""
     rows: list[list[Cell]] = []
     for k, factor in enumerate(found.factors):
@@ -175,18 +180,18 @@ NEGLIGIBLE = 1e-3
 """Share of a response's largest change below which no bar is drawn."""
 
 
-def normalised(found: Gradient) -> np.ndarray:
+def _normalised(found: Gradient) -> np.ndarray:
     """(R, F) changes per spread as shares of each response's largest; zeros for responses that nothing moves."""
     change = found.change
     largest = np.max(np.abs(change), axis=1, initial=0.0, keepdims=True)
     return np.asarray(np.where(largest > 0.0, change / np.where(largest > 0.0, largest, 1.0), 0.0))
 
 
-def heat_map(found: Gradient) -> Figure:
-    """Responses along x, factors down, coloured by the normalised change."""
-    shares = normalised(found).T
+def _heat_map(found: Gradient) -> Figure:
+    """Responses along x, factors down, coloured by the _normalised change."""
+    shares = _normalised(found).T
     rows, columns = shares.shape
-    figure = new_figure(2.1 + 0.21 * max(rows, 4))
+    figure = svg.new_figure(2.1 + 0.21 * max(rows, 4))
     axes = figure.subplots()
     norm = SymLogNorm(LINEAR, vmin=-1.0, vmax=1.0)
     picture = axes.imshow(shares, cmap="RdBu", norm=norm, aspect="auto", interpolation="nearest")
@@ -194,7 +199,7 @@ def heat_map(found: Gradient) -> Figure:
     axes.set_yticks(np.arange(rows), [factor.name for factor in found.factors])
     axes.set_xticks(np.arange(columns + 1) - 0.5, minor=True)
     axes.set_yticks(np.arange(rows + 1) - 0.5, minor=True)
-    axes.grid(which="minor", color=LIGHT, lw=0.5)
+    axes.grid(which="minor", color=svg.LIGHT, lw=0.5)
     axes.tick_params(which="minor", length=0)
     axes.tick_params(which="major", length=0)
     axes.spines[:].set_visible(False)
@@ -206,17 +211,11 @@ def heat_map(found: Gradient) -> Figure:
     return figure
 
 
-def tornado(found: Gradient) -> Figure:
+def _tornado(found: Gradient) -> Figure:
     """Per response the largest changes per spread."""
-    change = found.change
-    moved = [i for i in range(len(found.responses)) if np.any(change[i])]
-    largest = [_largest(change[i]) for i in moved]
-    wide = 2
-    heights = [0.85 + 0.2 * max(len(one) for one in largest[k : k + wide]) for k in range(0, len(moved), wide)]
-    figure = new_figure(max(sum(heights), 1.5))
-    grid = figure.subplots(max(len(heights), 1), wide, squeeze=False, height_ratios=heights or None).ravel()
-    for axes in grid[len(moved) :]:
-        axes.set_axis_off()
+    moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
+    largest = [_largest(found.change[i]) for i in moved]
+    figure, grid = svg.panels([0.85 + 0.2 * len(one) for one in largest] or [1.5], 2)
     for axes, i, order in zip(grid, moved, largest, strict=False):
         _bars(axes, found, i, order)
     return figure
@@ -230,8 +229,8 @@ def _largest(change: np.ndarray) -> np.ndarray:
 def _bars(axes: Axes, found: Gradient, i: int, order: np.ndarray) -> None:
     values = found.change[i, order][::-1]
     y = np.arange(len(order))
-    axes.barh(y, values, 0.66, color=[BLUE if value >= 0 else VERMILION for value in values])
-    axes.axvline(0.0, color=INK, lw=0.8)
+    axes.barh(y, values, 0.66, color=[svg.BLUE if value >= 0 else svg.VERMILION for value in values])
+    axes.axvline(0.0, color=svg.INK, lw=0.8)
     axes.set_yticks(y, [found.factors[k].name for k in order[::-1]])
     unit = f", {typeset(found.units[i])}" if found.units[i] else ""
     rss = significant(float(np.linalg.norm(found.change[i])), 3, floor=0.0)
@@ -239,3 +238,114 @@ def _bars(axes: Axes, found: Gradient, i: int, order: np.ndarray) -> None:
     axes.set_ylim(-0.7, max(len(order), 2) - 0.3)
     finish(axes, 5, None)
     axes.grid(False, axis="y")
+
+
+DOUBTFUL = 0.01
+"""Differences that Richardson's extrapolation moved by more than this share of a response's largest change are told."""
+
+
+def _unit_text(response: str, factor: str) -> str:
+    """Unit of a derivative."""
+    if not factor:
+        return response or "1"
+    return f"{response or '1'}/{factor}" if "/" not in factor else f"{response or '1'}/({factor})"
+
+
+def _entries(of: Callable[[Gradient], np.ndarray]) -> Callable[[Gradient], list[list[float | None]]]:
+    """What gives a table of the Jacobian as plain numbers, None where there is none."""
+
+    def rows(found: Gradient) -> list[list[float | None]]:
+        return [[None if np.isnan(value) else float(value) + 0.0 for value in row] for row in of(found)]
+
+    return rows
+
+
+GRADIENT: Record[Gradient] = Record(
+    "gradient.json: the Jacobian of a study at the base's values; rows are responses, columns factors.",
+    Quantity("responses", lambda g: g.responses, "names of the rows"),
+    Quantity("factors", lambda g: [factor.name for factor in g.factors], "names of the columns"),
+    Quantity("response_units", lambda g: g.units, "unit of every response, empty for a pure number"),
+    Quantity("factor_units", lambda g: [factor.unit for factor in g.factors], "unit of every factor"),
+    Quantity("base", lambda g: [factor.value for factor in g.factors], "value of every factor in the base"),
+    Quantity("spread", lambda g: [factor.spread for factor in g.factors], "sigma of every factor, or half its range"),
+    Quantity("spread_of", lambda g: [factor.spread_of for factor in g.factors], "which of the two a spread is"),
+    Quantity(
+        "units", lambda g: [[_unit_text(u, factor.unit) for factor in g.factors] for u in g.units], "of entries", "unit"
+    ),
+    Quantity("ad", _entries(lambda g: g.ad), "derivative by automatic differentiation", "AD"),
+    Quantity("differences", _entries(lambda g: g.differences), "derivative by central differences", "differences"),
+    Quantity("difference_error", _entries(lambda g: g.error), "what the extrapolation changed", "extrapolated by"),
+    Quantity("step", _entries(lambda g: g.step), "step of the differences, in the factor's unit", "step"),
+    Quantity("relative", _entries(lambda g: g.relative), "differences against AD, relative", "relative deviation"),
+    Quantity("worst_relative", lambda g: g.worst, "largest relative deviation, None without AD"),
+    Quantity("change", _entries(lambda g: g.change), "change per spread of the factor", "change per spread"),
+    Quantity("method", lambda g: g.method.tolist(), "how the best value of an entry was found", "method"),
+)
+
+
+def _whole_table(found: Gradient) -> Table:
+    """Every entry of the Jacobian, a row each."""
+    told = GRADIENT(found)
+    keys = ("units", "method", "ad", "differences", "relative", "difference_error", "step", "change")
+    rows = [
+        [response, factor, *(told[key][i][k] for key in keys)]
+        for i, response in enumerate(told["responses"])
+        for k, factor in enumerate(told["factors"])
+    ]
+    heads = ("response", "factor", *(GRADIENT[key].head for key in keys))
+    return Table("gradient", "Jacobian", "All entries.", heads, rows)
+
+
+def _doubtful(found: Gradient) -> list[str]:
+    """Responses some of whose differences are not to be trusted to 1%: noise, or a step over a kink or a bend."""
+    spread = np.array([factor.spread for factor in found.factors])
+    largest = np.max(np.abs(found.change), axis=1, initial=0.0, keepdims=True)
+    bad = (found.method != AD) & (found.error * spread > DOUBTFUL * largest)
+    return [
+        f"{found.responses[i]}: by {', '.join(found.factors[k].name for k in np.flatnonzero(bad[i]))}"
+        for i in np.flatnonzero(bad.any(axis=1))
+    ]
+
+
+def run_gradient(file: Path, options: cli.Options) -> None:
+    """Read a study, differentiate it at its base, write gradient.json, gradient.csv and a report, print what they say.
+
+    Args:
+        file: of the study, or a config.yaml.
+        options: what the user chose.
+
+    Raises:
+        typer.Exit: with the exit code of a failure, which has been told.
+    """
+    command.run_command(f"{file.stem}-gradient", options, lambda: read_for(PROGRAM, file, resolve_study), _work)
+
+
+def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
+    found = study_gradient(setup, session.backend, session.advance)
+    session.advance(procedure.WRITE, 0, 1)
+    folder = session.folder
+    numbers = reference_frames.described("gradient", {**GRADIENT(found), "verdict": verdict(found)})
+    folder.write_text("config.yaml", setup.to_yaml())
+    folder.write_json("gradient.json", numbers)
+    folder.write_bytes("gradient.csv", _whole_table(found).content())
+    base = base_of(setup)
+    warnings = (*blur_warnings(base, session.backend), *coarse_warnings(base))
+    _write_report(setup, found, folder, warnings)
+    entries: dict[str, Any] = {"gradient": True, "backend": session.backend.name, "worst_relative": found.worst}
+    entries["again"] = [PROGRAM, "config.yaml", "--gradient", "--backend", session.backend.name]
+    entries["inputs"] = provenance.inputs_in(setup.tree)
+    run_folder.write_manifest(folder, PROGRAM, session.started, session.seconds, warnings=list(warnings), **entries)
+    return command.Result(numbers, lambda console: _print_result(found, warnings, console))
+
+
+def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
+    cli.print_verdict(console, verdict(found))
+    table = cli.result_table(f"{len(found.responses)} responses by {len(found.factors)} factors")
+    picked = [0, 1, 2, 3, 4, 5, 8]
+    heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")
+    for head, k in zip(heads, picked, strict=True):
+        table.add_column(head, justify="left" if k in (0, 1, 3) else "right", no_wrap=True)
+    for row in _response_table(found).rows:
+        table.add_row(*(str(row[k]) for k in picked))
+    cli.print_whole(console, table)
+    command.print_warnings(console, warnings)

@@ -8,8 +8,9 @@ everything that needs no image and so has no noise, or those of the whole job wi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,17 +23,16 @@ from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import FactorSpec, ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
-from scenes.yaml.units import split_quantity, unit_ratio, with_unit
+from scenes.yaml.units import with_unit
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_derivative import spot_gradient
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.run.cli import InputErrorText
 from twin.run.procedure import Advance, silent
 from twin.study.gradient.gradient_chain import CAP, SHARES, Chain, Slopes, extrapolated, motion_slopes, sight_gradient
-from twin.study.runs.base_job import Failure, Run
-from twin.study.runs.config_tree import leaf
-from twin.study.runs.perturbed_job import PERTURB, JobMaker
-from twin.study.runs.sampling import number_of, ratios, scaled
+from twin.study.runs.base_job import Failure, Run, leaf
+from twin.study.runs.render_base import PERTURB, JobMaker
+from twin.study.runs.sampling import number_in, number_of, ratios, scaled
 from twin.study.runs.setup import StudySetup
 
 
@@ -83,7 +83,7 @@ class GradientFactor:
 
     @property
     def spec(self) -> FactorSpec:
-        """As the study describes it."""
+        """What the study's file says of the factor."""
         return self.setup.study.factors[self.name]
 
     def values(self, value: float) -> tuple[tuple[KeyPath, Any], ...]:
@@ -111,7 +111,7 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
         return 1.0
     numbers: list[float] = []
     for k, value in enumerate(found):
-        number = _number(value, unit)
+        number = number_in(value, unit)
         if number is None:
             what = shown(value) if value is not None else "nothing"
             problem = Problem("the base has no number here to differentiate at", what, "a number of the factor's kind")
@@ -122,15 +122,6 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
             text = "the places of the factor have different values in the base, so that it has none"
             raise setup.error(Problem(text, shown(value), shown(found[0])), ("factors", name, *factor.key_of(k)))
     return numbers[0]
-
-
-def _number(value: Any, unit: str) -> float | None:
-    parts = split_quantity(value)
-    if parts is not None and unit:
-        return parts[0] * unit_ratio(parts[1], unit)
-    if parts is None and not unit and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    return None
 
 
 MOVE = 2.0
@@ -177,6 +168,20 @@ class Gradient:
     step: np.ndarray
     method: np.ndarray
 
+    @classmethod
+    def unknown(cls, factors: tuple[GradientFactor, ...], asked: Sequence[_Asked]) -> Gradient:
+        """A Jacobian whose entries are still to be filled in."""
+        shape = (len(asked), len(factors))
+        names, units = tuple(one.name for one in asked), tuple(one.spec.units for one in asked)
+        ad, differences, error, scale, step = (np.full(shape, np.nan) for _ in range(5))
+        return cls(factors, names, units, ad, differences, error, scale, step, np.full(shape, WHOLE, object))
+
+    def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
+        """Fill in the differences of factor k in some rows from their values (4, rows)."""
+        self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
+        self.step[rows, k] = step
+        self.method[rows, k] = method
+
     @property
     def best(self) -> np.ndarray:
         """(R, F): by automatic differentiation where it is known, else by differences."""
@@ -204,7 +209,7 @@ class Gradient:
 
 
 @dataclass(frozen=True)
-class Asked:
+class _Asked:
     """A response: where its number stands, and what is subtracted.
 
     Attributes:
@@ -247,25 +252,6 @@ class Asked:
         return {"image" if of_noise else str(key[0]) for key, of_noise in zip(keys, noisy, strict=True)}
 
 
-@dataclass(eq=False)
-class _Table:
-    """The Jacobian while it is filled."""
-
-    ad: np.ndarray
-    differences: np.ndarray
-    error: np.ndarray
-    scale: np.ndarray
-    step: np.ndarray
-    method: np.ndarray
-    slopes: dict[int, Slopes] = field(default_factory=dict)
-
-    def put(self, rows: Sequence[int], k: int, values: np.ndarray, step: float, method: str) -> None:
-        """Differences of factor k in some rows from their values (4, rows)."""
-        self.differences[rows, k], self.error[rows, k] = extrapolated(values, step)
-        self.step[rows, k] = step
-        self.method[rows, k] = method
-
-
 def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silent) -> Gradient:
     """Differentiate a study at its base.
 
@@ -280,21 +266,13 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
         InputErrorText: the base itself cannot be run.
     """
     factors = tuple(GradientFactor.of(setup, name) for name in setup.study.factors)
-    asked = [Asked(name, spec) for name, spec in setup.study.responses.items()]
+    asked = [_Asked(name, spec) for name, spec in setup.study.responses.items()]
     maker = JobMaker(setup.tree) if setup.study.base.command == "render" else None
     if maker is not None and maker.base.job.course is not None:
         maker = None
     if maker is not None:
         asked = [*_spot_responses(maker.base), *asked]
-    shape = (len(asked), len(factors))
-    table = _Table(
-        ad=np.full(shape, np.nan),
-        differences=np.full(shape, np.nan),
-        error=np.full(shape, np.nan),
-        scale=np.full(shape, np.nan),
-        step=np.full(shape, np.nan),
-        method=np.full(shape, WHOLE, dtype=object),
-    )
+    table = Gradient.unknown(factors, asked)
     known = {"truth", "recovered", "quality"} if maker is not None else set()
     traced = [i for i, one in enumerate(asked) if one.roots <= known]
     if maker is not None and traced:
@@ -302,49 +280,37 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
     rest = [i for i in range(len(asked)) if i not in traced]
     if rest:
         _whole(setup, backend, factors, [asked[i] for i in rest], rest, table, advance)
-    names, units = tuple(one.name for one in asked), tuple(one.spec.units for one in asked)
-    return Gradient(
-        factors,
-        names,
-        units,
-        table.ad,
-        table.differences,
-        table.error,
-        table.scale,
-        table.step,
-        table.method.astype(str),
-    )
+    return replace(table, method=table.method.astype(str))
 
 
-def _spot_responses(resolved: ResolvedJob) -> list[Asked]:
+def _spot_responses(resolved: ResolvedJob) -> list[_Asked]:
     out = []
     for camera in resolved.instrument.cameras:
         for side in resolved.instrument.channels_of(camera):
             for axis in ("row", "column"):
                 key = ("recovered", "spots", camera, side, "after", axis)
-                out.append(Asked(f"spots.{camera}.{side}.{axis}", ResponseSpec(key=key, unit="px")))
+                out.append(_Asked(f"spots.{camera}.{side}.{axis}", ResponseSpec(key=key, unit="px")))
     return out
 
 
+@dataclass(eq=False)
 class _Traced:
-    """The part of the Jacobian that needs no image."""
+    """The part of the Jacobian that needs no image; ``slopes``: of the motions by the factors that are nothing else."""
 
-    def __init__(
-        self,
-        setup: StudySetup,
-        maker: JobMaker,
-        backend: Backend,
-        factors: Sequence[GradientFactor],
-        asked: Sequence[Asked],
-        rows: Sequence[int],
-        advance: Advance,
-    ) -> None:
-        self.setup, self.maker, self.backend, self.factors = setup, maker, backend, factors
-        self.asked, self.advance = asked, advance
-        self.exact = [i for i in rows if "quality" not in asked[i].roots]
-        self.quality = [i for i in rows if i not in self.exact]
+    setup: StudySetup
+    maker: JobMaker
+    backend: Backend
+    factors: Sequence[GradientFactor]
+    asked: Sequence[_Asked]
+    rows: Sequence[int]
+    advance: Advance
+    slopes: dict[int, Slopes] = field(default_factory=dict)
 
-    def fill(self, table: _Table) -> None:
+    def __post_init__(self) -> None:
+        self.exact = [i for i in self.rows if "quality" not in self.asked[i].roots]
+        self.quality = [i for i in self.rows if i not in self.exact]
+
+    def fill(self, table: Gradient) -> None:
         """AD and differences of all factors."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
@@ -357,22 +323,22 @@ class _Traced:
             raise self.setup.blamed(error) from None
         for k, factor in enumerate(self.factors):
             if all(place[:2] == PERTURB for place, _ in factor.values(factor.value)):
-                slopes = motion_slopes(about, self._state_of(chain, factor), PART * factor.spread)
+                slopes = motion_slopes(about, partial(self._state, chain, factor), PART * factor.spread)
                 if slopes is not None:
-                    table.slopes[k] = slopes
-        sizes = self._exact(chain, about, table) if table.slopes else {}
+                    self.slopes[k] = slopes
+        sizes = self._exact(chain, about, table) if self.slopes else {}
         steps = {k: sizes.get(k, PART * factor.spread) for k, factor in enumerate(self.factors)}
         self._differences(chain, table, self.exact, steps)
         steps = {k: QUALITY_PART * factor.spread for k, factor in enumerate(self.factors)}
         self._differences(chain, table, self.quality, steps)
-        for k in table.slopes:
+        for k in self.slopes:
             table.method[self.exact, k] = AD
 
-    def _differences(self, chain: Chain, table: _Table, rows: Sequence[int], steps: Mapping[int, float]) -> None:
+    def _differences(self, chain: Chain, table: Gradient, rows: Sequence[int], steps: Mapping[int, float]) -> None:
         """Differences of some rows by all factors."""
         if not rows:
             return
-        moving = list(table.slopes)
+        moving = list(self.slopes)
         done: dict[int, np.ndarray] = {}
         for start in range(0, len(moving), TOGETHER):
             some = moving[start : start + TOGETHER]
@@ -394,11 +360,8 @@ class _Traced:
     def _numbers(self, outcomes: Sequence[Any], rows: Sequence[int]) -> np.ndarray:
         return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
 
-    def _state_of(self, chain: Chain, factor: GradientFactor) -> Callable[[float], State]:
-        def state(change: float) -> State:
-            return chain.experiment.state(self._job(factor, change).job)
-
-        return state
+    def _state(self, chain: Chain, factor: GradientFactor, change: float) -> State:
+        return chain.experiment.state(self._job(factor, change).job)
 
     def _job(self, factor: GradientFactor, change: float) -> ResolvedJob:
         try:
@@ -406,10 +369,10 @@ class _Traced:
         except InputError as error:
             raise _refused(self.setup, factor, change, error) from None
 
-    def _exact(self, chain: Chain, about: State, table: _Table) -> dict[int, float]:
+    def _exact(self, chain: Chain, about: State, table: Gradient) -> dict[int, float]:
         """Fill in what AD finds; the steps of the differences by these factors."""
         self.advance(AD_PART, 0, 1)
-        motions = list(dict.fromkeys(motion for slopes in table.slopes.values() for motion in slopes))
+        motions = list(dict.fromkeys(motion for slopes in self.slopes.values() for motion in slopes))
         spots: np.ndarray = np.zeros((*chain.nominal.shape[1:], 0))
         sight: np.ndarray = np.zeros((*chain.experiment.sight.nominal[:, 0].shape, 0))
         if motions:
@@ -418,7 +381,7 @@ class _Traced:
             sight = np.moveaxis(sight_gradient(experiment.instrument, self.backend, motions, about), 1, -1)
         at = chain.spots([about])[0], chain.sight([about])[0]
         sizes = {}
-        for k, slopes in table.slopes.items():
+        for k, slopes in self.slopes.items():
             weight = np.array([slopes.get(motion, 0.0) for motion in motions])
             moved, turned = spots @ weight, sight @ weight
             outcomes, step = chain.moved(about, at, moved, turned)
@@ -427,11 +390,8 @@ class _Traced:
             table.ad[self.exact, k] = terms[:, 0] - terms[:, 1]
             table.scale[self.exact, k] = np.abs(terms).max(axis=1)
             limits = [CAP[motion.kind] / abs(slope) for motion, slope in slopes.items()]
-            sizes[k] = (
-                float(min([MOVE / max(np.abs(moved).max(), 1e-300), *limits]))
-                if slopes
-                else PART * self.factors[k].spread
-            )
+            if slopes:
+                sizes[k] = float(min([MOVE / max(np.abs(moved).max(), 1e-300), *limits]))
         self.advance(AD_PART, 1, 1)
         return sizes
 
@@ -468,9 +428,9 @@ def _whole(
     setup: StudySetup,
     backend: Backend,
     factors: Sequence[GradientFactor],
-    asked: Sequence[Asked],
+    asked: Sequence[_Asked],
     rows: Sequence[int],
-    table: _Table,
+    table: Gradient,
     advance: Advance,
 ) -> None:
     """Differences of the base command's own results; all runs have the noise of the base's seed."""

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from twin.study.report.study_runs import Factor, Response
-from twin.study.report.study_statistics import CONFIDENCE, Estimate, Interval
+from twin.study.report.study_statistics import CONFIDENCE, Estimate, Factor, Interval, Response
 from twin.study.runs.sampling import quantiles
 
 
@@ -62,6 +61,10 @@ def linear_model(factors: Sequence[Factor], response: Response) -> LinearModel |
     leaves is not equally large everywhere. Of standardised coefficients they hold what the drawn factors and responses
     scatter by, too: sum over the runs of what each does to the coefficient. Columns of the matrix that follow from
     others are left out.
+
+    Args:
+        factors: of the study.
+        response: to be fitted.
     """
     good = response.good
     y = response.values[good]
@@ -154,8 +157,8 @@ def _span(factor: Factor, values: np.ndarray) -> tuple[float, float]:
 
 
 def _largest_difference(means: np.ndarray, moved: np.ndarray, t: float) -> Estimate:
-    """Of (m,) means, the first of which is 0 by definition: the interval is of all pairs at once, by Bonferroni, so
-    that it stays true although the largest is looked for.
+    """Largest difference of two of (m,) means, the first of which is 0 by definition. The interval covers all pairs at
+    once, after Bonferroni, so that it stays true although the largest is looked for.
     """
     moved = np.concatenate([np.zeros((1, moved.shape[1])), moved])
     first, last = np.triu_indices(len(means), 1)
@@ -200,7 +203,12 @@ class MainEffect:
 
 
 def main_effects(factors: Sequence[Factor], response: Response) -> tuple[MainEffect, ...]:
-    """Of each factor that takes several values with numbers, the largest swing first."""
+    """Main effects of the factors that take several values with numbers, the largest swing first.
+
+    Args:
+        factors: of the study.
+        response: of a grid.
+    """
     out = []
     for factor in factors:
         parts = [(level, response.values[(factor.values == level) & response.good]) for level in factor.levels]

@@ -13,15 +13,13 @@ import numpy as np
 from scipy import stats
 from scipy.special import roots_legendre
 
-from twin.study.report.stated_noise import noise_share
-from twin.study.report.study_runs import Factor, Response, StudyRuns
-from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate
+from twin.study.report.study_statistics import CONFIDENCE, LEAST, Estimate, Factor, Response, StudyRuns, noise_share
 
 MOST_LEVELS = 20
 """Texts with more values are not taken apart."""
 
 
-class NoBasis(Exception):
+class _NoBasis(Exception):
     """A factor for which no functions can be made; the text says why."""
 
 
@@ -38,7 +36,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
         degree: the highest.
 
     Raises:
-        NoBasis: the axis has too many different texts.
+        _NoBasis: the axis has too many different texts.
     """
     if len(axis) == 1 and axis[0].numeric:
         return _of_number(axis[0], axis[0].values[good], degree)
@@ -49,7 +47,7 @@ def axis_functions(axis: tuple[Factor, ...], good: np.ndarray, degree: int) -> t
         table = np.stack([np.array(factor.spec.numbers().values, np.float64) for factor in axis], axis=1)
         return _of_table(table, np.stack([factor.values[good] for factor in axis], axis=1), degree)
     if len(levels) > MOST_LEVELS:
-        raise NoBasis(f"{axis[0].name} has {len(levels)} different values")
+        raise _NoBasis(f"{axis[0].name} has {len(levels)} different values")
     weights = _text_weights(axis, levels, counts)
     # switches of all levels but the first, made orthonormal
     functions = _orthonormal(np.concatenate([np.ones((len(levels), 1)), np.eye(len(levels))[:, 1:]], axis=1), weights)
@@ -161,11 +159,11 @@ MOST_TERMS = 250
 MOST_RUNS = 20_000
 TINY = sys.float_info.min
 RUNS_TO_CHOOSE = 3_000
-"""Of the first that many runs the degree is found."""
+"""The degree is chosen by this many runs, the first ones."""
 RUNS_PER_TERM = 2.5
 RESAMPLES = 1000
 HARMONICS = 10
-"""Of the factor's cycle that RBD-FAST sums."""
+"""Harmonics of the factor's cycle that RBD-FAST sums."""
 
 
 @dataclass(frozen=True)
@@ -230,6 +228,10 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     what their noise adds. The degree is that with the smallest error of runs left out in turn. Intervals come from 1000
     resamples of the runs. They are those of the terms that were chosen; what these leave may belong to any factor, and
     counts for the upper end of each as far as the runs do not state it as noise.
+
+    Args:
+        runs: of the study.
+        response: one of its responses or stated sigmas.
     """
     axes = [axis for axis in runs.axes if any(len(np.unique(f.values[response.good])) > 1 for f in axis)]
     if response.constant:
@@ -248,7 +250,7 @@ def sensitivity_indices(runs: StudyRuns, response: Response) -> Indices | NoIndi
     good = response.good & (np.cumsum(response.good) <= MOST_RUNS)
     try:
         chaos = _Chaos.fitted(axes, good, response.values[good])
-    except NoBasis as error:
+    except _NoBasis as error:
         return NoIndices(str(error))
     if chaos is None:
         return NoIndices(f"{n} runs are too few for {len(axes)} factors")
@@ -365,7 +367,7 @@ class _Chaos:
         return cls(axes, terms, coefficients[1:], y, q, r, degree, held_out, rest / total, good)
 
     def indices(self, noise: float, seed: int) -> tuple[Index, ...]:
-        """Of every axis, the largest total first.
+        """Indices of every axis, the largest total first.
 
         Args:
             noise: variance of the noise that the runs state, 0 where they state none.
@@ -378,11 +380,11 @@ class _Chaos:
             names = tuple(factor.name for factor in axis)
             alone = _estimate(first[k], lows[:, 0, k], highs[:, 0, k])
             whole = _estimate(total[k], lows[:, 1, k], highs[:, 1, k])
-            out.append(Index(names, alone, whole, rbd_fast(axis, self.good, self.y)))
+            out.append(Index(names, alone, whole, _rbd_fast(axis, self.good, self.y)))
         return tuple(sorted(out, key=lambda index: -index.total.value))
 
     def _parts(self, squares: np.ndarray) -> np.ndarray:
-        """Of squared coefficients (..., m) the sums of each axis alone and of all terms with it, (..., 2, axes)."""
+        """Sums of squared coefficients (..., m): of each axis alone, and of all terms with it, (..., 2, axes)."""
         used = self.terms > 0
         alone = used & (used.sum(axis=1) == 1)[:, None]
         return np.stack([squares @ alone, squares @ used], axis=-2)
@@ -467,7 +469,7 @@ def _products(degrees: Sequence[np.ndarray], axis: int, left: float, norm: float
                 yield (k, *others)
 
 
-def rbd_fast(axis: tuple[Factor, ...], good: np.ndarray, y: np.ndarray) -> float | None:
+def _rbd_fast(axis: tuple[Factor, ...], good: np.ndarray, y: np.ndarray) -> float | None:
     """First order index of a factor by random balance designs, as SALib has it; None for texts, lists and few runs.
 
     Source: Tarantola, Gatelli and Mara, Reliability Engineering and System Safety 91, 717 (2006); bias corrected as by

@@ -12,22 +12,11 @@ import numpy as np
 import xarray as xr
 
 from scenes.specs.study import ParetoSpec, StudySpec, ThresholdSpec
-from twin.study.report.linear_model import LinearModel, MainEffect, linear_model, main_effects
-from twin.study.report.sensitivity_indices import Indices, NoIndices, sensitivity_indices
-from twin.study.report.stated_noise import NoiseShare, noise_share
-from twin.study.report.study_runs import Factor, Response, StudyRuns
-from twin.study.report.study_statistics import (
-    CONFIDENCE,
-    Description,
-    Estimate,
-    Interval,
-    describe,
-    mean_interval,
-    quantile_interval,
-    runs_for_quantile,
-    share_interval,
-    std_interval,
-)
+from twin.run.quantity import Quantity, Record
+from twin.study.report import study_statistics as statistics
+from twin.study.report.linear_model import Effect, LinearModel, MainEffect, linear_model, main_effects
+from twin.study.report.sensitivity_indices import Index, Indices, NoIndices, sensitivity_indices
+from twin.study.report.study_statistics import Estimate, Response, StudyRuns
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +41,13 @@ class ParetoFront:
 
 
 def pareto_front(spec: ParetoSpec, x: np.ndarray, y: np.ndarray) -> ParetoFront:
-    """The front of (n,) ``x`` and ``y``."""
+    """The front of (n,) ``x`` and ``y``.
+
+    Args:
+        spec: the pair, and which way each is better.
+        x: (n,) of all runs.
+        y: (n,) of all runs.
+    """
     good = np.isfinite(x) & np.isfinite(y)
     signs = {"min": 1.0, "max": -1.0}
     costs = np.stack([signs[spec.best_x] * x, signs[spec.best_y] * y], axis=-1)
@@ -124,7 +119,7 @@ class Requirement:
     count: int
     runs: int
     interval: tuple[float, float] | None
-    judged: Description | None
+    judged: statistics.Description | None
     unit: str
 
     @property
@@ -151,10 +146,10 @@ class Requirement:
         """
         if self.bounds is None or (self.interval is None and self.count):
             return None
-        return share_interval(self.met, self.runs)[0], share_interval(self.most, self.runs)[1]
+        return statistics.share_interval(self.met, self.runs)[0], statistics.share_interval(self.most, self.runs)[1]
 
 
-def is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
+def _is_met(spec: ThresholdSpec, values: np.ndarray) -> np.ndarray:
     """(n,) whether each value meets the requirement; NaN does not."""
     judged = np.abs(values) if spec.magnitude else values
     good = np.isfinite(judged)
@@ -173,12 +168,14 @@ def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
     for name, spec in runs.study.report.thresholds.items():
         response = runs.find(spec.response)
         assert isinstance(response, Response)
-        good = is_met(spec, response.values)
+        good = _is_met(spec, response.values)
         everything &= good
         judged &= response.good
         values = np.abs(response.values) if spec.magnitude else response.values
         out.append(
-            _counted(runs, name, _text(spec), good, response.good, describe(values, runs.sampled), response.unit)
+            _counted(
+                runs, name, _text(spec), good, response.good, statistics.describe(values, runs.sampled), response.unit
+            )
         )
     if len(out) > 1:
         out.append(_counted(runs, "", "all of them", everything, judged, None, ""))
@@ -186,10 +183,16 @@ def requirements(runs: StudyRuns) -> tuple[Requirement, ...]:
 
 
 def _counted(
-    runs: StudyRuns, name: str, text: str, good: np.ndarray, known: np.ndarray, judged: Description | None, unit: str
+    runs: StudyRuns,
+    name: str,
+    text: str,
+    good: np.ndarray,
+    known: np.ndarray,
+    judged: statistics.Description | None,
+    unit: str,
 ) -> Requirement:
     met, count = int(np.sum(good & known)), int(np.sum(known))
-    interval = share_interval(met, count) if runs.sampled and count else None
+    interval = statistics.share_interval(met, count) if runs.sampled and count else None
     return Requirement(name, text, met, count, runs.count, interval, judged, unit)
 
 
@@ -232,24 +235,26 @@ class Convergence:
 
 
 def convergences(values: np.ndarray) -> tuple[Convergence, ...]:
-    """Of (n,) finite values in the order of the runs; none for fewer than 20 and for constant values."""
+    """How the statistics of (n,) finite values settle, run by run; none below 20 runs and for constant values."""
     n = len(values)
     if n < 20 or np.ptp(values) == 0.0:
         return ()
     counts = np.unique(np.rint(np.geomspace(10, n, POINTS)).astype(int))
     sigma = float(np.std(values, ddof=1))
-    rows: dict[str, list[tuple[float, Interval]]] = {name: [] for name in GOALS}
+    rows: dict[str, list[tuple[float, statistics.Interval]]] = {name: [] for name in GOALS}
     for count in counts:
         part = values[:count]
         ordered = np.sort(part)
-        rows["mean"].append((float(np.mean(part)), mean_interval(part)))
-        rows["sigma"].append((float(np.std(part, ddof=1)), std_interval(part)))
+        rows["mean"].append((float(np.mean(part)), statistics.mean_interval(part)))
+        rows["sigma"].append((float(np.std(part, ddof=1)), statistics.std_interval(part)))
         for name, q in QUANTILES.items():
-            rows[name].append((float(np.quantile(ordered, q)), quantile_interval(ordered, q)))
+            rows[name].append((float(np.quantile(ordered, q)), statistics.quantile_interval(ordered, q)))
     return tuple(_convergence(name, counts, row, sigma) for name, row in rows.items())
 
 
-def _convergence(name: str, counts: np.ndarray, row: list[tuple[float, Interval]], sigma: float) -> Convergence:
+def _convergence(
+    name: str, counts: np.ndarray, row: list[tuple[float, statistics.Interval]], sigma: float
+) -> Convergence:
     low = np.array([math.nan if ends[0] is None else ends[0] for _, ends in row])
     high = np.array([math.nan if ends[1] is None else ends[1] for _, ends in row])
     half = 0.5 * (high[-1] - low[-1]) / sigma
@@ -258,7 +263,7 @@ def _convergence(name: str, counts: np.ndarray, row: list[tuple[float, Interval]
     enough = relative is not None and relative <= goal
     needed = n if enough else None if relative is None else math.ceil(n * (relative / goal) ** 2)
     if relative is None and name in QUANTILES:
-        needed = runs_for_quantile(QUANTILES[name])
+        needed = statistics.runs_for_quantile(QUANTILES[name])
     return Convergence(name, counts, np.array([value for value, _ in row]), low, high, relative, enough, needed)
 
 
@@ -280,10 +285,10 @@ class StudyAnalysis:
     """
 
     runs: StudyRuns
-    descriptions: Mapping[str, Description]
+    descriptions: Mapping[str, statistics.Description]
     linear: Mapping[str, LinearModel | None]
     effects: Mapping[str, tuple[MainEffect, ...]]
-    noise: Mapping[str, NoiseShare]
+    noise: Mapping[str, statistics.NoiseShare]
     indices: Mapping[str, Indices | NoIndices]
     convergences: Mapping[str, tuple[Convergence, ...]]
     requirements: tuple[Requirement, ...]
@@ -298,17 +303,21 @@ class StudyAnalysis:
         fronts, wrong = [], []
         for spec in runs.study.report.pareto:
             x, y = runs.find(spec.x), runs.find(spec.y)
-            if any(isinstance(thing, Factor) and not thing.numeric for thing in (x, y)):
+            if any(not thing.numeric for thing in (x, y)):
                 wrong.append(f"{spec.x} and {spec.y}")
             else:
                 # a run without a response is no compromise
                 fronts.append(pareto_front(spec, x.values, y.values))
         return cls(
             runs=runs,
-            descriptions={r.name: describe(r.values, runs.sampled) for r in everything},
+            descriptions={r.name: statistics.describe(r.values, runs.sampled) for r in everything},
             linear={r.name: linear_model(runs.factors, r) for r in everything},
             effects={r.name: () if runs.sampled else main_effects(runs.factors, r) for r in everything},
-            noise={share.response: share for r in runs.responses if (share := noise_share(r, runs.study)) is not None},
+            noise={
+                share.response: share
+                for r in runs.responses
+                if (share := statistics.noise_share(r, runs.study)) is not None
+            },
             indices={r.name: sensitivity_indices(runs, r) for r in indexed},
             convergences={
                 r.name: convergences(r.known) if runs.sampled and not r.constant else () for r in runs.responses
@@ -345,132 +354,154 @@ def _swing_in_sigmas(effect: Any, std: Estimate | None) -> float:
 
 
 def summary(dataset: xr.Dataset, study: StudySpec) -> dict[str, Any]:
-    """What the report says of a study, as plain data for JSON; intervals are those of 95%."""
-    return plain_data(StudyAnalysis.of(StudyRuns.of(dataset, study)))
+    """What the report says of a study, as plain data for JSON; intervals are those of 95%.
+
+    Args:
+        dataset: as ``twin.study.study_files.make_dataset`` makes it.
+        study: as the user wrote it.
+    """
+    return STATISTICS(StudyAnalysis.of(StudyRuns.of(dataset, study)))
 
 
-def plain_data(found: StudyAnalysis) -> dict[str, Any]:
-    """An analysis as plain data; null where the runs cannot tell a number."""
-    runs = found.runs
-    return {
-        "name": runs.study.name,
-        "design": runs.kind,
-        "runs": runs.count,
-        "failed": int(runs.failed.sum()),
-        "confidence": CONFIDENCE,
-        "responses": {
-            r.name: {
-                "unit": r.unit,
-                **({"sigma_of": r.of} if r.of else {}),
-                **_description(found.descriptions[r.name]),
-                **_noise(found.noise.get(r.name)),
-                "linear_model": _linear(found.linear[r.name]),
-                "main_effects": [
-                    {"factor": e.factor, "levels": e.levels.tolist(), "means": e.means.tolist(), "swing": e.swing}
-                    for e in found.effects[r.name]
-                ],
-                **({"sobol": _indices(found.indices[r.name])} if r.name in found.indices else {}),
-                "convergence": {c.name: _analysis_convergence(c) for c in found.convergences.get(r.name, ())},
-            }
-            for r in runs.everything
-        },
-        "requirements": [
-            {
-                "name": r.name or "all",
-                "text": r.text,
-                "met": r.met,
-                "runs_with_a_number": r.count,
-                "share": r.share,
-                "interval": list(r.interval) if r.interval is not None else None,
-                "bounds": list(r.bounds) if r.bounds is not None else None,
-                "bounds_interval": list(r.bounds_interval) if r.bounds_interval is not None else None,
-            }
-            for r in found.requirements
-        ],
-        "pareto": [
-            {
-                "x": f.spec.x,
-                "y": f.spec.y,
-                "best_x": f.spec.best_x,
-                "best_y": f.spec.best_y,
-                "runs": f.runs.tolist(),
-                "knee_run": None if f.knee is None else int(f.runs[f.knee]),
-            }
-            for f in found.fronts
-        ],
-    }
-
-
-def _number(value: float | None) -> float | None:
+def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _estimate(value: Estimate | None) -> dict[str, Any] | None:
-    if value is None:
-        return None
-    return {"value": _number(value.value), "interval": [_number(end) for end in value.interval]}
+ESTIMATE: Record[Estimate] = Record(
+    "A number with its 95% interval; null where the runs cannot tell it.",
+    Quantity("value", lambda one: _finite(one.value), "the number"),
+    Quantity("interval", lambda one: [_finite(end) for end in one.interval], "lower and upper end"),
+)
+EFFECT: Record[Effect] = Record(
+    "What a factor does to a response, by the linear model and by ranks.",
+    Quantity("swing", lambda e: e.swing, "change from the factor's 5% to its 95% quantile", record=ESTIMATE),
+    Quantity("standardised_coefficient", lambda e: e.coefficient, "sigmas per sigma of the factor", record=ESTIMATE),
+    Quantity("rank_correlation", lambda e: e.rank, "Spearman's", record=ESTIMATE),
+)
+LINEAR: Record[LinearModel] = Record(
+    "Least squares fit of a response by all factors together.",
+    Quantity("r2", lambda model: model.r2, "share of the variance that it explains"),
+    Quantity("adjusted_r2", lambda model: model.adjusted, "corrected for the number of terms"),
+    Quantity("effects", lambda model: {e.factor: e for e in model.effects}, "by factor", record=EFFECT),
+    Quantity("not_separable", lambda model: model.cannot, "factors whose effects the runs do not tell apart"),
+)
+MAIN_EFFECT: Record[MainEffect] = Record(
+    "Means of a response over the runs of a grid, for each value of a factor.",
+    Quantity("factor", lambda effect: effect.factor, "its name"),
+    Quantity("levels", lambda effect: effect.levels, "its values"),
+    Quantity("means", lambda effect: effect.means, "mean of the response there"),
+    Quantity("swing", lambda effect: effect.swing, "largest minus smallest mean"),
+)
+INDEX: Record[Index] = Record(
+    "Sensitivity to a factor, or to factors that vary together.",
+    Quantity("first", lambda index: index.first, "share of the variance that it explains alone", record=ESTIMATE),
+    Quantity("total", lambda index: index.total, "share that is gone when it is fixed", record=ESTIMATE),
+    Quantity("first_rbd_fast", lambda index: index.check, "first order by RBD-FAST, which needs no model"),
+)
+INDICES: Record[Indices] = Record(
+    "Sobol indices of a response.",
+    Quantity("method", lambda found: found.method, "chaos or grid; null where there are none, with the reason"),
+    Quantity("degree", lambda found: found.degree, "of the polynomials, 0 for a grid"),
+    Quantity("terms", lambda found: found.terms, "number of polynomials, 0 for a grid"),
+    Quantity("held_out_r2", lambda found: found.held_out, "of runs that the model was not fitted to"),
+    Quantity("unexplained_share", lambda found: found.rest, "share of the variance that the model does not explain"),
+    Quantity("noise_share", lambda found: found.noise, "share of the variance that the runs state as noise"),
+    Quantity("factors", lambda found: {index.name: index for index in found.axes}, "by factor", record=INDEX),
+)
+CONVERGENCE: Record[Convergence] = Record(
+    "How well the runs know a statistic.",
+    Quantity("relative_half_width", lambda one: one.relative, "half the interval over sigma of the response"),
+    Quantity("enough_runs", lambda one: one.enough, "whether that is below the goal"),
+    Quantity("runs_needed", lambda one: one.needed, "about how many runs would reach it"),
+)
 
 
-def _description(d: Description) -> dict[str, Any]:
-    return {
-        "count": d.count,
-        **{name: _estimate(getattr(d, name)) for name in ("mean", "std", "median", "p95", "p997")},
-        "min": d.low,
-        "max": d.high,
-        "skewness": d.normality.skewness if d.normality else None,
-        "excess_kurtosis": d.normality.kurtosis if d.normality else None,
-        "normality_p": d.normality.p if d.normality else None,
-        "p0135": d.tails[0] if d.tails else None,
-        "p99865": d.tails[1] if d.tails else None,
-    }
+@dataclass(frozen=True, eq=False)
+class _About:
+    """A response, or the sigma of one, and all that was found."""
+
+    found: StudyAnalysis
+    of: Response
+
+    @property
+    def numbers(self) -> statistics.Description:
+        return self.found.descriptions[self.of.name]
+
+    @property
+    def noise(self) -> statistics.NoiseShare | None:
+        return self.found.noise.get(self.of.name)
+
+    def sobol(self) -> dict[str, Any] | None:
+        found = self.found.indices.get(self.of.name)
+        if isinstance(found, NoIndices):
+            return {"method": None, "reason": found.reason}
+        return None if found is None else INDICES(found)
 
 
-def _noise(found: NoiseShare | None) -> dict[str, Any]:
-    return {} if found is None else {"noise_share": found.share, "noise_share_possible": found.possible}
-
-
-def _linear(model: LinearModel | None) -> dict[str, Any] | None:
-    if model is None:
-        return None
-    return {
-        "r2": model.r2,
-        "adjusted_r2": model.adjusted,
-        "effects": {
-            e.factor: {
-                "swing": _estimate(e.swing),
-                "standardised_coefficient": _estimate(e.coefficient),
-                "rank_correlation": _estimate(e.rank),
-            }
-            for e in model.effects
-        },
-        "not_separable": list(model.cannot),
-    }
-
-
-def _indices(found: Indices | NoIndices) -> dict[str, Any]:
-    if isinstance(found, NoIndices):
-        return {"method": None, "reason": found.reason}
-    return {
-        "method": found.method,
-        "degree": found.degree,
-        "terms": found.terms,
-        "held_out_r2": found.held_out,
-        "unexplained_share": found.rest,
-        "noise_share": found.noise,
-        "factors": {
-            index.name: {
-                "first": _estimate(index.first),
-                "total": _estimate(index.total),
-                "first_rbd_fast": index.check,
-            }
-            for index in found.axes
-        },
-    }
-
-
-def _analysis_convergence(convergence: Convergence) -> dict[str, Any]:
-    return {
-        "relative_half_width": convergence.relative,
-        "enough_runs": convergence.enough,
-        "runs_needed": convergence.needed,
-    }
+RESPONSE: Record[_About] = Record(
+    "Statistics of a response over the runs that have a number, in its unit.",
+    Quantity("unit", lambda a: a.of.unit, "of its numbers, empty for pure ones"),
+    Quantity("sigma_of", lambda a: a.of.of or None, "response whose stated sigma this is", where_known=True),
+    Quantity("count", lambda a: a.numbers.count, "runs that have a number"),
+    Quantity("mean", lambda a: a.numbers.mean, "mean", record=ESTIMATE),
+    Quantity("std", lambda a: a.numbers.std, "standard deviation, n - 1", record=ESTIMATE),
+    Quantity("median", lambda a: a.numbers.median, "median", record=ESTIMATE),
+    Quantity("p95", lambda a: a.numbers.p95, "95% of the runs lie below", record=ESTIMATE),
+    Quantity("p997", lambda a: a.numbers.p997, "99.7% of the runs lie below", record=ESTIMATE),
+    Quantity("min", lambda a: a.numbers.low, "smallest value"),
+    Quantity("max", lambda a: a.numbers.high, "largest value"),
+    Quantity("skewness", lambda a: a.numbers.normality and a.numbers.normality.skewness, "0 for a normal one"),
+    Quantity("excess_kurtosis", lambda a: a.numbers.normality and a.numbers.normality.kurtosis, "0 for a normal one"),
+    Quantity(
+        "normality_p", lambda a: a.numbers.normality and a.numbers.normality.p, "of D'Agostino and Pearson's test"
+    ),
+    Quantity("p0135", lambda a: a.numbers.tails and a.numbers.tails[0], "0.135% of the runs lie below"),
+    Quantity("p99865", lambda a: a.numbers.tails and a.numbers.tails[1], "99.865% of the runs lie below"),
+    Quantity("noise_share", lambda a: a.noise and a.noise.share, "of the variance, as stated", where_known=True),
+    Quantity("noise_share_possible", lambda a: a.noise and a.noise.possible, "whether that can be", where_known=True),
+    Quantity("linear_model", lambda a: a.found.linear[a.of.name], "null where none can be fitted", record=LINEAR),
+    Quantity("main_effects", lambda a: a.found.effects[a.of.name], "of a grid", record=MAIN_EFFECT),
+    Quantity("sobol", _About.sobol, "sensitivity indices, where the study asks for them", where_known=True),
+    Quantity(
+        "convergence",
+        lambda a: {one.name: one for one in a.found.convergences.get(a.of.name, ())},
+        "how the statistics settle",
+        record=CONVERGENCE,
+    ),
+)
+REQUIREMENT: Record[Requirement] = Record(
+    "What became of a requirement.",
+    Quantity("name", lambda r: r.name or "all", "its name; all for all of them together"),
+    Quantity("text", lambda r: r.text, "in words"),
+    Quantity("met", lambda r: r.met, "runs that meet it"),
+    Quantity("runs_with_a_number", lambda r: r.count, "runs that have a number"),
+    Quantity("share", lambda r: r.share, "of these"),
+    Quantity("interval", lambda r: r.interval, "95% interval of the share, of a drawn design"),
+    Quantity("bounds", lambda r: r.bounds, "share of all runs if none, and if all, without a number meet it"),
+    Quantity("bounds_interval", lambda r: r.bounds_interval, "from the lower end for none to the upper end for all"),
+)
+FRONT: Record[ParetoFront] = Record(
+    "Best compromises of a pair.",
+    Quantity("x", lambda front: front.spec.x, "name of a factor or response"),
+    Quantity("y", lambda front: front.spec.y, "name of a factor or response"),
+    Quantity("best_x", lambda front: front.spec.best_x, "min or max"),
+    Quantity("best_y", lambda front: front.spec.best_y, "min or max"),
+    Quantity("runs", lambda front: front.runs, "runs on the front, from the best x to the best y"),
+    Quantity("knee_run", lambda f: None if f.knee is None else f.runs[f.knee], "run at the strongest bulge"),
+)
+STATISTICS: Record[StudyAnalysis] = Record(
+    "statistics.json: what the report says of a study; null where the runs cannot tell a number.",
+    Quantity("name", lambda found: found.runs.study.name, "of the study"),
+    Quantity("design", lambda found: found.runs.kind, "kind of the design"),
+    Quantity("runs", lambda found: found.runs.count, "number of runs"),
+    Quantity("failed", lambda found: found.runs.failed.sum(), "runs that failed"),
+    Quantity("confidence", lambda found: statistics.CONFIDENCE, "of all intervals"),
+    Quantity(
+        "responses",
+        lambda found: {one.name: _About(found, one) for one in found.runs.everything},
+        "responses, and the sigmas that the runs state for them",
+        record=RESPONSE,
+    ),
+    Quantity("requirements", lambda found: found.requirements, "in the study's order, then all", record=REQUIREMENT),
+    Quantity("pareto", lambda found: found.fronts, "of the pairs that the study asks for", record=FRONT),
+)

@@ -1,43 +1,36 @@
-"""Distributions, curves, convergence and compromises of a study's responses."""
+"""Figures of a study: distributions, curves, influences, pairs, convergence and compromises."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from scipy import stats
 
+from twin.run import svg
 from twin.run.artefact import plain
-from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, gridded, new_figure
+from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, SKY, VERMILION
+from twin.study.report.sensitivity_indices import Indices
 from twin.study.report.study_analysis import StudyAnalysis
-from twin.study.report.study_runs import Factor, Response, typeset
-from twin.study.report.study_statistics import Description, mean_interval
+from twin.study.report.study_statistics import Description, Factor, Response, Series, mean_interval, typeset
 
 COLOURS = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 MARKS = ("o", "s", "^", "D", "v", "P")
 MOST_POINTS = 500
-"""Of a scatter: more would make the page heavy and the picture black."""
+"""Points in a scatter plot at most: more would make the page heavy and the picture black."""
 STEPS = (1, 2, 2.5, 5, 10)
 """Ticks are these times a power of ten apart."""
 LONGEST = 18
 """Characters of a text on an axis."""
 
 
-def panels(count: int, wide: int, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of ``count`` panels, ``wide`` beside each other, each ``height`` inches high."""
-    rows = -(-count // wide)
-    figure = new_figure(height * rows)
-    grid = figure.subplots(rows, wide, squeeze=False).ravel()
-    for axes in grid[count:]:
-        axes.set_axis_off()
-    return figure, list(grid[:count])
-
-
 def finish(axes: Axes, x_ticks: int | None = 6, y_ticks: int | None = 5) -> None:
     """The look of all panels; None leaves the ticks of an axis as they are."""
-    gridded(axes)
+    svg.gridded(axes)
     if x_ticks is not None:
         axes.xaxis.set_major_locator(MaxNLocator(x_ticks, steps=STEPS))
         _plain_numbers(axes, "x")
@@ -58,16 +51,16 @@ def short(text: str) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
-def positions(thing: Factor | Response) -> np.ndarray:
+def positions(thing: Series) -> np.ndarray:
     """(runs,) where the values stand on an axis: numbers where they are, texts at 0, 1, ..."""
-    if isinstance(thing, Factor) and not thing.numeric:
+    if not thing.numeric:
         return np.array([np.flatnonzero(thing.levels == value)[0] for value in thing.values], np.float64)
     return thing.values
 
 
-def name_texts(axes: Axes, thing: Factor | Response, which: str) -> None:
+def name_texts(axes: Axes, thing: Series, which: str) -> None:
     """Names of the texts at an axis with ``positions``; nothing for numbers."""
-    if not isinstance(thing, Factor) or thing.numeric:
+    if thing.numeric:
         return
     places, names = np.arange(len(thing.levels)), [short(str(level)) for level in thing.levels]
     if which == "x":
@@ -85,9 +78,9 @@ def some(good: np.ndarray, most: int = MOST_POINTS) -> np.ndarray:
     return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(int)]
 
 
-def jitter(thing: Factor | Response, seed: int) -> np.ndarray:
+def jitter(thing: Series, seed: int) -> np.ndarray:
     """(runs,) what is added to ``positions`` so that points of one text do not hide each other."""
-    if isinstance(thing, Factor) and not thing.numeric:
+    if not thing.numeric:
         return np.random.default_rng(np.random.SeedSequence(seed)).uniform(-0.2, 0.2, len(thing.values))
     return np.zeros(len(thing.values))
 
@@ -107,7 +100,7 @@ def bins(factor: Factor, good: np.ndarray) -> Iterator[np.ndarray]:
 def histogram_figure(found: StudyAnalysis, names: Sequence[str]) -> Figure:
     """A panel for each of the named responses."""
     things = [r for r in found.runs.responses if r.name in names]
-    figure, grid = panels(len(things), min(len(things), 2), 3.0)
+    figure, grid = svg.panels([3.0] * len(things), min(len(things), 2))
     for axes, response in zip(grid, things, strict=True):
         _histogram(axes, response, found.descriptions[response.name], found.runs.sampled)
     return figure
@@ -155,7 +148,7 @@ _TITLES = {"mean": "mean", "sigma": "standard deviation", "p95": "95% quantile",
 def convergence_figure(found: StudyAnalysis, response: Response) -> Figure:
     """Mean, sigma and the upper quantiles of the first n runs, each with its interval."""
     convergences = found.convergences[response.name]
-    figure, grid = panels(len(convergences), len(convergences), 2.8)
+    figure, grid = svg.panels([2.8] * len(convergences), len(convergences))
     for axes, convergence in zip(grid, convergences, strict=True):
         both = np.isfinite(convergence.low) & np.isfinite(convergence.high)
         axes.fill_between(convergence.counts, convergence.low, convergence.high, where=both, color=SKY, alpha=0.4, lw=0)
@@ -183,7 +176,7 @@ def curve_figure(found: StudyAnalysis, response: Response) -> Figure:
     if not factors:
         factors = list(found.runs.factors[:1])
     wide = min(len(factors), 3)
-    figure, grid = panels(len(factors), wide, 3.5 if wide < 3 else 3.0)
+    figure, grid = svg.panels([3.5 if wide < 3 else 3.0] * len(factors), wide)
     for k, (axes, factor) in enumerate(zip(grid, factors, strict=True)):
         other = _partner(factor, factors) if not found.runs.sampled else None
         if not factor.numeric:
@@ -218,11 +211,10 @@ def _binned(axes: Axes, factor: Factor, response: Response) -> None:
     x = np.array([factor.values[group].mean() for group in groups])
     parts = [response.values[group] for group in groups]
     low, high = np.array([np.quantile(part, (0.1587, 0.8413)) for part in parts]).T
-    ends = np.array([mean_interval(part) for part in parts], np.float64)
     mean = np.array([part.mean() for part in parts])
     axes.fill_between(x, low, high, color=SKY, alpha=0.35, lw=0, label="middle 68%")
-    error = np.abs(ends.T - mean)
-    axes.errorbar(x, mean, error, fmt="o-", color=BLUE, ms=3, lw=1.2, capsize=2, label="mean, 95%")
+    style: dict[str, Any] = {"fmt": "o-", "color": BLUE, "ms": 3, "lw": 1.2, "capsize": 2, "label": "mean, 95%"}
+    svg.interval_bars(axes, x, mean, [mean_interval(part) for part in parts], **style)
 
 
 def _groups(other: Factor | None, response: Response) -> list[tuple[str, np.ndarray]]:
@@ -276,7 +268,7 @@ def _bars(axes: Axes, factor: Factor, other: Factor | None, response: Response) 
 def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Figure:
     """The pairs that the study asks for."""
     wide = min(len(pairs), 3)
-    figure, grid = panels(len(pairs), wide, 3.5)
+    figure, grid = svg.panels([3.5] * len(pairs), wide)
     for axes, (x_name, y_name) in zip(grid, pairs, strict=True):
         x, y = found.runs.find(x_name), found.runs.find(y_name)
         _points(axes, x, y, found.runs.study.design.seed)
@@ -287,7 +279,7 @@ def scatter_figure(found: StudyAnalysis, pairs: Sequence[tuple[str, str]]) -> Fi
     return figure
 
 
-def _points(axes: Axes, x: Factor | Response, y: Factor | Response, seed: int, size: float = 3.0) -> None:
+def _points(axes: Axes, x: Series, y: Series, seed: int, size: float = 3.0) -> None:
     places, heights = positions(x) + jitter(x, seed), positions(y) + jitter(y, seed + 1)
     shown = some(np.isfinite(places) & np.isfinite(heights))
     axes.plot(places[shown], heights[shown], ".", color=BLUE, ms=size, alpha=0.6)
@@ -298,7 +290,7 @@ _WAYS = {"min": "small is good", "max": "large is good"}
 
 def pareto_figure(found: StudyAnalysis) -> Figure:
     """A panel for each pair: all runs, the front, its knee."""
-    figure, grid = panels(len(found.fronts), min(len(found.fronts), 2), 3.9)
+    figure, grid = svg.panels([3.9] * len(found.fronts), min(len(found.fronts), 2))
     for axes, front in zip(grid, found.fronts, strict=True):
         x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
         shown = some(front.ranks > 0, 1000)
@@ -317,3 +309,180 @@ def pareto_figure(found: StudyAnalysis) -> Figure:
         if np.any(front.ranks >= 0):
             axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.04), ncols=3)
     return figure
+
+
+MOST_BARS = 10
+
+
+def _bar_panels(rows: Sequence[int]) -> tuple[Figure, list[Axes]]:
+    """Panels as high as their bars need, two beside each other."""
+    return svg.panels([0.95 + 0.3 * max(row, 2) for row in rows], min(2, len(rows)))
+
+
+def with_tornado(found: StudyAnalysis) -> list[Response]:
+    """Responses and sigmas of which there is something to draw."""
+    return [r for r in found.runs.everything if found.effects[r.name] or found.linear[r.name] is not None]
+
+
+def tornado_figure(found: StudyAnalysis) -> Figure:
+    """Swing of each response over each factor, the largest first."""
+    things = with_tornado(found)
+    rows = [min(len(found.effects[r.name]) or _effects(found, r.name), MOST_BARS) for r in things]
+    figure, grid = _bar_panels(rows)
+    for axes, response in zip(grid, things, strict=True):
+        if found.runs.sampled:
+            _swings(axes, found, response)
+        else:
+            _main_effects(axes, found, response)
+    return figure
+
+
+def _effects(found: StudyAnalysis, name: str) -> int:
+    model = found.linear[name]
+    return len(model.effects) if model is not None else 0
+
+
+def _swings(axes: Axes, found: StudyAnalysis, response: Response) -> None:
+    model = found.linear[response.name]
+    assert model is not None
+    shown = model.effects[:MOST_BARS][::-1]
+    y = np.arange(len(shown))
+    values = np.array([e.swing.value for e in shown])
+    texts = np.array([e.coefficient is None for e in shown])
+    colours = [GREY if text else BLUE if v >= 0 else VERMILION for v, text in zip(values, texts, strict=True)]
+    axes.barh(y, values, 0.66, color=colours)
+    ends = [[e.swing.value if end is None else end for end in e.swing.interval] for e in shown]
+    svg.interval_bars(axes, values, y, ends, "x", capsize=2.5)
+    _name_bars(axes, [e.factor for e in shown], f"change of {response.label}")
+
+
+def _main_effects(axes: Axes, found: StudyAnalysis, response: Response) -> None:
+    """From the smallest to the largest mean of a factor's values, about the mean of all."""
+    shown = found.effects[response.name][:MOST_BARS][::-1]
+    mean = float(np.mean(response.known))
+    y = np.arange(len(shown))
+    for place, effect in zip(y, shown, strict=True):
+        low, high = float(effect.means.min()) - mean, float(effect.means.max()) - mean
+        rising = effect.means[-1] >= effect.means[0]
+        numeric = effect.levels.dtype.kind == "f"
+        colour = GREY if not numeric else BLUE if rising else VERMILION
+        axes.barh(place, high - low, 0.66, left=low, color=colour)
+    of = f", {typeset(response.unit)}" if response.unit else ""
+    _name_bars(axes, [e.factor for e in shown], f"mean of {response.name} − mean of all{of}")
+
+
+def _name_bars(axes: Axes, names: Sequence[str], label: str) -> None:
+    axes.axvline(0.0, color=INK, lw=0.8)
+    axes.use_sticky_edges = False
+    axes.set_yticks(np.arange(len(names)), [short(name) for name in names])
+    axes.set_xlabel(label)
+    axes.set_ylim(-0.7, max(len(names), 2) - 0.3)
+    finish(axes, 5, None)
+    axes.grid(False, axis="y")
+
+
+def with_indices(found: StudyAnalysis) -> list[Response]:
+    """Responses and sigmas that have indices."""
+    return [r for r in found.runs.everything if isinstance(found.indices.get(r.name), Indices)]
+
+
+def indices_figure(found: StudyAnalysis) -> Figure:
+    """First order and total index of each factor."""
+    things = with_indices(found)
+    parts = [found.indices[r.name] for r in things]
+    rows = [min(2 * len(part.axes), 2 * MOST_BARS) for part in parts if isinstance(part, Indices)]
+    figure, grid = _bar_panels([int(0.7 * row) + 1 for row in rows])
+    for axes, response, part in zip(grid, things, parts, strict=True):
+        assert isinstance(part, Indices)
+        shown = part.axes[:MOST_BARS][::-1]
+        y = np.arange(len(shown))
+        for shift, colour, label, estimates in (
+            (0.19, BLUE, "first order", [index.first for index in shown]),
+            (-0.19, SKY, "total", [index.total for index in shown]),
+        ):
+            values = np.array([e.value for e in estimates])
+            axes.barh(y + shift, values, 0.36, color=colour, label=label)
+            if part.method == "chaos":
+                svg.interval_bars(axes, values, y + shift, [e.interval for e in estimates], "x", capsize=2.0)
+        _name_bars(axes, [index.name for index in shown], f"share of the variance of {response.name}")
+        axes.set_xlim(0.0, 1.08)
+        axes.set_xticks([0.0, 0.2, 0.4, 0.6, 0.8, 1.0])
+        axes.legend(loc="lower right")
+    return figure
+
+
+MOST_RESPONSES, MOST = 3, 6
+
+
+def chosen(found: StudyAnalysis) -> list[Series]:
+    """The first three responses that vary, and as many factors as have room, by their influence on these."""
+    responses = [r for r in found.runs.responses if not r.constant][:MOST_RESPONSES]
+    weight = {factor.name: 0.0 for factor in found.runs.factors}
+    for response in responses:
+        influence = found.influence(response.name)
+        for name, value in influence.items():
+            weight[name] = max(weight[name], value)
+    factors = [factor for factor in found.runs.factors if len(factor.levels) > 1]
+    best = sorted(factors, key=lambda factor: -weight[factor.name])[: MOST - len(responses)]
+    return [*(factor for factor in found.runs.factors if factor in best), *responses]
+
+
+def matrix_figure(found: StudyAnalysis) -> Figure:
+    """Points below the diagonal, rank correlations above it, distributions on it."""
+    things = chosen(found)
+    n = len(things)
+    figure = svg.new_figure(min(1.65 * n + 0.6, 10.2), {"h_pad": 0.03, "w_pad": 0.03, "hspace": 0.02, "wspace": 0.02})
+    grid = figure.subplots(n, n, squeeze=False)
+    seed = found.runs.study.design.seed
+    for i, row in enumerate(things):
+        for j, column in enumerate(things):
+            axes = grid[i, j]
+            if j > i:
+                _correlation(axes, column, row)
+                continue
+            if i == j:
+                values = positions(row)
+                count = len(row.levels) if isinstance(row, Factor) and len(row.levels) < 20 else 20
+                axes.hist(values[np.isfinite(values)], bins=count, color=SKY, edgecolor="white", linewidth=0.3)
+                axes.set_yticks([])
+                svg.plain_axes(axes)
+                axes.xaxis.set_major_locator(MaxNLocator(3))
+            else:
+                x, y = positions(column) + jitter(column, seed), positions(row) + jitter(row, seed + 1)
+                shown = some(np.isfinite(x) & np.isfinite(y), 300)
+                axes.plot(x[shown], y[shown], ".", color=BLUE, ms=2.0, alpha=0.6)
+                finish(axes, 3, 3)
+                name_texts(axes, row, "y")
+            name_texts(axes, column, "x")
+            if i < n - 1:
+                axes.tick_params(labelbottom=False)
+                axes.xaxis.offsetText.set_visible(False)
+            if j > 0:
+                axes.tick_params(labelleft=False)
+                axes.yaxis.offsetText.set_visible(False)
+    for k, thing in enumerate(things):
+        label = thing.label.replace(", ", ",\n")
+        grid[n - 1, k].set_xlabel(label)
+        grid[k, 0].set_ylabel(label)
+    return figure
+
+
+def _correlation(axes: Axes, x: Series, y: Series) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_color(LIGHT)
+    if any(not thing.numeric for thing in (x, y)):
+        axes.set_axis_off()
+        return
+    good = np.isfinite(x.values) & np.isfinite(y.values)
+    if good.sum() < 3 or np.ptp(x.values[good]) == 0.0 or np.ptp(y.values[good]) == 0.0:
+        return
+    rank = float(stats.spearmanr(x.values[good], y.values[good]).statistic) + 0.0
+    strong = abs(rank) > 0.3
+    text = f"{rank:+.2f}".replace("-", "\N{MINUS SIGN}")
+    colour = INK if strong else GREY
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=colour, fontsize=9 + 4 * strong)
+    edge = VERMILION if rank < 0 else GREEN
+    if strong:
+        axes.spines[:].set_color(edge)
+        axes.spines[:].set_linewidth(0.6 + 1.4 * abs(rank))

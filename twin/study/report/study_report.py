@@ -1,27 +1,30 @@
-"""The report of a study: ``report.html``, the files it shows and ``statistics.json``."""
+"""The report of a study with its sections: ``report.html``, the files that it shows and ``statistics.json``."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
 import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 
-from scenes.specs.study import StudySpec
-from twin.run.artefact import Undrawn
-from twin.run.owned_files import every_file
-from twin.run.page import links, report_page
+from scenes.specs.study import FactorSpec, StudySpec
+from scenes.yaml.errors import key_text
+from twin.run import owned_files, page, run_folder, svg
+from twin.run.artefact import Cell, SvgFigure, Table, Undrawn, fixed, plain
 from twin.run.report import Report, Section
-from twin.run.run_folder import json_text
-from twin.study.report.conclusions import conclusions, design_title, verdict, warnings
-from twin.study.report.study_analysis import StudyAnalysis, plain_data, summary
-from twin.study.report.study_runs import StudyRuns
-from twin.study.report.study_sections import STATISTICS, factor_table, response_table, sections
-from twin.study.report.study_wording import plural
+from twin.study.report import conclusions as words
+from twin.study.report import study_analysis
+from twin.study.report import study_plots as plots
+from twin.study.report.sensitivity_indices import Indices
+from twin.study.report.study_analysis import StudyAnalysis
+from twin.study.report.study_statistics import Estimate, Factor, StudyRuns, typeset
+from twin.study.runs.base_job import one_line
 from twin.study.runs.plan import Plan
 from twin.study.runs.study_folder import PROGRAM, StudyFolder
-
-__all__ = ["report_files", "summary", "write_report"]
 
 ARTEFACTS = "artefacts"
 
@@ -59,38 +62,399 @@ def write_report(
     made = report_files(data, plan.setup.study, files, given)
     contents = made.contents
     # what an earlier report showed may not be there any more
-    there = [name for name in every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents]
+    there = [
+        name for name in owned_files.every_file(folder.path) if name.split("/")[0] == ARTEFACTS and name not in contents
+    ]
     folder.remove(there)
     folder.write_all(contents)
     return made
 
 
 def report_files(
-    data: xr.Dataset,
-    study: StudySpec,
-    files: Sequence[str] = ("study.nc", "study.csv"),
-    given: Sequence[str] = (),
+    data: xr.Dataset, study: StudySpec, files: Sequence[str] = ("study.nc", "study.csv"), given: Sequence[str] = ()
 ) -> StudyReport:
     """The report with all its files; arguments as of ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
-    said, runs = verdict(found), found.runs
+    said, runs = words.verdict(found), found.runs
     about = (
-        f"{plural(runs.count, 'run')} of {study.base.command}, {int(runs.failed.sum())} of them failed; "
-        f"{design_title(runs.kind)}, seed {study.design.seed}."
+        f"{words.plural(runs.count, 'run')} of {study.base.command}, {int(runs.failed.sum())} of them failed; "
+        f"{words.design_title(runs.kind)}, seed {study.design.seed}."
     )
     report = Report(
         study.name,
         said,
         (*([study.description] if study.description else ()), about),
         (),
-        response_table(found),
-        (Section("Factors", (), (factor_table(runs),)), *sections(found)),
-        conclusions=tuple(conclusions(found)),
+        _response_table(found),
+        (Section("Factors", (), (_factor_table(runs),)), *sections(found)),
+        conclusions=tuple(words.conclusions(found)),
     )
     undrawn = tuple(artefact.note for artefact in report.artefacts if isinstance(artefact, Undrawn))
-    report = replace(report, warnings=(*given, *undrawn, *warnings(found)))
+    report = replace(report, warnings=(*given, *undrawn, *words.warnings(found)))
     contents = {artefact.file: artefact.content() for artefact in report.artefacts if artefact.within is None}
-    contents[STATISTICS] = json_text({**plain_data(found), "verdict": said}).encode()
-    numbers = links((*files, "study.json", STATISTICS, "config.yaml"))
-    contents["report.html"] = report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
+    contents[STATISTICS] = run_folder.json_text({**study_analysis.STATISTICS(found), "verdict": said}).encode()
+    numbers = page.links((*files, "study.json", STATISTICS, "config.yaml"))
+    contents["report.html"] = page.report_page(report, (PROGRAM, "config.yaml"), [("Numbers", numbers)]).encode()
     return StudyReport(said, contents, undrawn)
+
+
+MOST_NAMED = 6
+STATISTICS = "statistics.json"
+"""Holds all digits of tables whose cells are texts, which have no file of their own."""
+
+
+def _factor_table(runs: StudyRuns) -> Table:
+    """Name, where it acts, distribution and the values that were run."""
+    rows: list[list[Cell]] = []
+    for factor in runs.factors:
+        places = [key_text(place) for place in factor.spec.places]
+        places += [f"{key_text(scale.key)} (power {scale.power:g})" for scale in factor.spec.scales]
+        rows.append([factor.name, typeset(factor.unit), "; ".join(places), _source(factor.spec), _values(factor)])
+    heads = ("factor", "unit", "in the base", "distribution", "values run")
+    return Table("factors", "", "What was varied.", heads, rows, within="config.yaml")
+
+
+def _source(spec: FactorSpec) -> str:
+    if spec.kind == "table":
+        assert spec.table is not None
+        return f"table {spec.table.file}, column {spec.table.column}"
+    if spec.kind == "values":
+        return f"list of {words.plural(len(spec.scalars()), 'value')}"
+    values = [plain(value, 6) for value in spec.numbers().values]
+    if spec.kind == "normal":
+        return f"normal, mean {values[0]}, σ {values[1]}"
+    if spec.kind == "truncated":
+        return f"normal, mean {values[0]}, σ {values[1]}, cut to {values[2]} … {values[3]}"
+    if spec.kind in ("range", "uniform"):
+        return f"{spec.kind}, {values[0]} … {values[1]}"
+    raise ValueError(f"a factor of kind {spec.kind!r} has no words")
+
+
+def _values(factor: Factor) -> str:
+    levels = factor.levels
+    if not factor.numeric:
+        named = [str(level) for level in levels[:MOST_NAMED]]
+        return ", ".join(named) + (f" and {len(levels) - MOST_NAMED} more" if len(levels) > MOST_NAMED else "")
+    if len(levels) <= MOST_NAMED:
+        return ", ".join(plain(float(level), 6) for level in levels)
+    return f"{plain(float(np.min(levels)), 5)} … {plain(float(np.max(levels)), 5)}"
+
+
+MOST_FIGURES = 12
+"""Responses that have figures of their own."""
+MOST_FRONT = 50
+"""Rows of a front in the report; its CSV holds all."""
+
+
+def sections(found: StudyAnalysis) -> list[Section]:
+    """All sections that have something to show, in the order of the page."""
+    made = (
+        _requirements(found),
+        _distributions(found),
+        _influences(found),
+        _indices(found),
+        _curves(found),
+        _pairs(found),
+        _fronts(found),
+        _convergence(found),
+    )
+    return [section for section in made if section is not None]
+
+
+def _response_table(found: StudyAnalysis) -> Table:
+    """Statistics of the responses and of the stated sigmas."""
+    heads = ("response", "unit", "runs", "mean", "std", "median", "95%", "99.7%", "min", "max")
+    rows: list[list[Cell]] = []
+    for r in found.runs.everything:
+        d = found.descriptions[r.name]
+        estimates = [words.with_limits(e) for e in (d.mean, d.std, d.median, d.p95, d.p997)]
+        rows.append([r.name, typeset(r.unit), d.count, *estimates, words.number(d.low), words.number(d.high)])
+    if found.runs.sampled:
+        how = (
+            "In brackets 95% confidence intervals: Student's for the mean, from the kurtosis for the standard "
+            "deviation, order statistics for the quantiles; a question mark stands for an end that so few runs cannot "
+            "tell, > for a quantile of which they tell nothing else."
+        )
+    else:
+        how = (
+            "Over the combinations of the grid, all counted alike; they are no sample, so that there are no intervals."
+        )
+    caption = f"Over the runs that have a number; 95% and 99.7% of the runs lie below those columns. {how}"
+    return Table("responses", "Responses", caption, heads, rows, within=STATISTICS)
+
+
+def _figure(name: str, title: str, caption: str, draw: Callable[[], Figure]) -> SvgFigure | Undrawn:
+    """A figure; what cannot be drawn must not cost the numbers beside it, and is told in its place."""
+    try:
+        with svg.look(f"study-{name}"):
+            figure = draw()
+            for text in figure.findobj(Text):
+                if "$" in text.get_text():  # somebody's unit or name, and no formula
+                    text.set_parse_math(False)
+            return SvgFigure(name, title, caption, svg.to_svg(figure))
+    except Exception as error:
+        return Undrawn(name, title, caption, one_line(error))
+
+
+def _requirements(found: StudyAnalysis) -> Section | None:
+    if not found.requirements:
+        return None
+    failed = int(found.runs.failed.sum())
+    lacking = any(r.bounds is not None for r in found.requirements)
+    rows: list[list[Cell]] = [
+        [
+            r.name or "all",
+            r.text,
+            typeset(r.unit),
+            r.met,
+            r.count,
+            words.percent(r.share),
+            words.span(r.interval) if r.interval is not None else words.DASH,
+            *([words.DASH if r.bounds is None else f"{r.met} … {r.most} of {r.runs}"] if lacking else ()),
+            *([words.DASH if r.bounds_interval is None else words.span(r.bounds_interval)] if lacking else ()),
+            words.number(r.judged.p95.value) if r.judged and r.judged.p95 else words.DASH,
+            words.number(r.judged.p997.value) if r.judged and r.judged.p997 else words.DASH,
+        ]
+        for r in found.requirements
+    ]
+    how = "The interval is Clopper and Pearson's, 95%." if found.runs.sampled else "A grid is no sample: no interval."
+    lost = f" {failed} failed runs are not counted." if failed else ""
+    more = ("all runs", "interval of all runs") if lacking else ()
+    open_ends = ""
+    if lacking:
+        open_ends = (
+            " Runs may fail where the response is bad, or where it is good: the column of all runs goes from none of "
+            "those without a number to all of them."
+        )
+    return Section(
+        "Requirements",
+        (),
+        (
+            Table(
+                "requirements",
+                "Share of the runs that meet them",
+                f"Of the runs that have a number.{lost} {how}{open_ends} The last columns are quantiles of what is "
+                "judged.",
+                ("requirement", "", "unit", "met", "of", "share", "interval", *more, "95%", "99.7%"),
+                rows,
+                within=STATISTICS,
+            ),
+        ),
+    )
+
+
+def _distributions(found: StudyAnalysis) -> Section | None:
+    asked = found.runs.study.report.histograms
+    names = [r.name for r in found.runs.responses if asked is None or r.name in asked][:MOST_FIGURES]
+    names = [name for name in names if found.descriptions[name].count > 0]
+    if not names:
+        return None
+    texts = [words.normality_text(r, found.descriptions[r.name]) for r in found.runs.responses if r.name in names]
+    remarks = tuple(text for text in texts if text is not None)
+    if remarks:
+        remarks = (
+            *remarks,
+            "The test is D'Agostino and Pearson's; a normal distribution fails it in one of 100 studies.",
+        )
+    caption = "Number of runs by value."
+    if found.runs.sampled:
+        caption += (
+            " Dashed: three standard deviations from the mean. Where the distribution is not normal, dotted: what "
+        )
+        caption += "0.135% and 99.865% of the runs lie below, from 741 runs on."
+    figure = _figure("histograms", "Histograms", caption, lambda: plots.histogram_figure(found, names))
+    return Section("Distributions", remarks, (figure,))
+
+
+def _influences(found: StudyAnalysis) -> Section | None:
+    things = plots.with_tornado(found)
+    if not things:
+        return None
+    sampled = found.runs.sampled
+    if sampled:
+        caption = (
+            "Change of the response from a factor's 5% to its 95% quantile by the linear model, the others unchanged, "
+            "with 95% intervals (HC3). Blue: rises with the factor; red: falls; grey: of a text, between the values "
+            "with the smallest and the largest mean."
+        )
+    else:
+        caption = (
+            "From the smallest to the largest of the means that belong to a factor's values. Blue: the mean at the "
+            "last value is the larger one; red: the first; grey: texts."
+        )
+    figure = _figure("tornado", "Swings" if sampled else "Main effects", caption, lambda: plots.tornado_figure(found))
+    rows: list[list[Cell]] = []
+    texts = []
+    for r in things:
+        model = found.linear[r.name]
+        if model is None:
+            continue
+        texts.append(f"{r.name} {words.percent(model.r2)}")
+        for e in model.effects:
+            ends = " … ".join(end if isinstance(end, str) else words.number(end, 3) for end in e.span)
+            rows.append(
+                [
+                    r.name,
+                    e.factor,
+                    ends,
+                    words.with_limits(e.swing) if sampled else words.number(e.swing.value),
+                    typeset(r.unit),
+                    _maybe(e.coefficient, sampled),
+                    _maybe(e.rank, sampled),
+                ]
+            )
+    table = Table(
+        "linear-model",
+        "Linear model and rank correlations",
+        "Swing between the factor's 5% and 95% quantiles (second column), standardised regression coefficient (sigmas "
+        "of the response per sigma of the factor) and Spearman's rank correlation"
+        + (", with 95% intervals. Where the last two differ much, the response is curved." if sampled else "."),
+        ("response", "factor", "from … to", "swing", "unit", "standardised", "rank correlation"),
+        rows,
+        within=STATISTICS,
+    )
+    cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
+    remarks = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
+    if cannot:
+        remarks.append(f"Not told apart from the other factors, and left out of the model: {', '.join(cannot)}.")
+    return Section("What the factors do", tuple(remarks), (figure, table) if rows else (figure,))
+
+
+def _maybe(estimate: Estimate | None, sampled: bool) -> str:
+    if estimate is None:
+        return words.DASH
+    return words.with_limits(estimate) if sampled else words.number(estimate.value, 3)
+
+
+def _indices(found: StudyAnalysis) -> Section | None:
+    if not found.runs.study.report.sobol:
+        return None
+    remarks = words.indices_texts(found)
+    things = plots.with_indices(found)
+    if not things:
+        return Section("Sobol indices", tuple(remarks))
+    chaos = found.runs.sampled
+    rows: list[list[Cell]] = []
+    for r in things:
+        part = found.indices[r.name]
+        assert isinstance(part, Indices)
+        for index in part.axes:
+            check = words.DASH if index.check is None else fixed(index.check, 2)
+            rows.append(
+                [r.name, index.name, words.share(index.first), words.share(index.total), *([check] if chaos else [])]
+            )
+    heads = ("response", "factor", "first order", "total", *(("first order, RBD-FAST",) if chaos else ()))
+    caption = "First order: share of the variance that the factor explains alone; total: with all its interactions."
+    if chaos:
+        caption += " RBD-FAST (SALib) needs no model and checks the first order; its own error is some 0.03 to 0.1."
+    table = Table("sobol", "Indices", caption, heads, rows, within=STATISTICS)
+    intervals = "with 95% intervals" if chaos else "exact for the grid"
+    figure = _figure("sobol-indices", "First order and total", f"Shares of the variance, {intervals}.",
+                     lambda: plots.indices_figure(found))  # fmt: skip
+    return Section("Sobol indices", tuple(remarks), (figure, table))
+
+
+def _curves(found: StudyAnalysis) -> Section | None:
+    figures = []
+    if found.runs.sampled:
+        caption = (
+            "Points: runs. Line: means of neighbouring runs with 95% intervals. Band: the middle 68% of these runs."
+        )
+    else:
+        caption = "Means over all other factors; of a text with one standard deviation of the runs as whisker."
+        if len([f for f in found.runs.factors if len(f.levels) > 1]) > 1:
+            caption += " A line or group for each value of the other factor that matters most."
+    for k, response in enumerate(found.runs.everything[:MOST_FIGURES]):
+        if found.descriptions[response.name].count == 0 or response.constant:
+            continue
+        figures.append(
+            _figure(f"curves-{k + 1}", response.label, caption, partial(plots.curve_figure, found, response))
+        )
+        caption = "As above."
+    if not figures:
+        return None
+    more = len(found.runs.factors) - plots.MOST_PANELS
+    remarks = (f"The {plots.MOST_PANELS} factors that matter most of {len(found.runs.factors)}.",) if more > 0 else ()
+    return Section("Response curves", remarks, tuple(figures))
+
+
+def _pairs(found: StudyAnalysis) -> Section | None:
+    figures = []
+    pairs = found.runs.study.report.scatter
+    if pairs:
+        figures.append(
+            _figure(
+                "scatter",
+                "Pairs that were asked for",
+                "Every point is a run.",
+                lambda: plots.scatter_figure(found, pairs),
+            )
+        )
+    things = plots.chosen(found)
+    if len(things) > 2:
+        factors = sum(isinstance(thing, Factor) for thing in things)
+        caption = (
+            f"The {factors} factors that matter most and {len(things) - factors} responses. Below the diagonal up to "
+            "300 runs, above it Spearman's rank correlation, large and framed (green +, red −) beyond 0.3."
+        )
+        figures.append(_figure("matrix", "Scatter matrix", caption, lambda: plots.matrix_figure(found)))
+    return Section("Pairs", (), tuple(figures)) if figures else None
+
+
+def _fronts(found: StudyAnalysis) -> Section | None:
+    remarks = tuple(f"{pair}: texts have no order, so that there is no front." for pair in found.not_numbers)
+    if not found.fronts:
+        return Section("Best compromises", remarks) if remarks else None
+    caption = "Blue: runs that no other run beats in both; the stairs bound what is known to be possible. "
+    caption += "Knee: where the front, scaled to its range, bulges farthest from the line through its ends."
+    parts: list[SvgFigure | Undrawn | Table] = [
+        _figure("pareto", "Pareto fronts", caption, lambda: plots.pareto_figure(found))
+    ]
+    for k, front in enumerate(found.fronts):
+        x, y = found.runs.find(front.spec.x), found.runs.find(front.spec.y)
+        others = [f for f in found.runs.factors if f not in (x, y) and len(f.levels) > 1]
+        rows: list[list[Cell]] = []
+        for j, run in enumerate(front.runs.tolist()):
+            own: list[Cell] = [_cell(f, run) for f in others]
+            rows.append([run, float(front.x[j]), float(front.y[j]), *own, "knee" if j == front.knee else ""])
+        shown = (
+            rows
+            if len(rows) <= MOST_FRONT
+            else [rows[round(i * (len(rows) - 1) / (MOST_FRONT - 1))] for i in range(MOST_FRONT)]
+        )
+        note = (
+            ""
+            if shown is rows
+            else f" {MOST_FRONT} of {len(rows)}, evenly through the front; study.csv holds all runs."
+        )
+        heads = ("run", x.label, y.label, *(f.label for f in others), "")
+        parts.append(
+            Table(
+                f"pareto-front-{k + 1}",
+                f"Front of {x.name} and {y.name}",
+                f"From the best {x.name} on.{note}",
+                heads,
+                shown,
+            )
+        )
+    return Section("Best compromises", remarks, tuple(parts))
+
+
+def _cell(factor: Factor, run: int) -> Cell:
+    """Value of a factor; whole numbers without decimals."""
+    value: Cell = factor.values[run].item()
+    whole = factor.numeric and bool(np.all(factor.levels == np.rint(factor.levels)))
+    return int(value) if whole and isinstance(value, float) else value
+
+
+def _convergence(found: StudyAnalysis) -> Section | None:
+    names = [name for name, convergences in found.convergences.items() if convergences][:MOST_FIGURES]
+    if not names:
+        return None
+    caption = "Of the first n runs, with the 95% interval where both its ends can be told."
+    figures = []
+    things = [r for r in found.runs.responses if r.name in names]
+    for k, r in enumerate(things):
+        figures.append(_figure(f"convergence-{k + 1}", r.label, caption, partial(plots.convergence_figure, found, r)))
+        caption = "As above."
+    return Section("Enough runs?", tuple(words.convergence_texts(found, names)), tuple(figures))

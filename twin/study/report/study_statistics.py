@@ -1,15 +1,193 @@
-"""Statistics of one response over the runs that have a number, with confidence intervals."""
+"""Runs of a finished study, and statistics of each response with confidence intervals and its share of noise."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import xarray as xr
 from scipy import stats
 
+from scenes.specs.samplers import GRID
+from scenes.specs.study import NOISE, FactorSpec, StudySpec
+from scenes.yaml.errors import InputError, Issue, key_text
+from twin.run.artefact import significant
+from twin.study.runs.sampling import axes_of
+
+_SIGNS = {"um": "µm", "us": "µs", "urad": "µrad", "percent": "%", "deg": "°"}
+
+
+def typeset(unit: str) -> str:
+    """A unit as the report writes it."""
+    return _SIGNS.get(unit, unit)
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Values of a factor or of a response, run by run.
+
+    Attributes:
+        name: of it.
+        unit: of the numbers, empty for pure numbers and texts.
+        values: (runs,) float64, NaN where there is none; of some factors text.
+    """
+
+    name: str
+    unit: str
+    values: np.ndarray
+
+    @property
+    def label(self) -> str:
+        """Name with unit."""
+        return f"{self.name}, {typeset(self.unit)}" if self.unit else self.name
+
+    @property
+    def numeric(self) -> bool:
+        """Whether the values are numbers."""
+        return self.values.dtype.kind == "f"
+
+    @cached_property
+    def levels(self) -> np.ndarray:
+        """The different values, numbers in order, texts in the order of the study."""
+        found = np.unique(self.values)
+        if self.numeric:
+            return found
+        first = [int(np.argmax(self.values == value)) for value in found]
+        return np.asarray(found[np.argsort(first, kind="stable")])
+
+
+@dataclass(frozen=True, eq=False)
+class Factor(Series):
+    """What was varied.
+
+    Attributes:
+        spec: where the values come from.
+        drawn: whether the runs are drawn from it; those of a grid are not.
+    """
+
+    spec: FactorSpec
+    drawn: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Response(Series):
+    """What came out.
+
+    Attributes:
+        noise: (runs,) the standard deviation by noise alone that each run states for it; None without.
+        of: of a standard deviation that is looked at like a response: what it belongs to; empty for responses.
+    """
+
+    noise: np.ndarray | None = None
+    of: str = ""
+
+    @cached_property
+    def good(self) -> np.ndarray:
+        """(runs,) where there is a finite number."""
+        return np.isfinite(self.values)
+
+    @cached_property
+    def known(self) -> np.ndarray:
+        """The finite numbers."""
+        return np.asarray(self.values[self.good])
+
+    @cached_property
+    def constant(self) -> bool:
+        """Whether all numbers are the same, or differ by rounding."""
+        if len(self.known) == 0:
+            return True
+        # 64 units in the last place: what sums over a few hundred terms lose
+        return bool(np.ptp(self.known) <= 64.0 * np.finfo(float).eps * np.max(np.abs(self.known)))
+
+
+@dataclass(frozen=True, eq=False)
+class StudyRuns:
+    """All runs of a study.
+
+    Attributes:
+        study: as the user wrote it.
+        factors: what was varied, in the study's order.
+        responses: what came out, in the study's order.
+        sigmas: the standard deviations that the runs state for responses, where they are not all the same.
+        failed: (runs,) bool.
+        messages: (runs,) why a run failed.
+        doubts: (runs,) why sigma does not hold in a run, empty where it does; none of commands that do not say so.
+    """
+
+    study: StudySpec
+    factors: tuple[Factor, ...]
+    responses: tuple[Response, ...]
+    sigmas: tuple[Response, ...]
+    failed: np.ndarray
+    messages: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, data: xr.Dataset, study: StudySpec) -> StudyRuns:
+        """The runs of a data set as ``twin.study.study_files.make_dataset`` makes it."""
+        drawn = study.design.kind != GRID
+        factors = tuple(
+            Factor(name, str(data[name].attrs.get("units", "")), _factor_values(data[name].values), spec, drawn)
+            for name, spec in study.factors.items()
+        )
+        responses, sigmas = [], []
+        for name, response in study.responses.items():
+            unit = str(data[name].attrs.get("units", ""))
+            stated = {ending: data[f"{name}{ending}"].values.astype(np.float64) for ending in response.stated}
+            responses.append(Response(name, unit, data[name].values.astype(np.float64), stated.get(NOISE)))
+            own = [Response(f"{name}{ending}", unit, sigma, None, name) for ending, sigma in stated.items()]
+            sigmas += [one for one in own if not one.constant]
+        messages = tuple(str(m) for m in data["message"].values.tolist()) if "message" in data else ()
+        doubts = tuple(str(m) for m in data["doubt"].values.tolist()) if "doubt" in data else ()
+        failed = data["failed"].values.astype(bool)
+        return cls(study, factors, tuple(responses), tuple(sigmas), failed, messages, doubts)
+
+    @property
+    def count(self) -> int:
+        """Number of runs."""
+        return len(self.failed)
+
+    @property
+    def kind(self) -> str:
+        """Kind of the design."""
+        return self.study.design.kind
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the runs are a sample of distributions; those of a grid are not."""
+        return self.kind != GRID
+
+    @property
+    def everything(self) -> tuple[Response, ...]:
+        """Responses, then the stated standard deviations."""
+        return (*self.responses, *self.sigmas)
+
+    @cached_property
+    def axes(self) -> tuple[tuple[Factor, ...], ...]:
+        """Factors that vary independently: each alone, columns of one table together."""
+        by_name = {factor.name: factor for factor in self.factors}
+        return tuple(tuple(by_name[name] for name in names) for names in axes_of(self.study))
+
+    def find(self, name: str) -> Series:
+        """A factor or response by its name."""
+        things: Sequence[Series] = (*self.factors, *self.responses, *self.sigmas)
+        return next(thing for thing in things if thing.name == name)
+
+
+def _factor_values(values: np.ndarray) -> np.ndarray:
+    """Numbers as float64, texts as text; switches, which the data set holds as 8-bit numbers, as no and yes."""
+    if values.dtype.kind in "OUS":
+        return np.array([str(value) for value in values.tolist()], np.str_)
+    if values.dtype.itemsize == 1:
+        return np.where(values.astype(bool), "yes", "no")
+    return np.asarray(values, np.float64)
+
+
 CONFIDENCE = 0.95
-"""Of all intervals, two-sided."""
+"""Two-sided confidence of all intervals."""
 LEAST = 20
 """With fewer runs no distribution is judged."""
 UNLIKELY = 0.01
@@ -80,10 +258,14 @@ class Description:
 
 
 def describe(values: np.ndarray, sampled: bool) -> Description:
-    """Statistics of the finite ones of ``values`` (n,); intervals and normality only where the runs were ``drawn``.
+    """Statistics of the finite values, with intervals and a test of normality where the runs are a sample.
 
     The intervals take the runs as independent. Evenly spread designs (Latin hypercube, Sobol) know the mean better, so
     that theirs are on the safe side.
+
+    Args:
+        values: (n,) of a response.
+        sampled: whether the runs are drawn from distributions; those of a grid are not.
     """
     good = values[np.isfinite(values)]
     n = len(good)
@@ -112,17 +294,17 @@ def describe(values: np.ndarray, sampled: bool) -> Description:
     )
 
 
-def mean_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
+def mean_interval(values: np.ndarray) -> Interval:
     """Student's interval of the mean of (n,) values; open for a single one."""
     n = len(values)
     if n < 2:
         return None, None
-    half = float(stats.t.ppf(0.5 + 0.5 * confidence, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
+    half = float(stats.t.ppf(0.5 + 0.5 * CONFIDENCE, n - 1) * np.std(values, ddof=1) / math.sqrt(n))
     mean = float(np.mean(values))
     return mean - half, mean + half
 
 
-def std_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval:
+def std_interval(values: np.ndarray) -> Interval:
     """Interval of the standard deviation of (n,) values, n - 1.
 
     In the logarithm, with the variance (k - (n-3)/(n-1)) / (4n) that follows from the kurtosis k of the values; for a
@@ -136,33 +318,42 @@ def std_interval(values: np.ndarray, confidence: float = CONFIDENCE) -> Interval
         return 0.0, 0.0
     kurtosis = float(np.mean((values - np.mean(values)) ** 4) / np.var(values) ** 2)
     spread = math.sqrt(max(kurtosis - (n - 3) / (n - 1), 0.0) / (4.0 * n))
-    factor = math.exp(float(stats.norm.ppf(0.5 + 0.5 * confidence)) * spread)
+    factor = math.exp(float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)) * spread)
     return s / factor, s * factor
 
 
-def quantile_interval(values: np.ndarray, q: float, confidence: float = CONFIDENCE) -> Interval:
+def quantile_interval(values: np.ndarray, q: float) -> Interval:
     """Interval of the quantile ``q`` of any continuous distribution by order statistics of (n,) values.
 
-    Each end is passed with a chance of (1 - confidence)/2 at most; an end that n values do not reach is None.
+    Each end is passed with a chance of (1 - CONFIDENCE)/2 at most; an end that n values do not reach is None.
+
+    Args:
+        values: (n,) of a response.
+        q: share of the runs that lie below the quantile.
     """
-    found = stats.quantile_test(values, p=q).confidence_interval(confidence)
+    found = stats.quantile_test(values, p=q).confidence_interval(CONFIDENCE)
     return (None if math.isnan(found.low) else float(found.low)), (
         None if math.isnan(found.high) else float(found.high)
     )
 
 
-def runs_for_quantile(q: float, confidence: float = CONFIDENCE) -> int:
+def runs_for_quantile(q: float) -> int:
     """Number of runs from which on the interval of the quantile ``q`` has both ends."""
-    side = 0.5 * (1.0 - confidence)
+    side = 0.5 * (1.0 - CONFIDENCE)
     # the largest of n lies below the quantile with q^n
     return math.ceil(math.log(side) / math.log(max(q, 1.0 - q)))
 
 
-def share_interval(met: int, count: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Clopper and Pearson's interval of a share, ``met`` of ``count``."""
+def share_interval(met: int, count: int) -> tuple[float, float]:
+    """Clopper and Pearson's interval of a share, ``met`` of ``count``.
+
+    Args:
+        met: runs that meet a requirement.
+        count: runs that were judged.
+    """
     if count == 0:
         return 0.0, 1.0
-    side = 0.5 * (1.0 - confidence)
+    side = 0.5 * (1.0 - CONFIDENCE)
     low = float(stats.beta.ppf(side, met, count - met + 1)) if met > 0 else 0.0
     high = float(stats.beta.ppf(1.0 - side, met + 1, count - met)) if met < count else 1.0
     return low, high
@@ -174,3 +365,68 @@ def normality(values: np.ndarray) -> Normality | None:
         return None
     p = float(stats.normaltest(values).pvalue)
     return Normality(float(stats.skew(values)), float(stats.kurtosis(values)), p)
+
+
+FALSE_ALARM = 1e-6
+"""How often noise that is stated rightly, and all that varies, is called impossible; of a response."""
+
+
+@dataclass(frozen=True)
+class NoiseShare:
+    """Noise against all that varies in a response.
+
+    Attributes:
+        response: its name.
+        share: mean of the stated variances over the variance of the runs. By chance somewhat above 1 where nothing
+            but noise varies.
+        chance: how often runs vary as little or less where the stated noise is all there is.
+    """
+
+    response: str
+    share: float
+    chance: float
+
+    @property
+    def possible(self) -> bool:
+        """Whether the stated noise may be a part of what varies."""
+        return self.chance >= FALSE_ALARM
+
+
+def noise_share(response: Response, study: StudySpec) -> NoiseShare | None:
+    """The share of a response, None where its noise is not stated, does not vary or nothing varies.
+
+    Of independent normal noise the sum of squares is chi-square; where the runs differ in noise its degrees of freedom
+    are those of Satterthwaite, Biometrics Bulletin 2, 110 (1946).
+
+    Args:
+        response: whose noise the runs state.
+        study: which says whether runs share their noise.
+    """
+    # noise that all runs have in common is a part of what they do not differ by
+    if response.noise is None or study.noise == "shared" or response.constant:
+        return None
+    stated = response.noise[response.good] ** 2
+    stated = stated[np.isfinite(stated)]
+    if len(stated) < 2 or not np.any(stated):
+        return None
+    share = float(np.mean(stated) / np.var(response.known, ddof=1))
+    freedom = (len(stated) - 1) * float(np.mean(stated) ** 2 / np.mean(stated**2))
+    return NoiseShare(response.name, share, float(stats.chi2.cdf(freedom / share, freedom)))
+
+
+def impossible(runs: StudyRuns) -> InputError | None:
+    """What is wrong with noise that is more than all that varies, each at its key; None where all is possible."""
+    study = runs.study
+    issues: list[Issue] = []
+    for response in runs.responses:
+        one = noise_share(response, study)
+        if one is None or one.possible:
+            continue
+        key = study.responses[one.response].noise
+        assert key is not None
+        times = significant(one.share, 3)
+        text = f"states a variance of noise {times} times that of all runs: not the noise of {one.response}"
+        remedy = "the standard deviation by noise alone, for readings the key that ends in _sigma_noise"
+        found = study.error(text, ("responses", one.response, "noise"), found=key_text(key), allowed=remedy)
+        issues += found.issues
+    return InputError(*issues) if issues else None

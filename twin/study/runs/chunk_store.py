@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from twin.run.durable import PARTIAL, make_folders, sync_folder, write_safely
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult
 from twin.study.runs.plan import Plan
 
 FOLDER, INDEX = "chunks", "index.txt"
@@ -98,8 +98,8 @@ class ChunkStore:
             # written, but not listed before the end: nobody vouches for it
             if left.name not in {entry.file for entry in self.entries.values()}:
                 left.unlink(missing_ok=True)
-        if self.corrupt or self._index_is_damaged(listed):
-            self._rewrite_index()
+        if self.corrupt or self._index() != b"".join(map(_line, listed)):
+            write_safely(self.folder / INDEX, b"".join(map(_line, self.entries.values())))
 
     @property
     def done(self) -> set[int]:
@@ -203,9 +203,6 @@ class ChunkStore:
         except FileNotFoundError:
             return b""
 
-    def _index_is_damaged(self, listed: list[Entry]) -> bool:
-        return self._index() != b"".join(_line(entry) for entry in listed)
-
     def _set_aside(self, entry: Entry) -> None:
         place = self.folder / entry.file
         text = "it is computed again"
@@ -213,9 +210,6 @@ class ChunkStore:
             place.replace(place.with_name(f"{entry.file}.corrupt"))
             text = f"it was moved aside as {entry.file}.corrupt and is computed again"
         self.corrupt.append(f"chunk {entry.file} is corrupt; {text}")
-
-    def _rewrite_index(self) -> None:
-        write_safely(self.folder / INDEX, b"".join(_line(entry) for entry in self.entries.values()))
 
 
 @dataclass(frozen=True)

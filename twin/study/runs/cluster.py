@@ -16,10 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from twin.run.cli import InputErrorText
-from twin.run.ending_signals import ending_later
-from twin.run.provenance import source_digest, versions
-from twin.run.unfinished import scratch
+from twin.run import cli, durable, owned_files, provenance
 from twin.study.runs.task import ONE_THREAD
 
 if TYPE_CHECKING:  # it takes half a second, and a study's file is read before workers are started
@@ -111,7 +108,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     Whoever may send a task to a worker runs programs as its user, and a port of this machine is open to all its users.
     So all speak TLS with a key that is made for the study and kept in memory, and a peer without it is refused.
     """
-    with scratch(SCRATCH) as place, _cluster(count, place) as workers:
+    with owned_files.scratch(SCRATCH) as place, _cluster(count, place) as workers:
         yield workers
 
 
@@ -143,7 +140,7 @@ def _cluster(count: int, place: Path) -> Iterator[Workers]:
     with _kept_environment():
         _silence()
         with dask.config.set(settings), ExitStack() as stack:
-            with ending_later(), _children_deaf_to_ctrl_c():
+            with durable.ending_later(), _children_deaf_to_ctrl_c():
                 cluster = LocalCluster(
                     n_workers=count,
                     threads_per_worker=1,
@@ -222,7 +219,7 @@ def remote_workers(address: str, tell: Callable[[str], None]) -> Iterator[Worker
         except (OSError, TimeoutError, ValueError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             text = f"the scheduler {address} cannot be reached ({reason}); start it with `dask scheduler`"
-            raise InputErrorText(text) from None
+            raise cli.InputErrorText(text) from None
         try:
             workers = Workers(client, False)
             _wait_for_worker(workers, address, tell)
@@ -244,7 +241,9 @@ def _check_address(address: str) -> None:
     except ValueError:
         whole = None
     if not (address.startswith(SCHEMES) and whole):
-        raise InputErrorText(f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786")
+        raise cli.InputErrorText(
+            f"--scheduler {address}: not an address; write it as tls://host:8786 or tcp://host:8786"
+        )
     if not address.startswith(ENCRYPTED):
         return
     from distributed.security import Security
@@ -254,9 +253,9 @@ def _check_address(address: str) -> None:
         known = Security().get_connection_args("client").get("ssl_context")
     except (OSError, ValueError, TypeError) as error:
         text = f"--scheduler {address}: the certificates that Dask is told of cannot be used ({error}); see {names}"
-        raise InputErrorText(text) from None
+        raise cli.InputErrorText(text) from None
     if known is None:
-        raise InputErrorText(f"--scheduler {address}: TLS needs certificates; name them to Dask by {names}")
+        raise cli.InputErrorText(f"--scheduler {address}: TLS needs certificates; name them to Dask by {names}")
 
 
 def _wait_for_worker(workers: Workers, address: str, tell: Callable[[str], None]) -> None:
@@ -286,10 +285,10 @@ def _differences(client: Client) -> list[str]:
     for address, found in theirs.items():
         if isinstance(found, BaseException):
             text = f"the worker {address} cannot import the twin ({found}); start it from the twin's environment"
-            raise InputErrorText(text)
+            raise cli.InputErrorText(text)
         if found[1] != source:
             text = f"the worker {address} has other source files of the twin than this command; install the same there"
-            raise InputErrorText(text)
+            raise cli.InputErrorText(text)
         different = [
             f"{name} {found[0].get(name)} instead of {own}" for name, own in ours.items() if found[0].get(name) != own
         ]
@@ -300,7 +299,7 @@ def _differences(client: Client) -> list[str]:
 
 def _program() -> tuple[dict[str, str], str]:
     """Versions of the packages, checksum of the program's own source files."""
-    return versions(), source_digest()
+    return provenance.versions(), provenance.source_digest()
 
 
 def _silence() -> None:

@@ -10,15 +10,10 @@ from typing import Any
 
 from scenes.specs.study import NOISE, TOTAL
 from scenes.yaml.errors import KeyPath, Problem, key_text
-from twin.run.cli import InputErrorText
 from twin.run.provenance import source_digest
-from twin.study.runs.block_result import check_response
-from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.cluster import ClusterError, Workers, killed
-from twin.study.runs.config_tree import leaf
+from twin.study.runs import base_job, chunk_store, cluster, task
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
-from twin.study.runs.task import OtherProgramError, Pilot, Task, evaluate, pilot
 
 CHUNK_SECONDS = 6.0
 """How long a worker is to be busy with a chunk: what is lost when it dies, against what handing over costs."""
@@ -97,14 +92,14 @@ class Engine:
     """
 
     plan: Plan
-    store: ChunkStore
+    store: chunk_store.ChunkStore
     backend: str = "llvm"
     progress: Progress = field(default_factory=Progress)
     chunk_blocks: int | None = None
     computed: int = 0
     seconds: float = 0.0
 
-    def run(self, workers: Workers, own_memory: float = 0.0) -> None:
+    def run(self, workers: cluster.Workers, own_memory: float = 0.0) -> None:
         """Compute whatever is missing.
 
         Args:
@@ -145,17 +140,17 @@ class Engine:
         self._all(workers, config, chunks)
         self.seconds = time.monotonic() - started
 
-    def _pilot(self, workers: Workers, config: str, block: int) -> Pilot:
+    def _pilot(self, workers: cluster.Workers, config: str, block: int) -> task.Pilot:
         """Do the first block and see whether the results hold what is asked for."""
-        workers.submit(pilot, self._task(config, range(block, block + 1)))
+        workers.submit(task.pilot, self._task(config, range(block, block + 1)))
         future = workers.next_finished()
         if future.status != "finished":
             error = future.exception()
             runs = _runs_text([self.plan.block(block)])
-            if killed(error):
+            if cluster.killed(error):
                 raise IncompleteError(f"the workers died in the first block, {runs}")
             raise _fault(future)
-        first: Pilot = future.result()
+        first: task.Pilot = future.result()
         if first.refusal is not None:
             raise first.refusal
         if first.sample is not None:
@@ -166,7 +161,7 @@ class Engine:
         self.computed += len(first.result.messages)
         return first
 
-    def _all(self, workers: Workers, config: str, chunks: list[range]) -> None:
+    def _all(self, workers: cluster.Workers, config: str, chunks: list[range]) -> None:
         """Compute chunks, never more than a few ahead. One in which workers die is cut into blocks to find which; a
         block is blamed only when it is alone, for the scheduler suspects all that a worker had before it when it died.
         """
@@ -181,7 +176,7 @@ class Engine:
                 alone.add(waiting[0].start)
             while waiting and len(running) < AHEAD * max(1, workers.count):
                 blocks = waiting.pop()
-                future = workers.submit(evaluate, self._task(config, blocks))
+                future = workers.submit(task.evaluate, self._task(config, blocks))
                 running[future.key] = (blocks, future)
             future = workers.next_finished()
             blocks, _ = running.pop(future.key, (range(0), None))
@@ -193,7 +188,7 @@ class Engine:
                 self.progress.done(self.store.runs, self.plan.runs)
                 continue
             error = future.exception()
-            if not killed(error):
+            if not cluster.killed(error):
                 raise _fault(future)
             if len(blocks) > 1:
                 waiting.extend(range(block, block + 1) for block in reversed(blocks))
@@ -205,8 +200,8 @@ class Engine:
         if bad:
             raise IncompleteError(f"not computed: {_runs_text(bad)} (the workers died)")
 
-    def _task(self, config: str, blocks: range) -> Task:
-        return Task(
+    def _task(self, config: str, blocks: range) -> task.Task:
+        return task.Task(
             config,
             source_digest(),
             self.backend,
@@ -218,6 +213,10 @@ class Engine:
 def check_responses(setup: StudySetup, sample: Any) -> None:
     """Check that the results hold every response of a study.
 
+    Args:
+        setup: the study.
+        sample: results of one run, by file.
+
     Raises:
         InputError: one that they do not, with what there is.
     """
@@ -227,7 +226,7 @@ def check_responses(setup: StudySetup, sample: Any) -> None:
             if path is None:
                 continue
             try:
-                check_response(sample, path)
+                base_job.check_response(sample, path)
             except Problem as problem:
                 place: KeyPath = ("responses", name, key)
                 text = f"the results of {setup.study.base.command!r} do not have this: {problem.problem}"
@@ -249,7 +248,7 @@ def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> No
     if named.endswith(NOISE):
         return
     try:
-        leaf(sample, own)
+        base_job.leaf(sample, own)
     except Problem:
         return
     text = "not the noise alone, which stands beside it"
@@ -257,7 +256,13 @@ def _check_noise(setup: StudySetup, sample: Any, name: str, path: KeyPath) -> No
 
 
 def fit_workers(wanted: int, memory: float, least: float) -> int:
-    """As many workers as are wanted and fit into the memory, one at least."""
+    """Number of workers that are wanted and fit into the memory, one at least.
+
+    Args:
+        wanted: number of workers.
+        memory: that they may take, bytes.
+        least: that one takes, bytes.
+    """
     return max(1, min(wanted, int(memory // least)))
 
 
@@ -288,10 +293,7 @@ def _fault(future: Any) -> Exception:
     error = future.exception()
     notes = " ".join(getattr(error, "__notes__", ()))
     text = f"{type(error).__name__}: {error} {notes}".strip()
-    if isinstance(error, OtherProgramError):
+    if isinstance(error, task.OtherProgramError):
         return IncompleteError(text)
     trace = "".join(traceback.format_exception(type(error), error, future.traceback()))
     return ProgramFault(f"the program failed: {text}", trace)
-
-
-__all__ = ["ClusterError", "Engine", "Estimate", "IncompleteError", "InputErrorText", "ProgramFault", "Progress"]

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from scenes.specs.study import GRID
+from scenes.specs.samplers import GRID
 from scenes.yaml.errors import InputError, KeyPath, Problem
 from scenes.yaml.spec import validate
 from scenes.yaml.units import with_unit
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.memory import LIMIT, amount_text, free_memory, largest
-from twin.study.runs.base_job import Run
-from twin.study.runs.config_tree import leaf, with_values
+from twin.study.runs.base_job import Run, leaf, with_values
 from twin.study.runs.sampling import Scaling, draw, extremes, number_of, ratios, run_count, scaled
 from twin.study.runs.setup import StudySetup
 
@@ -194,16 +193,11 @@ def _telling(column: Column, limits: list[float]) -> list[Any]:
     return [low, high]
 
 
-def factor_units(plan: Plan) -> Mapping[str, str]:
-    """Factor -> unit of its values."""
-    return {column.name: column.unit for column in plan.columns}
-
-
 STARTED = 110e6
-"""Of a study of any size when its report is written, beside the imported program, bytes."""
+"""Memory that a study of any size takes when its report is written, beside the imported program, bytes."""
 CELL = 120.0
-"""Of a number of a run: as it is computed and kept, in the data set, and in the table of text that becomes a file;
-bytes."""
+"""Memory that a number of a run takes as it is computed and kept, in the data set, and in the table of text that
+becomes a file; bytes."""
 _KEPT = 5
 """Columns of every study: number, failed, message, doubt, seed."""
 

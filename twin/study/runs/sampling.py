@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri, ndtri_exp
 
-from scenes.specs.study import GRID, FactorSpec, StudySpec, unit_cube
+from scenes.specs.samplers import GRID, unit_cube
+from scenes.specs.study import FactorSpec, StudySpec
 from scenes.yaml.errors import KeyPath, Problem, shown
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
-from twin.study.runs.config_tree import Tree, leaf
+from twin.study.runs.base_job import Tree, leaf
 
 
 def axes_of(study: StudySpec) -> list[tuple[str, ...]]:
@@ -108,6 +109,10 @@ def _far(a: float, b: float, u: np.ndarray) -> np.ndarray:
 def quantiles(factor: FactorSpec, u: np.ndarray) -> np.ndarray:
     """Where the distribution function of a factor of numbers is ``u``; of a list the least of its values where that is
     reached.
+
+    Args:
+        factor: whose values are numbers.
+        u: shares between 0 and 1.
     """
     if factor.kind in _LISTS:
         return np.quantile(np.array(factor.numbers().values, np.float64), u, method="inverted_cdf")
@@ -140,7 +145,12 @@ class Scaling:
 
 
 def scaled(number: tuple[float | int, str], ratio: float) -> Any:
-    """Number and unit, times a ratio, as they stand in a tree."""
+    """Number and unit, times a ratio, as they stand in a tree.
+
+    Args:
+        number: number and unit, the unit empty for a pure number.
+        ratio: that the number is multiplied by.
+    """
     value = number[0] * ratio
     if number[1]:
         return with_unit(value, number[1])
@@ -176,16 +186,25 @@ def _nominal(factor: FactorSpec, tree: Tree, unit: str) -> float:
     if not factor.places:
         return 1.0
     value = leaf(tree, factor.places[0])
-    parts = split_quantity(value)
-    if parts is not None and unit:
-        number = parts[0] * unit_ratio(parts[1], unit)
-    elif parts is None and not unit and isinstance(value, int | float) and not isinstance(value, bool):
-        number = float(value)
-    else:
+    number = number_in(value, unit)
+    if number is None:
         raise Problem("nothing to compare it with", f"{shown(value)} in the base", "a number like the factor's")
     if number == 0.0:
         raise Problem("nothing to compare it with", "zero in the base", "scales in a factor without a key")
     return number
+
+
+def number_in(value: Any, unit: str) -> float | None:
+    """The number of a value in a unit; None where it is no number of that kind.
+
+    Args:
+        value: as it stands in a tree.
+        unit: of the same dimension, empty for pure numbers.
+    """
+    parts = split_quantity(value)
+    if parts is not None:
+        return parts[0] * unit_ratio(parts[1], unit) if unit else None
+    return None if unit or isinstance(value, bool) or not isinstance(value, int | float) else float(value)
 
 
 def number_of(value: Any) -> tuple[float | int, str]:

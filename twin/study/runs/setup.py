@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,30 +16,17 @@ from pydantic import TypeAdapter, ValidationError
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
-from scenes.specs.load import EXAMPLES, LAB, ORBIT, SCENES
+from scenes.specs.load import find_named
+from scenes.specs.procedures import PROCEDURES, studied
 from scenes.specs.study import FactorSpec, Scalar, StudySpec
+from scenes.yaml import yaml_file
 from scenes.yaml.csv_table import lines_of, table_text
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, key_text, names_text, nearest
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
-from scenes.yaml.yaml_file import (
-    LARGEST_BYTES,
-    NO_TEXT,
-    UNWRITABLE,
-    WRITABLE,
-    YamlFile,
-    dump_yaml,
-    parse_yaml,
-    plain_scalar,
-    read_yaml,
-)
 from twin.run.provenance import source_digest, versions
-from twin.study.runs.base_job import BaseJob
-from twin.study.runs.config_tree import Tree, with_place, with_values
-from twin.study.runs.jobs import base_job
+from twin.study.runs.base_job import BaseJob, ProcedureBase, Tree, with_place, with_values
 
-WHERE = {"render": EXAMPLES, "lab": SCENES / LAB, "orbit": SCENES / ORBIT}
-"""First word of a base's command -> folder of the library with its files."""
 BY_NAME = ("instrument", "disturbances")
 """Keys of a job whose files are parts of the resolved base, beside the job; a change of the name would change nothing.
 """
@@ -64,11 +51,11 @@ class StudySetup:
     @cached_property
     def job(self) -> BaseJob:
         """What runs the base."""
-        return base_job(self.study.base.command)
+        return _job(self.study.base.command)
 
     def to_yaml(self) -> str:
         """Text of the study's config.yaml, which ``resolve_study`` reads back to the same values."""
-        return dump_yaml({"study": self.study.plain(), "base": self.tree})
+        return yaml_file.dump_yaml({"study": self.study.plain(), "base": self.tree})
 
     @cached_property
     def content(self) -> str:
@@ -92,10 +79,13 @@ class StudySetup:
         """Something wrong at ``key`` of the study."""
         if isinstance(problem, str):
             return self.study.error(problem, key, allowed=allowed)
+        told = Issue(problem.problem, "", None, (), problem.found, problem.allowed, problem.suggestion)
+        return InputError(self._placed(told, (*key, *problem.within)))
+
+    def _placed(self, issue: Issue, key: KeyPath) -> Issue:
+        """The issue told at ``key`` of the study."""
         source = self.study.source
-        full = (*key, *problem.within)
-        issue = Issue(problem.problem, source.file, source.line(full), (*source.prefix, *full))
-        return InputError(_with(issue, problem.found, problem.allowed, problem.suggestion))
+        return replace(issue, file=source.file, line=source.line(key), key=(*source.prefix, *key))
 
     def factor_at(self, place: KeyPath) -> tuple[str, KeyPath] | None:
         """Name of the factor that changes ``place`` of the base, or something around or below it, and its key."""
@@ -112,18 +102,11 @@ class StudySetup:
         issues = []
         for issue in error.issues:
             found = self.factor_at((*prefix, *issue.key))
-            if found is None:
-                issues.append(issue)
-                continue
-            source = self.study.source
-            text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
-            restated = Issue(text, source.file, source.line(found[1]), (*source.prefix, *found[1]))
-            issues.append(_with(restated, issue.found, issue.allowed, issue.suggestion))
+            if found is not None:
+                text = f"{issue.problem} (at {key_text(issue.key)} of the base)"
+                issue = self._placed(replace(issue, problem=text), found[1])
+            issues.append(issue)
         return InputError(*issues)
-
-
-def _with(issue: Issue, found: str | None, allowed: str | None, suggestion: str | None) -> Issue:
-    return Issue(issue.problem, issue.file, issue.line, issue.key, found, allowed, suggestion)
 
 
 def resolve_study(path: str | Path) -> StudySetup:
@@ -132,7 +115,7 @@ def resolve_study(path: str | Path) -> StudySetup:
     Raises:
         InputError: any of the files cannot be read or is not valid, or a factor's key leads nowhere in the base.
     """
-    return _resolved(read_yaml(path))
+    return _resolved(yaml_file.read_yaml(path))
 
 
 def base_of(setup: StudySetup) -> Spec:
@@ -144,72 +127,62 @@ def base_of(setup: StudySetup) -> Spec:
     source = setup.study.source
     if source.prefix:  # a study's config.yaml holds it
         below = {key[1:]: line for key, line in source.lines.items() if key[:1] == ("base",)}
-        return validate(setup.job.model, YamlFile(source.file, setup.tree, below))
+        return validate(setup.job.model, yaml_file.YamlFile(source.file, setup.tree, below))
     return setup.job.resolve(_base_file(setup.study))
 
 
 def study_from_text(text: str) -> StudySetup:
     """The study that the text of a config.yaml holds, for a worker that shares no files."""
-    return _resolved(parse_yaml(text))
+    return _resolved(yaml_file.parse_yaml(text))
 
 
-def _resolved(yaml: YamlFile) -> StudySetup:
+def _resolved(yaml: yaml_file.YamlFile) -> StudySetup:
     if isinstance(yaml.data, dict) and "study" in yaml.data:
         return _again(yaml)
     study = validate(StudySpec, yaml)
     study = _with_tables(study)
-    job = base_job(study.base.command)
+    job = _job(study.base.command)
     tree = job.resolve(_base_file(study)).plain()
     setup = _placed(study, tree)
     size = len(setup.to_yaml().encode())
-    if size > LARGEST_BYTES:
+    if size > yaml_file.LARGEST_BYTES:
         rows = max((len(f.table.values or ()) for f in study.factors.values() if f.table is not None), default=0)
         allowed = (
-            f"tables of at most {int(rows * LARGEST_BYTES / size)} rows or fewer columns" if rows else "fewer values"
+            f"tables of at most {int(rows * yaml_file.LARGEST_BYTES / size)} rows or fewer columns"
+            if rows
+            else "fewer values"
         )
         raise study.error("the study with its tables is larger than 1 MB", ("factors",), allowed=allowed)
     return setup
 
 
-def _again(yaml: YamlFile) -> StudySetup:
+def _again(yaml: yaml_file.YamlFile) -> StudySetup:
     """From a config.yaml."""
     known = ("study", "base")
     for key in yaml.data:
         if key not in known:
-            issue = Issue("unknown key", yaml.file, yaml.lines.get((key,)), (key,), None, names_text(known))
-            raise InputError(_with(issue, None, names_text(known), nearest(key, known)))
+            line, allowed = yaml.lines.get((key,)), names_text(known)
+            raise InputError(Issue("unknown key", yaml.file, line, (key,), None, allowed, nearest(key, known)))
     if not isinstance(yaml.data.get("base"), dict):
         raise InputError(Issue("the resolved base is missing", yaml.file, 1, ("base",), None, "a study's config.yaml"))
     lines = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("study",)}
-    study = validate(StudySpec, YamlFile(yaml.file, yaml.data["study"], lines))
+    study = validate(StudySpec, yaml_file.YamlFile(yaml.file, yaml.data["study"], lines))
     for name, factor in study.factors.items():
         if factor.table is not None and factor.table.values is None:
             raise study.error("the table's values are missing", ("factors", name, "table"))
     placed = study.with_source(Source(yaml.file, yaml.lines, ("study",)))
     assert isinstance(placed, StudySpec)
     study = placed
-    model = base_job(study.base.command).model
+    model = _job(study.base.command).model
     below = {key[1:]: line for key, line in yaml.lines.items() if key[:1] == ("base",)}
-    validate(model, YamlFile(yaml.file, yaml.data["base"], below))
+    validate(model, yaml_file.YamlFile(yaml.file, yaml.data["base"], below))
     return _placed(study, yaml.data["base"])
 
 
 def _base_file(study: StudySpec) -> Path:
     """The base's file: a path relative to the study's, or a name in the library."""
-    text, folder = study.base.file, WHERE[study.base.command.split()[0]]
-    if "/" in text or text.endswith((".yaml", ".yml")):
-        path = Path(study.source.file).parent / text
-        if not is_file(path):
-            raise study.error(unusable(path), ("base", "file"))
-        return path
-    names = sorted(path.stem for path in folder.glob("*.yaml"))
-    if text not in names:
-        allowed = f"{names_text(names)}, or the path of a .yaml file"
-        suggestion = nearest(text, names)
-        raise study.error(
-            "no such file in the library", ("base", "file"), found=text, allowed=allowed, suggestion=suggestion
-        )
-    return folder / f"{text}.yaml"
+    kind = study.base.command.split()[0]
+    return find_named("examples" if kind == "render" else kind, study.base.file, study, ("base", "file"))
 
 
 def _placed(study: StudySpec, tree: Tree) -> StudySetup:
@@ -292,7 +265,7 @@ def _with_tables(study: StudySpec) -> StudySpec:
 LARGEST_TABLE = 100_000_000
 """Bytes of a table's file, of which a study takes some columns."""
 MOST_CELLS = 90_000
-"""Of all tables together: the study's config.yaml holds them, and has room for 100 000 keys and values in 1 MB."""
+"""Cells of all tables together: config.yaml of the study holds them, and has room for 100 000 keys and values."""
 
 
 def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, KeyPath]) -> dict[str, list[Any]]:
@@ -312,8 +285,10 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
             raise study.error(
                 text, (*named[missing], "column"), found=missing, allowed=names_text(heads), suggestion=meant
             )
-        if any(UNWRITABLE.search(head) for head in heads):
-            raise study.error(f"row 1 of the table {path}: {NO_TEXT}", (*key, "file"), allowed=WRITABLE)
+        if any(yaml_file.UNWRITABLE.search(head) for head in heads):
+            raise study.error(
+                f"row 1 of the table {path}: {yaml_file.NO_TEXT}", (*key, "file"), allowed=yaml_file.WRITABLE
+            )
         # of columns of one name the last
         places = {head: k for k, head in enumerate(heads) if head in named}
         columns = {head: [] for head in places}
@@ -326,8 +301,10 @@ def _read_table(study: StudySpec, path: Path, key: KeyPath, named: Mapping[str, 
                 text = f"the table {path} has too many rows for a study"
                 allowed = f"at most {most} with {len(places)} of its columns; draw from a distribution beyond that"
                 raise study.error(text, (*key, "file"), allowed=allowed)
-            if any(UNWRITABLE.search(row[k]) for k in places.values()):
-                raise study.error(f"row {number} of the table {path}: {NO_TEXT}", (*key, "file"), allowed=WRITABLE)
+            if any(yaml_file.UNWRITABLE.search(row[k]) for k in places.values()):
+                raise study.error(
+                    f"row {number} of the table {path}: {yaml_file.NO_TEXT}", (*key, "file"), allowed=yaml_file.WRITABLE
+                )
             for head, k in places.items():
                 columns[head].append(_cell(row[k]))
     except csv.Error as error:
@@ -347,8 +324,25 @@ def _cell(text: str) -> Any:
     """A cell as YAML would read it: number, true, false or text."""
     try:
         if _PLAIN.fullmatch(text):
-            return _SCALAR.validate_python(plain_scalar(text.strip()))
-        data = parse_yaml(f"- {json.dumps(text) if ':' in text or '#' in text else text}").data[0]
+            return _SCALAR.validate_python(yaml_file.plain_scalar(text.strip()))
+        data = yaml_file.parse_yaml(f"- {json.dumps(text) if ':' in text or '#' in text else text}").data[0]
         return _SCALAR.validate_python(data)
     except (InputError, ValidationError):
         return text
+
+
+def _job(command: str) -> BaseJob:
+    """The job of that name: ``render``, or a test of `PROCEDURES` that can be varied.
+
+    Raises:
+        InputError: this version of the twin does not have it.
+    """
+    if command == "render":
+        # a study imports only what its own base needs: a worker then starts in half the time
+        from twin.study.runs.render_base import RenderBase
+
+        return RenderBase()
+    if command not in studied():
+        allowed = ", ".join(("render", *studied()))
+        raise InputError(Issue(f"this version of the twin cannot run {command!r} in a study", allowed=allowed))
+    return ProcedureBase(PROCEDURES[command])

@@ -8,48 +8,20 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, TextIO
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from twin.run.durable import PARTIAL, make_folders, put_in_place, sync_folder, write_all_safely, write_safely
-from twin.run.ending_signals import ending_later
-from twin.run.owned_files import (
-    MANIFEST,
-    STUDY_LOCK,
-    STUDY_STATE,
-    SUCCEEDS,
-    WRITTEN,
-    digest,
-    every_file,
-    foreign_files,
-    is_study,
-    manifest_digest,
-    remove_study,
-    succeeds,
-)
+from twin.run import durable, owned_files, run_folder
 from twin.run.provenance import sources, versions
-from twin.run.run_folder import (
-    NAMED,
-    Numbered,
-    RunFolderError,
-    json_text,
-    read_manifest,
-    reason,
-    refuse_others,
-    remove_replaced,
-    remove_run,
-    unlisted,
-)
-from twin.run.unfinished import OLD, Unfinished, successor, sweep
+from twin.run.run_folder import Numbered, RunFolderError
 from twin.study.runs.chunk_store import FOLDER, INDEX
 from twin.study.runs.setup import StudySetup
 
 PROGRAM = "twin.study"
 
 
-class StudyState(BaseModel):
+class _StudyState(BaseModel):
     """What the folder of a study says of it from its beginning.
 
     Attributes:
@@ -71,8 +43,8 @@ class StudyState(BaseModel):
     sources: dict[str, str]
 
     @classmethod
-    def of(cls, setup: StudySetup) -> StudyState:
-        """Of a study run by this program."""
+    def of(cls, setup: StudySetup) -> _StudyState:
+        """State of a study that this program runs."""
         return cls(
             program="twin.study",
             name=setup.study.name,
@@ -129,17 +101,17 @@ class StudyFolder:
     def __enter__(self) -> StudyFolder:
         """Make the folder or take it up, and lock it."""
         try:
-            make_folders(self.target.parent)
-            sweep(self.target.parent, remove_replaced)
+            durable.make_folders(self.target.parent)
+            owned_files.sweep(self.target.parent, run_folder.remove_replaced)
             if self._numbered is None:
                 self._choose()
             if self._numbered is not None or not self.path.exists():
                 self._make()
                 self._fresh = True
             self._take_lock(self.path)
-            for left in (place for place in every_file(self.path) if place.endswith(PARTIAL)):
+            for left in (place for place in owned_files.every_file(self.path) if place.endswith(durable.PARTIAL)):
                 (self.path / left).unlink(missing_ok=True)
-            if (self.path / STUDY_STATE).exists():
+            if (self.path / owned_files.STUDY_STATE).exists():
                 self._check_identity()
             else:
                 self._fresh = True
@@ -148,22 +120,20 @@ class StudyFolder:
         except BaseException as error:
             self._leave()
             if isinstance(error, OSError):
-                raise RunFolderError(f"cannot use the folder {self.target}: {reason(error)}") from error
+                raise RunFolderError(f"cannot use the folder {self.target}: {run_folder.reason(error)}") from error
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Unlock; a complete study is put in place, one of which nothing has been done is removed."""
         self._leave()
 
     def _leave(self) -> None:
         try:
             if self._fresh and not self.resumable:
-                remove_study(self.path)
+                owned_files.remove_study(self.path)
             elif self._working and self.complete:
-                (self.path / WRITTEN).unlink(missing_ok=True)
+                (self.path / owned_files.WRITTEN).unlink(missing_ok=True)
                 if self.path != self.target:
                     self._put_in_place()
         finally:
@@ -173,46 +143,46 @@ class StudyFolder:
 
     def _put_in_place(self) -> None:
         try:
-            with ending_later():
+            with durable.ending_later():
                 if not self.target.exists():
                     self.path.rename(self.target)
-                    sync_folder(self.target.parent)
+                    durable.sync_folder(self.target.parent)
                 else:
                     self._check_succession()
-                    beside = Unfinished(self.target)
+                    beside = owned_files.Unfinished(self.target)
                     try:
-                        put_in_place(self.path, self.target, beside.path(OLD))
+                        durable.put_in_place(self.path, self.target, beside.path(owned_files.OLD))
                         with suppress(OSError):  # the next run beside it tries again
-                            remove_run(beside.path(OLD), self.target)
+                            run_folder.remove_run(beside.path(owned_files.OLD), self.target)
                     finally:
                         beside.close()
-                (self.target / SUCCEEDS).unlink(missing_ok=True)
+                (self.target / owned_files.SUCCEEDS).unlink(missing_ok=True)
                 self.path = self.target
         except OSError as error:
-            text = f"the study is complete in {self.path} and cannot be put in place of {self.target}: {reason(error)}"
-            raise RunFolderError(f"{text}; try again with --resume") from error
+            text = f"the study is complete in {self.path} and cannot be put in place of {self.target}"
+            raise RunFolderError(f"{text}: {run_folder.reason(error)}; try again with --resume") from error
 
     @property
     def complete(self) -> bool:
         """Whether the study has been finished."""
-        return (self.path / MANIFEST).exists()
+        return (self.path / owned_files.MANIFEST).exists()
 
     @property
     def resumable(self) -> bool:
         """Whether --resume has something to go on with."""
-        return any(place.exists() for place in (self.path / FOLDER / INDEX, self.path / MANIFEST))
+        return any(place.exists() for place in (self.path / FOLDER / INDEX, self.path / owned_files.MANIFEST))
 
     def _choose(self) -> None:
         """Check what is there, and choose where to work: in the target itself, or in what is to take its place."""
-        waiting = successor(self.target)
-        if waiting.exists() and self.target.exists() and succeeds(self.target, waiting):
+        waiting = owned_files.successor(self.target)
+        if waiting.exists() and self.target.exists() and owned_files.succeeds(self.target, waiting):
             # killed when the two had just changed places
-            remove_run(waiting, self.target)
-            (self.target / SUCCEEDS).unlink(missing_ok=True)
-        if waiting.exists() and not (waiting / STUDY_STATE).exists():
+            run_folder.remove_run(waiting, self.target)
+            (self.target / owned_files.SUCCEEDS).unlink(missing_ok=True)
+        if waiting.exists() and not (waiting / owned_files.STUDY_STATE).exists():
             # killed before it had begun
             self._take_lock(waiting)
-            remove_study(waiting)
+            owned_files.remove_study(waiting)
         there = self._holds_something()
         if not there and not waiting.exists():
             return
@@ -220,7 +190,7 @@ class StudyFolder:
             self.path = waiting if waiting.exists() else self.target
             self._check_resumed()
         elif not self.force:
-            study = waiting.exists() or (self.target / STUDY_STATE).exists()
+            study = waiting.exists() or (self.target / owned_files.STUDY_STATE).exists()
             also = ", go on with it with --resume," if study else ""
             raise RunFolderError(
                 f"output folder {self.target} exists{_begun(waiting)}; choose another with --out{also} or replace it "
@@ -230,10 +200,10 @@ class StudyFolder:
             self._check_replaced(waiting)
             if waiting.exists():
                 self._take_lock(waiting)
-                remove_study(waiting)
+                owned_files.remove_study(waiting)
             if there:
                 self.path = waiting
-        if self.path == waiting and is_study(self.target):
+        if self.path == waiting and owned_files.is_study(self.target):
             self._take_lock(self.target)
 
     def _holds_something(self) -> bool:
@@ -242,20 +212,20 @@ class StudyFolder:
             return False
         if not self.target.is_dir():
             raise RunFolderError(f"output {self.target} exists and is not a folder; choose another with --out")
-        return any(path.name != STUDY_LOCK for path in self.target.iterdir())
+        return any(path.name != owned_files.STUDY_LOCK for path in self.target.iterdir())
 
     def _check_resumed(self) -> None:
         """What is gone on with must be a study's, and its results as it wrote them, for they are written anew."""
-        if not (self.path / STUDY_STATE).exists():
+        if not (self.path / owned_files.STUDY_STATE).exists():
             raise RunFolderError(f"{self.path} is not the folder of a study, so there is nothing to resume")
         if self.path != self.target and self.target.exists():
             self._check_succession()
-        manifest = read_manifest(self.path)
+        manifest = run_folder.read_manifest(self.path)
         own = {*manifest.sha256} if manifest is not None else set()
-        if changed := sorted(own & {*(unlisted(self.path) or ())}):
+        if changed := sorted(own & {*(run_folder.unlisted(self.path) or ())}):
             raise RunFolderError(
-                f"{self.path} holds files that were changed since: {', '.join(changed[:NAMED])}; --resume writes them "
-                "anew, so move or rename them"
+                f"{self.path} holds files that were changed since: {owned_files.first_names(changed)}; --resume writes "
+                "them anew, so move or rename them"
             )
 
     def _check_replaced(self, waiting: Path) -> None:
@@ -263,17 +233,17 @@ class StudyFolder:
         for place in (self.target, waiting):
             if not place.exists() or not any(place.iterdir()):
                 continue
-            others = unlisted(place)
+            others = run_folder.unlisted(place)
             if others is None:
                 raise RunFolderError(
                     f"output folder {place} is not the folder of a study or run, so --force does not replace it; "
                     "choose another with --out"
                 )
-            refuse_others(place, others)
+            run_folder.refuse_others(place, others)
 
     def _check_succession(self) -> None:
         """Replace only what --force was said of."""
-        if not succeeds(self.path, self.target):
+        if not owned_files.succeeds(self.path, self.target):
             raise RunFolderError(
                 f"{self.target} holds another run than the one that the study in {self.path} was to replace; move one "
                 "of them away"
@@ -289,12 +259,12 @@ class StudyFolder:
                 if self._numbered is None:
                     raise
                 self.path = self.target = self._numbered.free()
-        sync_folder(self.path.parent)
+        durable.sync_folder(self.path.parent)
         if self.path != self.target:
-            write_safely(self.path / SUCCEEDS, manifest_digest(self.target).encode())
+            durable.write_safely(self.path / owned_files.SUCCEEDS, owned_files.manifest_digest(self.target).encode())
 
     def _take_lock(self, folder: Path) -> None:
-        lock = (folder / STUDY_LOCK).open("a+", encoding="utf-8")
+        lock = (folder / owned_files.STUDY_LOCK).open("a+", encoding="utf-8")
         self._locks.append(lock)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -304,11 +274,13 @@ class StudyFolder:
     def _check_identity(self) -> None:
         """Refuse to go on with what another study, or another program, has begun: their numbers do not mix."""
         try:
-            found = StudyState.model_validate_json((self.path / STUDY_STATE).read_bytes())
+            found = _StudyState.model_validate_json((self.path / owned_files.STUDY_STATE).read_bytes())
         except ValidationError:
-            text = f"{self.path / STUDY_STATE} cannot be read, or is of an older version; start again with --force"
-            raise RunFolderError(text) from None
-        own = StudyState.of(self.setup)
+            raise RunFolderError(
+                f"{self.path / owned_files.STUDY_STATE} cannot be read, or is of an older version; start again with "
+                "--force"
+            ) from None
+        own = _StudyState.of(self.setup)
         remedy = "start again in another folder with --out, or replace this one with --force"
         if found.content != own.content:
             text = f"{self.path} holds another study: its factors, design or base differ; {remedy}"
@@ -318,7 +290,7 @@ class StudyFolder:
             *_differences(found.sources, own.sources, lambda name, old, new: name),
         ]
         if changed or found.fingerprint != own.fingerprint:
-            named = ", ".join(changed[:NAMED]) + (f" and {len(changed) - NAMED} more" if len(changed) > NAMED else "")
+            named = owned_files.first_names(changed)
             raise RunFolderError(
                 f"{self.path} was begun with another version of the program, whose numbers would stand beside new ones "
                 f"(changed: {named}); go on with the program as it was, or {remedy}"
@@ -326,28 +298,28 @@ class StudyFolder:
 
     def _begin(self) -> None:
         self.write("config.yaml", self.setup.to_yaml().encode())
-        self.write(STUDY_STATE, (StudyState.of(self.setup).model_dump_json(indent=2) + "\n").encode())
+        self.write(owned_files.STUDY_STATE, (_StudyState.of(self.setup).model_dump_json(indent=2) + "\n").encode())
 
     def write(self, name: str, content: bytes) -> None:
         """Write a file so that under its name it is whole or not there."""
         self.write_all({name: content})
 
     def write_all(self, files: Mapping[str, bytes]) -> None:
-        """As ``write``, several at once, by their paths in the folder.
+        """Write several files at once, each whole or not there, by their paths in the folder.
 
         Raises:
             OSError: the disk is full, or gone; some may be there.
         """
         lines = [f"{hashlib.sha256(content).hexdigest()} {name}\n" for name, content in files.items()]
-        if [*files] != [MANIFEST]:
+        if [*files] != [owned_files.MANIFEST]:
             self._account(lines)
         for folder in {(self.path / name).parent for name in files}:
-            make_folders(folder)
-        write_all_safely((self.path / name, content) for name, content in files.items())
+            durable.make_folders(folder)
+        durable.write_all_safely((self.path / name, content) for name, content in files.items())
 
     def _account(self, lines: Sequence[str]) -> None:
         """Keep account of what is written next."""
-        with (self.path / WRITTEN).open("a", encoding="utf-8") as account:
+        with (self.path / owned_files.WRITTEN).open("a", encoding="utf-8") as account:
             # a line that was half written when the power failed is ended
             account.writelines(["\n", *lines])
             account.flush()
@@ -355,29 +327,29 @@ class StudyFolder:
 
     def begin_results(self) -> None:
         """Results are written anew: until their manifest is, the folder is not a complete study's."""
-        manifest = read_manifest(self.path)
+        manifest = run_folder.read_manifest(self.path)
         if manifest is not None:
             self._account([f"{check} {name}\n" for name, check in manifest.sha256.items()])
-        (self.path / MANIFEST).unlink(missing_ok=True)
-        sync_folder(self.path)
+        (self.path / owned_files.MANIFEST).unlink(missing_ok=True)
+        durable.sync_folder(self.path)
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove files that the study has written; what somebody has put there or changed stays."""
-        others = {*(foreign_files(self.path, None) or ())}
+        others = {*(owned_files.foreign_files(self.path, None) or ())}
         for name in names:
             if name not in others:
                 (self.path / name).unlink(missing_ok=True)
 
     def write_json(self, name: str, data: Any) -> None:
         """Write plain data."""
-        self.write(name, json_text(data).encode())
+        self.write(name, run_folder.json_text(data).encode())
 
     def checksums(self) -> dict[str, str]:
         """SHA-256 of every file of the result; chunks have their own in their index."""
         out = {}
         for file in sorted(self.path.rglob("*")):
             name = file.relative_to(self.path).as_posix()
-            inside = name.split("/")[0] == FOLDER or file.name.startswith(".") or name == MANIFEST
+            inside = name.split("/")[0] == FOLDER or file.name.startswith(".") or name == owned_files.MANIFEST
             if file.is_file() and not inside:
-                out[name] = digest(file)
+                out[name] = owned_files.digest(file)
         return out

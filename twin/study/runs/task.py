@@ -13,9 +13,9 @@ from typing import Any
 from optics.numerics.backend import Backend, load_backend
 from optics.numerics.threads import LIMIT, kernel_threads
 from scenes.yaml.errors import InputError
+from twin.run.memory import largest_memory
 from twin.run.provenance import source_digest
-from twin.study.runs.base_job import Failure, Run
-from twin.study.runs.block_result import BlockResult
+from twin.study.runs.base_job import BlockResult, Failure, Run
 from twin.study.runs.setup import StudySetup, study_from_text
 
 ONE_THREAD = {
@@ -93,7 +93,7 @@ def pilot(task: Task) -> Pilot:
         first = time.monotonic() - start
         if first > 0.5 and result.seconds < LONGEST_REPEAT:
             result, sample = _block(setup, backend, task.blocks[0])
-        return Pilot(result, sample, max(0.0, first - result.seconds), _largest_memory())
+        return Pilot(result, sample, max(0.0, first - result.seconds), largest_memory())
 
 
 LONGEST_REPEAT = 4.0
@@ -118,7 +118,7 @@ class OtherProgramError(Exception):
 def _prepared(task: Task) -> tuple[StudySetup, Backend]:
     if task.source != source_digest():
         raise OtherProgramError("the worker has other source files than the command: changed since it was started?")
-    one_thread()
+    _one_thread()
     return _setup(task.config), load_backend(task.backend)
 
 
@@ -127,7 +127,7 @@ def _setup(config: str) -> StudySetup:
     return study_from_text(config)
 
 
-def one_thread() -> None:
+def _one_thread() -> None:
     """Let this process do everything on the thread that asks for it; workers are as many as there are cores.
 
     For workers that somebody else has started the environment comes too late, so the libraries are told as well; again
@@ -145,10 +145,3 @@ def one_thread() -> None:
     ThreadpoolController().limit(limits=1)
     cv2.setNumThreads(1)
     kernel_threads(1)
-
-
-def _largest_memory() -> float:
-    """Largest resident memory of this process so far, bytes."""
-    import resource
-
-    return 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

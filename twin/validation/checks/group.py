@@ -8,7 +8,7 @@ number, or the dotted key of one in the same file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, nearest
 from scenes.yaml.spec import Number, Spec, Text, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Artefact
+from twin.run.artefact import Artefact, Cell, SvgFigure, Table
 from twin.validation.checks.check import Check, CheckResult
 
 
@@ -94,6 +94,22 @@ class Context:
         if any((artefact.name, artefact.kind) == (other.name, other.kind) for other in self.artefacts):
             raise ValueError(f"two artefacts {artefact.name}.{artefact.kind} in one group")
         self.artefacts.append(artefact)
+
+    def figure(self, name: str, title: str, caption: str, svg: str) -> None:
+        """Add a drawing; arguments as of `SvgFigure`."""
+        self.add(SvgFigure(name, title, caption, svg))
+
+    def table(
+        self,
+        name: str,
+        title: str,
+        caption: str,
+        heads: Sequence[str],
+        rows: Sequence[Sequence[Cell]],
+        decimals: Sequence[int | None] = (),
+    ) -> None:
+        """Add a table; arguments as of `Table`."""
+        self.add(Table(name, title, caption, heads, rows, decimals))
 
 
 Run = Callable[[Context], Iterable[CheckResult]]

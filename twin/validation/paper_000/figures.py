@@ -7,7 +7,7 @@ at most a quarter of the largest, and a slope that grows as one that grows by 5 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -18,7 +18,6 @@ from analysis.orbit.planes import Method, Strip
 from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from twin.orbit.angle.angle_flight import AnglePass, Measurement
-from twin.run.artefact import SvgFigure, Table
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import Check, CheckResult, Chosen, Supposed, mean_of
 from twin.validation.checks.group import Context, group_of, load_printed
@@ -327,7 +326,7 @@ def _single(context: Context, passes: Passes) -> CheckResult:
 
     def moved(strip: Strip) -> float:
         other = {**m.strips, "forward": strip}
-        planes = planes_of(Measurement(m.station, other, m.tangent, m.along, m.look, m.offset, m.bow), "corrected")
+        planes = planes_of(replace(m, strips=other), "corrected")
         return float(intersection_angles(*planes).values[0] - base)
 
     forward = m.strips["forward"]
@@ -382,50 +381,42 @@ def _readings(context: Context) -> list[tuple[str, str, int, int]]:
 
 def _show(context: Context, shown: Answers, places: Mapping[tuple[float, float], Answers]) -> None:
     for name, panels in PANELS.items():
-        context.add(
-            SvgFigure(
-                name,
-                TITLES[name],
-                "Change of the angle by planes when one coordinate is wrong by 0 to 10 m, Earth-fixed axes, one "
-                "measurement. The paper's ordinate, resection minus planes, is minus this but for a constant.",
-                sensitivity_svg(shown.amount, shown.change, panels),
-            )
+        context.figure(
+            name,
+            TITLES[name],
+            "Change of the angle by planes when one coordinate is wrong by 0 to 10 m, Earth-fixed axes, one "
+            "measurement. The paper's ordinate, resection minus planes, is minus this but for a constant.",
+            sensitivity_svg(shown.amount, shown.change, panels),
         )
     held = {place: sum(s.holds(a.rises, a.growth) for s in SENTENCES) for place, a in places.items()}
-    context.add(
-        SvgFigure(
-            "places",
-            "Where the paper's pass can have been",
-            f"How many of the {len(SENTENCES)} sentences on Figs. 3 to 5 hold on a descending pass, by its place; the "
-            "two on growing slopes hold nowhere. Circles: 40° N 116° E, where the checks are made, and 45° N 120° E.",
-            places_svg(held, len(SENTENCES), {"test": (40.0, 116.0), "elsewhere": ELSEWHERE}),
-        )
+    context.figure(
+        "places",
+        "Where the paper's pass can have been",
+        f"How many of the {len(SENTENCES)} sentences on Figs. 3 to 5 hold on a descending pass, by its place; the "
+        "two on growing slopes hold nowhere. Circles: 40° N 116° E, where the checks are made, and 45° N 120° E.",
+        places_svg(held, len(SENTENCES), {"test": (40.0, 116.0), "elsewhere": ELSEWHERE}),
     )
-    context.add(
-        Table(
-            "readings",
-            "What x, y and z can mean",
-            f"How many of the {len(SENTENCES)} sentences hold over 40° N 116° E; the paper names neither frame "
-            "nor direction.",
-            ("axes", "pass", "of the angle", "of the figures' ordinate"),
-            _readings(context),
-            (None, None, 0, 0),
-        )
+    context.table(
+        "readings",
+        "What x, y and z can mean",
+        f"How many of the {len(SENTENCES)} sentences hold over 40° N 116° E; the paper names neither frame "
+        "nor direction.",
+        ("axes", "pass", "of the angle", "of the figures' ordinate"),
+        _readings(context),
+        (None, None, 0, 0),
     )
     rows = [
         (what, axis, *(float(shown.rises[what, angle, axis]) for angle in ("alpha", "beta")))
         for what in ("station", "forward", "nadir", "aft")
         for axis in AXES
     ]
-    context.add(
-        Table(
-            "changes",
-            "Change of the angles for 10 m",
-            "One measurement at 40° N 116° E, planes fitted anew; Earth-fixed axes.",
-            ("moved", "axis", "α, arcsec", "β, arcsec"),
-            rows,
-            (None, None, 3, 3),
-        )
+    context.table(
+        "changes",
+        "Change of the angles for 10 m",
+        "One measurement at 40° N 116° E, planes fitted anew; Earth-fixed axes.",
+        ("moved", "axis", "α, arcsec", "β, arcsec"),
+        rows,
+        (None, None, 3, 3),
     )
 
 

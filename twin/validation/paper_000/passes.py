@@ -48,7 +48,7 @@ class Passes:
     @cached_property
     def sections(self) -> tuple[Resection, ...]:
         """Space resection of every measurement."""
-        return tuple(resected(m, self.flight) for m in self.measured)
+        return tuple(resected(m) for m in self.measured)
 
     def normal(self, line: str) -> np.ndarray:
         """True unit normal of a line's plane, (3,), ITRS, its z component negative like the paper's (a0, a1, -1).

@@ -181,7 +181,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
 
 def _outlook(context: Context, passes: Passes) -> Iterator[CheckResult]:
     flight = passes.flight
-    along = np.array([sighted(m, s, flight)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)])
+    along = np.array([sighted(m, s)[1].values for m, s in zip(passes.measured, passes.sections, strict=True)])
     many = f"{len(along)} measurements, 60 points of 1.5 m a line, station 0.5 m"
     names = list(flight.pairs)
     for name in ("high_resolution", "multispectral"):

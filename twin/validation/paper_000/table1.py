@@ -16,7 +16,6 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.angle import LINES
 from twin.orbit.angle.angle_flight import Measurement
 from twin.orbit.angle.angle_run import effect_rows, values_of
-from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import SIGMAS, CheckResult, Chosen
 from twin.validation.checks.group import Context, group_of, load_printed
@@ -126,14 +125,12 @@ def run(context: Context) -> Iterator[CheckResult]:
     yield _pair(context, data, own)
     yield from _accuracy(context, data)
     context.progress(0.9, "draw")
-    context.add(
-        SvgFigure(
-            "table1",
-            "Table 1: resection minus planes",
-            f"Points of {POINT_SIGMA:.1f} m for points of their own, of 1.5 m for the same points. Table 1 does not "
-            "say which angle is subtracted; the sign here is that of Figs. 3 to 5.",
-            differences_svg(same.values, own.values, (ALPHA, BETA)),
-        )
+    context.figure(
+        "table1",
+        "Table 1: resection minus planes",
+        f"Points of {POINT_SIGMA:.1f} m for points of their own, of 1.5 m for the same points. Table 1 does not "
+        "say which angle is subtracted; the sign here is that of Figs. 3 to 5.",
+        differences_svg(same.values, own.values, (ALPHA, BETA)),
     )
 
 

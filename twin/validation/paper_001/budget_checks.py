@@ -8,7 +8,7 @@ from math import hypot, log, sqrt
 
 from analysis.units import ARCSEC
 from twin.monitor.simulated_budget import BudgetLine, Together
-from twin.run.artefact import Cell, Data, SvgFigure, Table
+from twin.run.artefact import Cell, Data
 from twin.run.svg import BLUE, INK, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import SIGMAS, CheckResult, Chosen, Supposed
 from twin.validation.checks.group import Context, group_of
@@ -166,14 +166,12 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
         rows.append([texts[name], f"{TABLE_3[name]:g}", f"{line.three_sigma / ARCSEC:.4f}",
                      f"{line.sigma / ARCSEC:.4f}", f"{line.value:.4g} {line.unit}",
                      f"{line.allowed:.3g} {line.unit}"])  # fmt: skip
-    context.add(
-        Table(
-            "table3",
-            "Table 3 by mechanism, and what each line would allow",
-            "Error of one spot per axis, 3σ, arcsec. Last column: the input at which the line alone is 0.1 arcsec.",
-            ("line", "printed", "simulated", "sigma", "input, 3σ", "allowed for 0.1 arcsec"),
-            rows,
-        )
+    context.table(
+        "table3",
+        "Table 3 by mechanism, and what each line would allow",
+        "Error of one spot per axis, 3σ, arcsec. Last column: the input at which the line alone is 0.1 arcsec.",
+        ("line", "printed", "simulated", "sigma", "input, 3σ", "allowed for 0.1 arcsec"),
+        rows,
     )
     data = {n: {"three_sigma_arcsec": l.three_sigma / ARCSEC, "sigma_arcsec": l.sigma / ARCSEC, "input": l.value,
                 "unit": l.unit, "input_for_0.1_arcsec": l.allowed} for n, l in lines.items()}  # fmt: skip  # noqa: E741
@@ -182,7 +180,7 @@ def _show(context: Context, lines: dict[str, BudgetLine]) -> None:
     caption = (
         "Printed and simulated error of one spot, 3σ, on a logarithmic scale; bars: three sigma of the simulation."
     )
-    context.add(SvgFigure("table3-figure", "Table 3, printed and simulated", caption, budget_svg(shown)))
+    context.figure("table3-figure", "Table 3, printed and simulated", caption, budget_svg(shown))
 
 
 _TABLE_4 = budget.TABLE_4 * ARCSEC
@@ -300,15 +298,13 @@ def _show_errors(context: Context, images: BudgetImages, together: Together) -> 
         printed = context.check(f"001.table5.{name}").printed
         rows.append([f"{text} [{unit}]", f"{printed:g}", f"{formula[name] / size:.3g}",
                      *(f"{value:.4g} ± {sigma:.2g}" for value, sigma in cells)])  # fmt: skip
-    context.add(
-        Table(
-            "table5",
-            "Table 5: errors of the monitored parameters, 3σ",
-            "By formula: the printed factors times the simulated error of one spot, spots taken as independent. Monte "
-            "Carlo: all causes at once, through images and each estimator.",
-            ("parameter", "printed", "by formula", "Monte Carlo, (2) (3) (5) (7)", "Table 1, joint", "corrected"),
-            rows,
-        )
+    context.table(
+        "table5",
+        "Table 5: errors of the monitored parameters, 3σ",
+        "By formula: the printed factors times the simulated error of one spot, spots taken as independent. Monte "
+        "Carlo: all causes at once, through images and each estimator.",
+        ("parameter", "printed", "by formula", "Monte Carlo, (2) (3) (5) (7)", "Table 1, joint", "corrected"),
+        rows,
     )
 
 

@@ -18,20 +18,10 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from twin.run.artefact import Cell, Table
+from twin.run.artefact import Cell
 from twin.validation.checks.check import Check, CheckResult
 from twin.validation.checks.group import Context, group_of
-from twin.validation.paper_001.formulas_images import (
-    FACE,
-    FRAMES,
-    PISTON,
-    SCALE,
-    SHIFT,
-    TURN,
-    Ratio,
-    SingleMotions,
-    show_ratios,
-)
+from twin.validation.paper_001 import formulas_images as motions
 
 MIRROR_TURNS = tuple(math.radians(angle) for angle in (1 / 3600, 1 / 60, 0.5, 2.0, 10.0))
 INSTRUMENT = "monitor_pair"
@@ -88,10 +78,10 @@ def run(context: Context) -> Iterator[CheckResult]:
         _show(context, shown)
 
 
-def measured(context: Context) -> SingleMotions:
+def measured(context: Context) -> motions.SingleMotions:
     """The images of all motions and their spots."""
     experiment = context.experiment(INSTRUMENT)
-    return SingleMotions(experiment, context.seed, lambda done, text: context.progress(0.2 + 0.6 * done, text))
+    return motions.SingleMotions(experiment, context.seed, lambda done, text: context.progress(0.2 + 0.6 * done, text))
 
 
 @dataclass(frozen=True)
@@ -99,7 +89,7 @@ class _Finding:
     """What the images say for one check, before it is evaluated; equations that say the same share a check."""
 
     id: str
-    ratio: Ratio
+    ratio: motions.Ratio
     how: str
     explained: tuple[float | None, ...] = ()
     implied: float | None = None
@@ -117,27 +107,27 @@ def without_cos2(geometry: MonitorGeometry, local: float) -> float:
     return math.cos(geometry.field_beta_rad) ** 2 * local
 
 
-def _findings(images: SingleMotions) -> Iterator[_Finding]:
+def _findings(images: motions.SingleMotions) -> Iterator[_Finding]:
     geometry = images.first
     f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
     cos2 = math.cos(geometry.field_beta_rad) ** 2
     field = f"{math.degrees(geometry.field_beta_rad):.2f}°"
-    rendered = f"{FRAMES} frames of {INSTRUMENT} before and after"
+    rendered = f"{motions.FRAMES} frames of {INSTRUMENT} before and after"
     both = {direction: images.displacement(direction) for direction in ("along", "across")}
     far = max(both.values(), key=lambda ratio: abs(ratio.value - 1.0))
     yield _Finding(
         "001.eq1.displacement",
         far,
-        f"{rendered} a turn of each return face by {FACE / ARCSEC:g} arcsec, θ about either axis, the f of that "
-        f"direction: {both['along'].value:.5f} along the line, {both['across'].value:.5f} across; the one farther from "
-        f"1 counts. At the area CCDs' field of {field} the tangent alone gives 1/cos²β = {1 / cos2:.5f} along the "
+        f"{rendered} a turn of each return face by {motions.FACE / ARCSEC:g} arcsec, θ about either axis, the f of "
+        f"that direction: {both['along'].value:.5f} along the line, {both['across'].value:.5f} across; the one farther "
+        f"from 1 counts. At the area CCDs' field of {field} the tangent alone gives 1/cos²β = {1 / cos2:.5f} along the "
         "line; the rest is distortion.",
     )
     yield _Finding(
         "001.eq2",
         images.over_truth("along Y", "paper_single", "d_beta"),
-        f"{rendered} a shift of {SHIFT * 1e6:g} µm. β is not defined in print; taken as the area CCDs' field angle, "
-        f"{field}, cos²β alone makes {cos2:.5f}.",
+        f"{rendered} a shift of {motions.SHIFT * 1e6:g} µm. β is not defined in print; taken as the area CCDs' field "
+        f"angle, {field}, cos²β alone makes {cos2:.5f}.",
         (without_cos2(geometry, images.local_share),),
         facts={"local": images.local_share},
     )
@@ -152,8 +142,8 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
     yield _Finding(
         "001.eq3",
         images.over_truth("along X", "paper_single", "d_alpha"),
-        f"{rendered} a shift of {SHIFT * 1e6:g} µm; α is not defined in print and taken as 0, the area CCDs' field "
-        "across the line.",
+        f"{rendered} a shift of {motions.SHIFT * 1e6:g} µm; α is not defined in print and taken as 0, the area CCDs' "
+        "field across the line.",
         (f_x / f,),
         facts={"f": f, "f_x": f_x},
     )
@@ -169,8 +159,8 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
     rolled = images.roll()
     yield _Finding(
         "001.eq5",
-        images.over_motion("about Z", "paper_single", "d_gamma", TURN),
-        f"{rendered} a turn of {TURN / ARCSEC:g} arcsec. Δx / L₁ by (4), with L₁ = L/2 · tan Δγ: "
+        images.over_motion("about Z", "paper_single", "d_gamma", motions.TURN),
+        f"{rendered} a turn of {motions.TURN / ARCSEC:g} arcsec. Δx / L₁ by (4), with L₁ = L/2 · tan Δγ: "
         f"{rolled.value:.5f}. The middle of the printed line of (4) has a factor L/2 too many; its end is right in "
         "units.",
         (2.0,),
@@ -178,10 +168,10 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
     yield _Finding(
         "001.eq5",
         rolled,
-        f"{rendered} a turn of {TURN / ARCSEC:g} arcsec; Δx / L₁ by (4), L₁ = L/2 · tan Δγ.",
+        f"{rendered} a turn of {motions.TURN / ARCSEC:g} arcsec; Δx / L₁ by (4), L₁ = L/2 · tan Δγ.",
         (None, 2.0),
     )
-    scale = f"{rendered} a growth of the whole camera by {SCALE * 1e6:g} ppm, detectors unchanged."
+    scale = f"{rendered} a growth of the whole camera by {motions.SCALE * 1e6:g} ppm, detectors unchanged."
     grown = images.growth()
     yield _Finding(
         "001.eq7",
@@ -194,34 +184,32 @@ def _findings(images: SingleMotions) -> Iterator[_Finding]:
         grown,
         f"{scale} Δy / (LΔf/f) by (6); Δf is the traced one.",
     )
-    moved = images.over_motion("piston", "paper_single", "d_f", PISTON)
-    true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / PISTON
+    moved = images.over_motion("piston", "paper_single", "d_f", motions.PISTON)
+    true = fmean(images.true(camera, "piston", "d_f") for camera in images.cameras) / motions.PISTON
     yield _Finding(
         "001.eq7.piston",
         moved,
-        f"{rendered} a motion of {PISTON * 1e6:g} µm away from the optics. The traced principal distance changes by "
-        f"{true:.4f} of the motion. The two cameras' monitor beams cross opposite parts of the pupil, where defocus "
-        "moves spots differently.",
+        f"{rendered} a motion of {motions.PISTON * 1e6:g} µm away from the optics. The traced principal distance "
+        f"changes by {true:.4f} of the motion. The two cameras' monitor beams cross opposite parts of the pupil, where "
+        "defocus moves spots differently.",
         (true,),
     )
 
 
-def _show(context: Context, ratios: Mapping[str, Ratio]) -> None:
+def _show(context: Context, ratios: Mapping[str, motions.Ratio]) -> None:
     """Figure, table and data of what was found."""
     title = "Readings of paper 001's formulas over what they should be"
-    show_ratios(context, "ratios", title, {identifier: ratio.value for identifier, ratio in ratios.items()})
+    motions.show_ratios(context, "ratios", title, {identifier: ratio.value for identifier, ratio in ratios.items()})
     cameras = list(next(iter(ratios.values())).cameras)
     rows: list[list[Cell]] = [
         [i, *(number for name in cameras for number in ratio.cameras[name])] for i, ratio in ratios.items()
     ]
-    context.add(
-        Table(
-            "cameras",
-            "The same by camera",
-            "Both cameras have the same prescription and noise of their own.",
-            ("check", *(head for name in cameras for head in (name, f"{name}, sigma"))),
-            rows,
-        )
+    context.table(
+        "cameras",
+        "The same by camera",
+        "Both cameras have the same prescription and noise of their own.",
+        ("check", *(head for name in cameras for head in (name, f"{name}, sigma"))),
+        rows,
     )
 
 

@@ -21,7 +21,6 @@ from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.truth import Truth
-from twin.run.artefact import SvgFigure
 from twin.run.svg import BLUE, GREY, INK, LIGHT, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.group import Context
 
@@ -323,4 +322,4 @@ def show_ratios(context: Context, name: str, title: str, found: Mapping[str, flo
     exact = {i: (context.check(i).equation, v) for i, v in found.items() if context.check(i).printed == 1.0}
     if exact:
         caption = "Measured from images, mean of both cameras; the noise is below the size of the marks."
-        context.add(SvgFigure(name, title, caption, _ratios_svg(exact)))
+        context.figure(name, title, caption, _ratios_svg(exact))

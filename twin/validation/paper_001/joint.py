@@ -13,7 +13,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion, State
 from scenes.specs.instrument import BASE
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.run.artefact import Cell, Table
+from twin.run.artefact import Cell
 from twin.validation.checks.check import CheckResult
 from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_001 import formulas_images
@@ -249,15 +249,13 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
         ]
         for k, name in enumerate(PARAMETERS)
     ]
-    context.add(
-        Table(
-            "table1-response",
-            "What Table 1's joint form reads per true change, all four changing",
-            "Angles in arcsec, Δf in µm. Left: Table 1 as printed; right: corrected factors and the camera's own "
-            "gradients. Perfect is 1 on the diagonal and 0 off it.",
-            ("reading", *(f"per {p}" for p in PARAMETERS), *(f"corrected, per {p}" for p in PARAMETERS)),
-            rows,
-        )
+    context.table(
+        "table1-response",
+        "What Table 1's joint form reads per true change, all four changing",
+        "Angles in arcsec, Δf in µm. Left: Table 1 as printed; right: corrected factors and the camera's own "
+        "gradients. Perfect is 1 on the diagonal and 0 off it.",
+        ("reading", *(f"per {p}" for p in PARAMETERS), *(f"corrected, per {p}" for p in PARAMETERS)),
+        rows,
     )
 
 

@@ -24,16 +24,9 @@ from optics.numerics.quadrature import PupilNodes
 from scenes.models.autocollimator_model import UNITS, mirror_body
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.load import load_autocollimator_test
-from twin.laboratory.autocollimator_bench import (
-    Reader,
-    ReadingTable,
-    Series,
-    declared_spread,
-    run_autocollimator_test,
-    series_per_axis,
-)
+from twin.laboratory import autocollimator_bench as laboratory
 from twin.laboratory.autocollimator_images import AutocollimatorPath
-from twin.run.artefact import Cell, PngFigure, Table
+from twin.run.artefact import Cell, PngFigure
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, to_png
 from twin.validation.checks.check import CheckResult, Chosen
 from twin.validation.checks.group import Context, group_of, load_printed
@@ -55,23 +48,23 @@ class Measured:
     """Rendered and read: the ideal bench, benches with the declared errors, and what they were read with."""
 
     setup: AutocollimatorSetup
-    reader: Reader
-    ideal: ReadingTable
-    real: tuple[ReadingTable, ...]
+    reader: laboratory.Reader
+    ideal: laboratory.ReadingTable
+    real: tuple[laboratory.ReadingTable, ...]
 
 
 def measured(context: Context) -> Measured:
     """Render the benches."""
     setup = load_autocollimator_test()
     context.progress(0.0, "calibrate the autocollimators")
-    reader = Reader(setup, context.backend)
+    reader = laboratory.Reader(setup, context.backend)
     count = context.count(full=24, fast=12)
 
-    def bench(n: int) -> ReadingTable:
+    def bench(n: int) -> laboratory.ReadingTable:
         context.progress(0.1 + 0.8 * n / count, f"bench {n + 1} of {count}")
-        return run_autocollimator_test(setup, context.backend, seed=context.seed + n, reader=reader)
+        return laboratory.run_autocollimator_test(setup, context.backend, seed=context.seed + n, reader=reader)
 
-    ideal = run_autocollimator_test(setup, context.backend, seed=context.seed, ideal=True, reader=reader)
+    ideal = laboratory.run_autocollimator_test(setup, context.backend, seed=context.seed, ideal=True, reader=reader)
     return Measured(setup, reader, ideal, tuple(bench(n) for n in range(count)))
 
 
@@ -113,19 +106,22 @@ def printed_mean_difference(axis: str) -> float:
 
 
 def mean_differences(
-    spec: AutocollimatorTestSpec, ideal: ReadingTable, real: Sequence[ReadingTable]
+    spec: AutocollimatorTestSpec, ideal: laboratory.ReadingTable, real: Sequence[laboratory.ReadingTable]
 ) -> dict[str, MeanDifference]:
     """Axis -> mean difference, of the ideal bench and of at least one with errors."""
-    return {series.axis: _mean_difference(spec, series, ideal, real) for series in series_per_axis(spec)}
+    return {series.axis: _mean_difference(spec, series, ideal, real) for series in laboratory.series_per_axis(spec)}
 
 
 def _mean_difference(
-    spec: AutocollimatorTestSpec, series: Series, ideal: ReadingTable, real: Sequence[ReadingTable]
+    spec: AutocollimatorTestSpec,
+    series: laboratory.Series,
+    ideal: laboratory.ReadingTable,
+    real: Sequence[laboratory.ReadingTable],
 ) -> MeanDifference:
     axis = series.axis
     perfect, result = ideal[axis], real[0][axis]
     means = [table[axis].mean_difference / ARCSEC for table in real]
-    spread = declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0)) / ARCSEC
+    spread = laboratory.declared_spread(spec, series, float(np.max(result.sigma)) / math.sqrt(2.0)) / ARCSEC
     value = MEAN_DIFFERENCE[axis]
     component = column_component(axis)
     rate = float(perfect.readings[1, -1, component] / series.angles[-1])
@@ -231,21 +227,19 @@ def _claimed(context: Context, name: str) -> CheckResult:
 def _show(context: Context, found: Measured) -> None:
     context.progress(0.95, "draw")
     table = found.real[0]
-    context.add(
-        Table(
-            "table2",
-            "Table 2 from rendered spots",
-            "One bench with the declared errors, arcsec. Mirror 2 is scaled as the paper scales it: by 1, 2/√3, 2/√3.",
-            ("turntable", *(f"{axis}: mirror {n}" for axis in "XYZ" for n in (1, 2))),
-            _rows(table),
-        )
+    context.table(
+        "table2",
+        "Table 2 from rendered spots",
+        "One bench with the declared errors, arcsec. Mirror 2 is scaled as the paper scales it: by 1, 2/√3, 2/√3.",
+        ("turntable", *(f"{axis}: mirror {n}" for axis in "XYZ" for n in (1, 2))),
+        _rows(table),
     )
     caption = "Left: the bench seen from above, with traced rays. Right: differences from row to row."
     picture = bench_png(found.reader, [table])
     context.add(PngFigure("bench", "The principle experiment", caption, picture))
 
 
-def _rows(table: ReadingTable) -> list[list[Cell]]:
+def _rows(table: laboratory.ReadingTable) -> list[list[Cell]]:
     columns = [table["X"].series.angles, *(column for axis in "XYZ" for column in table[axis].columns)]
     return [[round(float(value) / ARCSEC, 4) for value in row] for row in zip(*columns, strict=True)]
 
@@ -259,7 +253,7 @@ _TITLES = {
 }
 
 
-def bench_png(reader: Reader, tables: Sequence[ReadingTable]) -> bytes:
+def bench_png(reader: laboratory.Reader, tables: Sequence[laboratory.ReadingTable]) -> bytes:
     """The picture as PNG.
 
     Args:
@@ -321,7 +315,7 @@ def _bench(axes: Axes, path: AutocollimatorPath) -> None:
     axes.grid(color=LIGHT, lw=0.5)
 
 
-def _differences(axes: Axes, tables: Sequence[ReadingTable], axis: str, last: bool) -> None:
+def _differences(axes: Axes, tables: Sequence[laboratory.ReadingTable], axis: str, last: bool) -> None:
     for k, table in enumerate(tables):
         result = table[axis]
         first, second = result.columns

@@ -15,7 +15,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign, FieldPass
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import Cell, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import CheckResult, Chosen, mean_of, median_of
@@ -308,25 +308,21 @@ def run(context: Context) -> Iterator[CheckResult]:
     yield from flown_fields.results(context, found, setup)
     limits = setup.test.limits
     if context.wants("003.before", "003.scale50000", *(f"003.scheme{k}" for k in flown_fields.NAMES)):
-        context.add(
-            SvgFigure(
-                "schemes",
-                "Accuracy without ground control by scheme and field",
-                "RMS at check points: marks are medians over the campaigns, bars hold the middle 90 % of them. "
-                "Scheme 0 is the laboratory's camera.",
-                schemes_svg(found, limits.plan, limits.height),
-            )
+        context.figure(
+            "schemes",
+            "Accuracy without ground control by scheme and field",
+            "RMS at check points: marks are medians over the campaigns, bars hold the middle 90 % of them. "
+            "Scheme 0 is the laboratory's camera.",
+            schemes_svg(found, limits.plan, limits.height),
         )
         context.add(_table(found))
     if context.wants("003.table3", "003.fig4", "003.fig5", "003.fig6"):
-        context.add(
-            SvgFigure(
-                "latitude",
-                "Attitude biases over latitude",
-                "Estimates of the first campaign, each field by itself, with 1 sigma; grey: slopes of other "
-                "campaigns, drawn through the middle of the first one's fit.",
-                latitude_svg(found),
-            )
+        context.figure(
+            "latitude",
+            "Attitude biases over latitude",
+            "Estimates of the first campaign, each field by itself, with 1 sigma; grey: slopes of other "
+            "campaigns, drawn through the middle of the first one's fit.",
+            latitude_svg(found),
         )
         context.add(_bias_table(found))
 

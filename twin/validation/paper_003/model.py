@@ -15,22 +15,12 @@ from scenes.specs.orbit.setup import CalibrationSetup
 from twin.orbit.calibration.calibration_run import source_of
 from twin.orbit.calibration.campaign import Campaign
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone
-from twin.run.artefact import SvgFigure, Table
 from twin.run.random_streams import stream
 from twin.run.svg import BLUE, GREY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import CheckResult
 from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_003 import exact, rendered
 from twin.validation.paper_003 import rendered as marks
-from twin.validation.paper_003.exact import (
-    FIELDS,
-    IMAGES,
-    Rank,
-    Walk,
-    all_errors,
-    setup_of,
-    without_light,
-)
 from twin.validation.paper_003.exact import exact as exact_setup
 from twin.validation.paper_003.rendered import FREE_INTERIOR, ROLL_PITCH, FromImages
 
@@ -52,7 +42,7 @@ UNKNOWNS = len(LINES) * len(INTERIOR) + len(BIAS)
 ROUNDS = (1, 3, 10, 30, 100, 300, 1000, 3000)
 
 
-def open_svg(rank: Rank, walk: Walk) -> str:
+def open_svg(rank: exact.Rank, walk: exact.Walk) -> str:
     """Bars of the open combination, and sigmas over rounds."""
     with look("paper-003-open"):
         figure = new_figure(3.4)
@@ -103,8 +93,8 @@ def run(context: Context) -> Iterator[CheckResult]:
 
 def exact_and_images() -> CalibrationSetup:
     """The field without noise, with the detectors that images need."""
-    points = setup_of(FIELDS).test.points
-    return exact_setup(without_light(setup_of(IMAGES, (FIELD,), images=None, points=points)))
+    points = exact.setup_of(exact.FIELDS).test.points
+    return exact_setup(exact.without_light(exact.setup_of(exact.IMAGES, (FIELD,), images=None, points=points)))
 
 
 def _exact(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
@@ -149,7 +139,7 @@ def exact_misses(setup: CalibrationSetup, campaign: Campaign, seed: np.random.Se
 
 
 def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckResult]:
-    setup = without_light(setup_of(FIELDS, (FIELD,)))
+    setup = exact.without_light(exact.setup_of(exact.FIELDS, (FIELD,)))
     campaign = source_of(setup, seed).independent
     if "003.model.rank" in context.selected:
         found = exact.rank_of(setup, campaign)
@@ -161,14 +151,12 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
             f"{found.weak_sigma / setup.camera.pitch:.1f} px, and is held, too."
         )
         yield context.check("003.model.rank").evaluate(found.rank, None, how, float(UNKNOWNS), [UNKNOWNS - 1.0])
-        context.add(
-            SvgFigure(
-                "open",
-                "What a calibration of one field leaves open",
-                "Left: the combination of unknowns that moves no image point. Right: how many sigmas the stepwise "
-                "solution is away from the simultaneous one.",
-                open_svg(found, exact.walked(campaign, campaign.passes[0], ROUNDS)),
-            )
+        context.figure(
+            "open",
+            "What a calibration of one field leaves open",
+            "Left: the combination of unknowns that moves no image point. Right: how many sigmas the stepwise "
+            "solution is away from the simultaneous one.",
+            open_svg(found, exact.walked(campaign, campaign.passes[0], ROUNDS)),
         )
     if "003.model.stepwise" in context.selected:
         way = exact.walked(campaign, campaign.passes[0])
@@ -184,7 +172,7 @@ def _simulated(context: Context, seed: np.random.SeedSequence) -> Iterator[Check
 
 def image_setup(fast: bool) -> CalibrationSetup:
     """Fields of rendered images: one with fewer points in the fast run."""
-    setup = setup_of(IMAGES, (FIELD,) if fast else (FIELD, "Anhui"))
+    setup = exact.setup_of(exact.IMAGES, (FIELD,) if fast else (FIELD, "Anhui"))
     if not fast:
         return setup
     spec = setup.test.images
@@ -195,7 +183,7 @@ def image_setup(fast: bool) -> CalibrationSetup:
 
 
 def _yaw(context: Context, seed: np.random.SeedSequence) -> CheckResult:
-    setup, count = without_light(setup_of(FIELDS)), context.count(CAMPAIGNS, FAST_CAMPAIGNS)
+    setup, count = exact.without_light(exact.setup_of(exact.FIELDS)), context.count(CAMPAIGNS, FAST_CAMPAIGNS)
     ratios, sigmas = [], []
     for k in range(count):
         context.progress(0.1 + 0.05 * k / count, f"fly campaign {k + 1} of {count}")
@@ -234,7 +222,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             f"{size}. {matched} places pass the matching, {wrong} of them wrong by truth; "
             "control points are identified less well by eye, and the campaigns take 0.3 px."
         )
-        yield context.check("003.model.points").evaluate(rms, None, how, setup_of(FIELDS).test.errors.image)
+        yield context.check("003.model.points").evaluate(rms, None, how, exact.setup_of(exact.FIELDS).test.errors.image)
     rounds = ", ".join(str(f.way.rounds) for f in found)
     for identifier, names, unit in (
         ("003.model.bias", tuple(ROLL_PITCH), ARCSEC),
@@ -244,7 +232,9 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
             rms, sigma = _worst(found, names)
             said = " ".join(rendered.summary(f, names) for f in found)
             how = f"{size}. Error and sigma: {said} The worst field counts. Rounds of the stepwise solution: {rounds}."
-            yield context.check(identifier).evaluate(rms / unit, sigma / unit, how, inputs=[all_errors(rms / unit)])
+            yield context.check(identifier).evaluate(
+                rms / unit, sigma / unit, how, inputs=[exact.all_errors(rms / unit)]
+            )
     for what in ("plan", "height"):
         if f"003.model.{what}" in context.selected:
             worst = max(found, key=lambda f: getattr(f.after, f"{what}_rms"))
@@ -256,7 +246,7 @@ def _rendered(context: Context, seed: np.random.SeedSequence) -> Iterator[CheckR
                 "points, whose error in the orthophoto they share."
             )
             limit = getattr(setup.test.limits, what)
-            yield context.check(f"003.model.{what}").evaluate(rms, sigma, how, limit, inputs=[all_errors(rms)])
+            yield context.check(f"003.model.{what}").evaluate(rms, sigma, how, limit, inputs=[exact.all_errors(rms)])
     _table(context, found)
 
 
@@ -272,15 +262,13 @@ def _table(context: Context, found: tuple[FromImages, ...]) -> None:
         for k, (name, error) in enumerate(f.error.items()):
             unit, scale = ("arcsec", ARCSEC) if name in BIAS else ("µm", 1e-6)
             rows.append((f.name, name, unit, error / scale, float(sigma[k]) / scale))
-    context.add(
-        Table(
-            "images",
-            "Calibrated from rendered images, stepwise",
-            "Estimated minus true, and the sigma of the simultaneous adjustment. x and y of the nadir line are held.",
-            ("field", "unknown", "unit", "error", "sigma"),
-            rows,
-            (None, None, None, 2, 2),
-        )
+    context.table(
+        "images",
+        "Calibrated from rendered images, stepwise",
+        "Estimated minus true, and the sigma of the simultaneous adjustment. x and y of the nadir line are held.",
+        ("field", "unknown", "unit", "error", "sigma"),
+        rows,
+        (None, None, None, 2, 2),
     )
 
 

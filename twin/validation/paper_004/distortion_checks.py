@@ -13,8 +13,9 @@ from analysis.units import UM_PER_M as UM
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.resolved import resolve_distortion
 from twin.laboratory.distortion_bench import DistortionBench
-from twin.laboratory.distortion_run import SimulatedDistortion, measure, rms
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.laboratory.distortion_run import SimulatedDistortion, measure
+from twin.laboratory.turntable_run import rms
+from twin.run.artefact import Cell
 from twin.run.svg import BLUE, GREY, INK, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of, median_of
 from twin.validation.checks.group import Context, group_of, load_printed
@@ -168,8 +169,7 @@ def _show(context: Context, runs: Sequence[SimulatedDistortion]) -> None:
     for name, pick in kinds.items():
         both = np.abs(UM * np.array([pick(run) for run in runs]))
         changes[name] = both[:, 0], both[:, 1]
-    context.add(
-        Table(
+    context.table(
             "table2",
             "Table 2 and the simulation",
             f"Over the {POINTS} points, µm: raw and compensated angles; median of {len(runs)} "
@@ -177,29 +177,24 @@ def _show(context: Context, runs: Sequence[SimulatedDistortion]) -> None:
             ("quantity", "RMS, raw", "RMS, comp.", "lower, %", "mean, raw", "mean, comp.", "lower, %",
              "largest, raw", "largest, comp.", "lower, %"),
             [[name, *_statistics(*both)] for name, both in changes.items()],
-        )
-    )  # fmt: skip
-    context.add(
-        SvgFigure(
-            "reduction",
-            "What compensation brings, table by table",
-            "A point per simulated turntable and test: RMS error of the distortion. The square is the RMS of the "
-            "paper's Table 2, which holds the distortion of its camera as well.",
-            reduction_svg(
-                _errors(runs), (rms(raw), rms(own)), 0.01 * load_printed("004").number("distortion.reduction_percent")
-            ),
-        )
+        )  # fmt: skip
+    context.figure(
+        "reduction",
+        "What compensation brings, table by table",
+        "A point per simulated turntable and test: RMS error of the distortion. The square is the RMS of the "
+        "paper's Table 2, which holds the distortion of its camera as well.",
+        reduction_svg(
+            _errors(runs), (rms(raw), rms(own)), 0.01 * load_printed("004").number("distortion.reduction_percent")
+        ),
     )
     tests = [SpotTest(r) for r in runs]
-    context.add(
-        SvgFigure(
-            "principal-point",
-            "The principal point by (2) and by (2) with a constant term",
-            "A point per simulated test. Left: p of (2) follows the error of the zero of W; the line is what the "
-            "traced camera makes of it. Right: with a constant beside (2), error bars one stated sigma; the traced "
-            "camera's p is zero on this scale, and a pixel is thinner than the line.",
-            points_svg(*equations_004.principal_points(tests)),
-        )
+    context.figure(
+        "principal-point",
+        "The principal point by (2) and by (2) with a constant term",
+        "A point per simulated test. Left: p of (2) follows the error of the zero of W; the line is what the "
+        "traced camera makes of it. Right: with a constant beside (2), error bars one stated sigma; the traced "
+        "camera's p is zero on this scale, and a pixel is thinner than the line.",
+        points_svg(*equations_004.principal_points(tests)),
     )
 
 

@@ -28,7 +28,8 @@ from optics.geometry.pose import rotation_matrix
 from optics.numerics.backend import Backend
 from scenes.models.camera_model import ROOT, build_camera_under_test
 from scenes.specs.resolved import DistortionSetup, resolve_distortion
-from twin.laboratory.distortion_run import SimulatedDistortion, rms
+from twin.laboratory.distortion_run import SimulatedDistortion
+from twin.laboratory.turntable_run import rms
 from twin.targets.target_path import TargetPath
 from twin.validation.checks.check import Check, CheckResult
 from twin.validation.checks.group import Context, group_of, load_printed

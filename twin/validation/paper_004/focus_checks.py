@@ -14,16 +14,14 @@ from analysis.focal_plane.plane_fit import RigidMotion, fit_focal_plane
 from analysis.focal_plane.shims import ShimPlan, shim_plan
 from analysis.focal_plane.through_focus import focus_vertex
 from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
-from analysis.units import ARCMIN, ARCSEC
-from analysis.units import MM_PER_M as MM
-from analysis.units import UM_PER_M as UM
+from analysis.units import ARCMIN, ARCSEC, MM_PER_M, UM_PER_M
 from optics.geometry.pose import Pose, rotation_matrix
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.resolved import resolve_focus
-from twin.laboratory.focus_alignment import Alignment, State, align, line_turn, mount_of
 from twin.laboratory.focus_bench import FocusBench
+from twin.laboratory.focus_run import FocusState, SimulatedFocus, align, line_turn, mount_of
 from twin.laboratory.focus_scan import NYQUIST
-from twin.run.artefact import Cell, SvgFigure, Table
+from twin.run.artefact import Cell
 from twin.run.svg import AFTER, BEFORE, INK, LIGHT, look, new_figure, plain_axes, to_svg
 from twin.targets.target_images import TRACK
 from twin.validation.checks.check import Check, CheckResult, Chosen, mean_of
@@ -121,16 +119,15 @@ class Plan:
         alignment: with the curves and the truth.
     """
 
-    alignment: Alignment
+    alignment: SimulatedFocus
 
     @cached_property
     def motion(self) -> RigidMotion:
         """Of the assembly, wanted."""
         state = self.alignment.states[0]
-        places = np.array([site.place for site in self.alignment.bench.sites])
         where, sigma = measured_defocus(state)
         # the plane wants how far best focus lies downstream of the CCD
-        return fit_focal_plane(places, -where, sigma, estimate_extra=True).correction(state.level)
+        return fit_focal_plane(self.alignment.places, -where, sigma, estimate_extra=True).correction(state.level)
 
     @cached_property
     def shims(self) -> ShimPlan:
@@ -165,7 +162,7 @@ class Plan:
         return np.asarray((moved - mount.holes) @ mount.normal)
 
 
-def measured_defocus(state: State) -> tuple[Array, Array]:
+def measured_defocus(state: FocusState) -> tuple[Array, Array]:
     """How far each CCD stands downstream of best focus by its MTF curves, and sigma, (N,), metres."""
     out = []
     for scan in state.scans:
@@ -190,7 +187,7 @@ def run(context: Context) -> Iterator[CheckResult]:
             yield from evaluate(context, alignments)
 
 
-def measured_alignments(context: Context, bench: FocusBench) -> list[Alignment]:
+def measured_alignments(context: Context, bench: FocusBench) -> list[SimulatedFocus]:
     """Alignments from rendered edges."""
     count = context.count(ALIGNMENTS, FAST_ALIGNMENTS) if context.wants("004.alignment") else 1
     alignments = []
@@ -201,25 +198,16 @@ def measured_alignments(context: Context, bench: FocusBench) -> list[Alignment]:
     return alignments
 
 
-def _edges(alignment: Alignment, band: str) -> list[EdgeMtf]:
+def _edges(alignment: SimulatedFocus, band: str) -> list[EdgeMtf]:
     """Edges along the track at the fields of a band, measured after the alignment."""
     noise, focus = alignment.bench.ccds[band].noise, alignment.states[-1].focus
     stacks = [f.frames[TRACK] for f, site in zip(focus, alignment.bench.sites, strict=True) if site.band == band]
     return [measure_edge(frames.mean(axis=0), noise=noise, frames=len(frames)) for frames in stacks]
 
 
-def _true_mtf(alignment: Alignment, band: str) -> float:
+def _true_mtf(alignment: SimulatedFocus, band: str) -> float:
     """MTF of the traced pupils at the Nyquist frequency, along the track, where the chips stand after the alignment."""
-    standing = alignment.states[-1].standing
-    return float(
-        np.mean(
-            [
-                site.imagers[TRACK].mtf(float(site.crossing(standing.pose, standing.heights[band])[2]), site.nyquist)
-                for site in alignment.bench.sites
-                if site.band == band
-            ]
-        )
-    )
+    return alignment.states[-1].true_mtf[band]
 
 
 def _losses(factors: Mapping[str, float], value: float) -> list[Chosen]:
@@ -240,7 +228,7 @@ def _slope(edges: Sequence[EdgeMtf]) -> float:
     return float(np.log(1.0 / 0.9) / np.log(below / there))
 
 
-def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:
+def _mtf(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
     if not context.wants(*(f"004.table1.{name}" for name in (*MTF_NYQUIST, "frequency"))):
         return
     alignment = alignments[0]
@@ -276,36 +264,34 @@ def _mtf(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckRes
     slope, lost = np.mean(logs, axis=0)
     chosen = Chosen(_ALL_LOSSES, 1.0, "1", lambda factor: value * lost ** ((factor**2 - 1.0) * slope))
     yield context.check("004.table1.frequency").evaluate(value, sigma, how, 1.0, inputs=[chosen])
-    context.add(
-        Table(
-            "table1",
-            "Table 1: MTF at the Nyquist frequency",
-            "Along the track, mean over the fields. Perfect: diffraction and pixel alone, in the middle of the field; "
-            "beside it the factors that make the difference.",
-            ("band", "printed", "measured", "sigma", "true", "perfect", *rest),
-            rows,
-        )
+    context.table(
+        "table1",
+        "Table 1: MTF at the Nyquist frequency",
+        "Along the track, mean over the fields. Perfect: diffraction and pixel alone, in the middle of the field; "
+        "beside it the factors that make the difference.",
+        ("band", "printed", "measured", "sigma", "true", "perfect", *rest),
+        rows,
     )
 
 
-def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:
+def _measured(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
     """What the analysis makes of the curves, against the traced pupils."""
     if not context.wants(*(f"004.alignment.{n}" for n in ("defocus", "plane", "constraint", "shims"))):
         return
     count, sites = len(alignments), len(alignments[0].bench.sites)
     looks = [(a.states[0], a.states[-1]) for a in alignments]
     error = np.array([[measured_defocus(state)[0] - state.true_defocus for state in pair] for pair in looks])
-    before, after = (UM * float(np.sqrt(np.mean(error[:, k] ** 2))) for k in (0, 1))
-    span = UM * float(np.max(np.abs([a.states[0].true_defocus for a in alignments])))
+    before, after = (UM_PER_M * float(np.sqrt(np.mean(error[:, k] ** 2))) for k in (0, 1))
+    span = UM_PER_M * float(np.max(np.abs([a.states[0].true_defocus for a in alignments])))
     how = (
         f"{_alignments(count)}, {sites} fields and bands, edges in two directions through focus: {before:.2f} µm RMS "
         f"before, where CCDs stand up to {span:.0f} µm off, {after:.2f} µm after; largest "
-        f"{UM * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
+        f"{UM_PER_M * np.max(np.abs(error)):.1f} µm. Truth: focus of the traced pupils."
     )
-    total = UM * float(np.sqrt(np.mean(error**2)))
+    total = UM_PER_M * float(np.sqrt(np.mean(error**2)))
     yield context.check("004.alignment.defocus").evaluate(total, None, how, 0.0)
     plans = [Plan(a) for a in alignments]
-    left = np.array([MM * np.max(np.abs(p.left)) for p in plans])
+    left = np.array([MM_PER_M * np.max(np.abs(p.left)) for p in plans])
     how = (
         f"{_alignments(count)}: plane through the measured defocus of the {sites} sites, the assembly moved by exactly "
         f"that: {_list(left, 4)} mm. What stays is how the chips were glued, and curvature of field."
@@ -322,15 +308,15 @@ def _measured(context: Context, alignments: Sequence[Alignment]) -> Iterator[Che
     changes = np.array([p.shims.change for p in plans])
     alone = np.array([abs(p.shims.level_coupling) / ARCMIN for p in plans])
     how = (
-        f"{_alignments(count)}, {asked.shape[1]} holes: changes up to {UM * np.max(np.abs(asked)):.0f} µm. The surface "
-        "of the mount is inclined, so that shims alone, without a turn by hand, would cost the line's level "
+        f"{_alignments(count)}, {asked.shape[1]} holes: changes up to {UM_PER_M * np.max(np.abs(asked)):.0f} µm. The "
+        "surface of the mount is inclined, so that shims alone, without a turn by hand, would cost the line's level "
         f"{_list(alone, 2)}′."
     )
-    value = UM * float(np.sqrt(np.mean((changes - asked) ** 2)))
+    value = UM_PER_M * float(np.sqrt(np.mean((changes - asked) ** 2)))
     yield context.check("004.alignment.shims").evaluate(value, None, how, 0.0)
 
 
-def _chips(placed: Sequence[tuple[Alignment, Pose, Mapping[str, float]]]) -> Chosen:
+def _chips(placed: Sequence[tuple[SimulatedFocus, Pose, Mapping[str, float]]]) -> Chosen:
     """How the line CCDs were glued, on which the largest distance from best focus hangs, millimetres."""
     flat, as_glued = (
         np.array([[s.defocus(pose, share * heights[s.band]) for s in a.bench.sites] for a, pose, heights in placed])
@@ -338,25 +324,25 @@ def _chips(placed: Sequence[tuple[Alignment, Pose, Mapping[str, float]]]) -> Cho
     )
     spread = placed[0][0].bench.setup.test.misset.chips
     return Chosen(
-        "scatter of the glued chips", UM * spread, "µm",
-        lambda factor: float(MM * np.max(np.abs(flat + factor * (as_glued - flat)))),
+        "scatter of the glued chips", UM_PER_M * spread, "µm",
+        lambda factor: float(MM_PER_M * np.max(np.abs(flat + factor * (as_glued - flat)))),
     )  # fmt: skip
 
 
-def _theodolite(alignments: Sequence[Alignment], value: float) -> Chosen:
+def _theodolite(alignments: Sequence[SimulatedFocus], value: float) -> Chosen:
     """What the line's turn is measured and set with, and is proportional to."""
     return Chosen.power(
         "error of the theodolite and of the setting", alignments[0].bench.setup.test.level / ARCSEC, "arcsec", value
     )
 
 
-def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[CheckResult]:
+def _reached(context: Context, alignments: Sequence[SimulatedFocus]) -> Iterator[CheckResult]:
     """What the loop of measuring, shimming and measuring reaches."""
     if not context.wants(*(f"004.alignment.{n}" for n in ("confocal", "level", "rounds"))):
         return
     count = len(alignments)
     plan = alignments[0].bench.setup.test
-    far = np.array([[MM * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
+    far = np.array([[MM_PER_M * np.max(np.abs(s.true_defocus)) for s in a.states] for a in alignments])
     turns = np.array([[abs(s.true_level) / ARCMIN for s in a.states] for a in alignments])
     sites = f"{_alignments(count)} of {len(alignments[0].bench.sites)} fields and bands, by the traced pupils"
     how = f"{sites}: before {_list(far[:, 0], 2)} mm, after {_list(far[:, -1], 4)} mm."
@@ -373,20 +359,18 @@ def _reached(context: Context, alignments: Sequence[Alignment]) -> Iterator[Chec
     more = [_second_round(a) for a in alignments]
     how = (
         f"{_alignments(count)}: {int(np.sum(rounds == 0))} needed none, {int(np.sum(rounds == 1))} needed one. A "
-        f"second round would change a shim by {UM * max(more):.1f} µm at most; shims are ground in steps of "
-        f"{UM * plan.mount.step:g} µm."
+        f"second round would change a shim by {UM_PER_M * max(more):.1f} µm at most; shims are ground in steps of "
+        f"{UM_PER_M * plan.mount.step:g} µm."
     )
     value = float(np.max(rounds))
     share = max(float(np.max(far[:, -1])) / CONFOCAL_MM, float(np.max(turns[:, -1])) / LINE_LEVEL_ARCMIN)
     chosen = Chosen("what one round leaves, times", 1.0, "1", lambda k: value if k * share <= 1.0 else value + 1.0)
     yield context.check("004.alignment.rounds").evaluate(value, None, how, inputs=[chosen])
-    context.add(
-        SvgFigure(
-            "alignments",
-            "One round of shims",
-            "Every alignment before and after, true values. Grey: within what the paper reached.",
-            alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN),
-        )
+    context.figure(
+        "alignments",
+        "One round of shims",
+        "Every alignment before and after, true values. Grey: within what the paper reached.",
+        alignment_svg(far, turns, CONFOCAL_MM, LINE_LEVEL_ARCMIN),
     )
 
 
@@ -424,13 +408,13 @@ def alignment_svg(far: NDArray[np.float64], turns: NDArray[np.float64], far_boun
         return to_svg(figure)
 
 
-def _second_round(alignment: Alignment) -> float:
+def _second_round(alignment: SimulatedFocus) -> float:
     """Largest change of a shim that the last measurement asks for, metres."""
     state = alignment.states[-1]
-    places = np.array([site.place for site in alignment.bench.sites])
     where, sigma = measured_defocus(state)
-    motion = fit_focal_plane(places, -where, sigma, estimate_extra=True).correction()
-    return float(np.max(np.abs(shim_plan(motion, mount_of(alignment.bench.setup.test)).change)))
+    motion = fit_focal_plane(alignment.places, -where, sigma, estimate_extra=True).correction()
+    present = alignment.shimmings[-1].plan.thickness
+    return float(np.max(np.abs(shim_plan(motion, mount_of(alignment.test), present).change)))
 
 
 def _alignments(count: int) -> str:

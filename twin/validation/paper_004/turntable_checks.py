@@ -17,9 +17,8 @@ from analysis.units import ARCSEC
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.resolved import resolve_turntable
 from scenes.specs.turntable import TurntableTestSpec
-from twin.laboratory.distortion_run import rms
 from twin.laboratory.turntable_bench import TurntableModel
-from twin.laboratory.turntable_run import run_turntable
+from twin.laboratory.turntable_run import rms, run_turntable
 from twin.run.artefact import Cell, Table
 from twin.validation.checks.check import Check, CheckResult, Chosen, median_of
 from twin.validation.checks.group import Context, group_of, load_printed

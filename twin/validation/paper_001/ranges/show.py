@@ -10,25 +10,12 @@ import numpy as np
 
 from analysis.monitor.monitoring import MonitorGeometry
 from analysis.units import ARCSEC
-from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
+from twin.run.artefact import SYMBOLS, Cell
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.validation.checks.group import Context
+from twin.validation.paper_001.ranges import turns
 from twin.validation.paper_001.ranges.curves import CALIBRATED, CORRECTED, FORMS, JOINT, PRINTED, Curves
 from twin.validation.paper_001.ranges.defocus import CONFOCAL, SMALL, FieldPoint, PupilStudy, Response
-from twin.validation.paper_001.ranges.turns import (
-    CLAIMED,
-    CUT,
-    EQUATIONS,
-    FINE,
-    KINDS,
-    NAMES,
-    UNITS,
-    Corners,
-    Range,
-    Separation,
-    criterion,
-    key,
-)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,7 +39,7 @@ def _thinned(points: np.ndarray) -> np.ndarray:
     return points[kept]
 
 
-def singles_svg(ranges: Mapping[str, Sequence[Range]]) -> str:
+def singles_svg(ranges: Mapping[str, Sequence[turns.Range]]) -> str:
     """A panel per parameter: error over the true change, both on logarithmic axes."""
     with look("ranges-001-singles"):
         figure = new_figure(7.4)
@@ -65,15 +52,15 @@ def singles_svg(ranges: Mapping[str, Sequence[Range]]) -> str:
             axes.axvspan(0.85 * low, min(r.window for r in both) * per, color=LIGHT, alpha=0.55, lw=0)
             grid = np.array([low, high])
             axes.plot(grid, 0.01 * grid, "--", color=GREY, lw=1.0)
-            axes.axhline(FINE[name] * per, color=INK, lw=1.0, ls=":")
-            if CLAIMED[name] != FINE[name]:
-                axes.axhline(CLAIMED[name] * per, color=INK, lw=1.0, ls="-.")
+            axes.axhline(turns.FINE[name] * per, color=INK, lw=1.0, ls=":")
+            if turns.CLAIMED[name] != turns.FINE[name]:
+                axes.axhline(turns.CLAIMED[name] * per, color=INK, lw=1.0, ls="-.")
             shown = [PRINTED, JOINT] if name == "d_f" else [PRINTED, CORRECTED]
             for form in shown:
                 marks = _thinned(first.raw[form]) * per
                 line = np.concatenate([first.raw[form], first.raw_traced[form]]) * per
                 axes.plot(line[:, 0], np.abs(line[:, 1]), "-", color=_COLOURS[form], lw=1.0)
-                label = f"printed {EQUATIONS[name]}" if form == PRINTED else form
+                label = f"printed {turns.EQUATIONS[name]}" if form == PRINTED else form
                 if name == "d_f" and form == PRINTED:
                     label += ", the same as corrected"
                 axes.plot(marks[:, 0], np.abs(marks[:, 1]), _MARKS[form], color=_COLOURS[form], ms=4.5, label=label)
@@ -82,7 +69,7 @@ def singles_svg(ranges: Mapping[str, Sequence[Range]]) -> str:
             axes.set_ylim(0.3 * np.min(np.abs(first.raw[CORRECTED][:, 1])) * per, None)
             axes.plot([], [], "--", color=GREY, lw=1.0, label="1 %")
             axes.plot([], [], ":", color=INK, lw=1.0, label="0.04 mm" if name == "d_f" else "0.1 arcsec")
-            if CLAIMED[name] != FINE[name]:
+            if turns.CLAIMED[name] != turns.FINE[name]:
                 axes.plot([], [], "-.", color=INK, lw=1.0, label="2.15 arcsec")
             axes.set_xlabel(f"true {SYMBOLS[name]} [{unit}]")
             axes.set_ylabel(f"|error| [{unit}]")
@@ -90,7 +77,7 @@ def singles_svg(ranges: Mapping[str, Sequence[Range]]) -> str:
         return to_svg(figure)
 
 
-def joint_svg(corners: Corners, forms: Sequence[str]) -> str:
+def joint_svg(corners: turns.Corners, forms: Sequence[str]) -> str:
     """A panel per parameter: worst corner as a share of the claim over the share of the box."""
     with look("ranges-001-joint"):
         figure = new_figure(6.2)
@@ -99,7 +86,7 @@ def joint_svg(corners: Corners, forms: Sequence[str]) -> str:
             axes.axhline(1.0, color=INK, lw=1.0, ls=":")
             axes.axvspan(float(corners.images.size[0]), 1.0, color=LIGHT, alpha=0.55, lw=0)
             for form in forms:
-                of = key(form, name)
+                of = turns.key(form, name)
                 size = np.concatenate([corners.images.size, corners.traced.size])
                 value = np.concatenate([corners.images.value[of], corners.traced.value[of]])
                 axes.plot(size, value, "-", color=_COLOURS[form], lw=1.0)
@@ -107,7 +94,7 @@ def joint_svg(corners: Corners, forms: Sequence[str]) -> str:
                 axes.plot(marks[:, 0], marks[:, 1], _MARKS[form], color=_COLOURS[form], ms=4.5, label=form)
             _log(axes)
             axes.set_xlim(float(corners.images.size[0]), corners.lost * 1.02)
-            limit = f"{CLAIMED[name] * _scale(name)[0]:g} {_scale(name)[1]}"
+            limit = f"{turns.CLAIMED[name] * _scale(name)[0]:g} {_scale(name)[1]}"
             axes.set_ylabel(f"worst error of {SYMBOLS[name]} / {limit}")
         for axes in panels[2:]:
             axes.set_xlabel("size of the box, times ±(4″, 4″, 24″, 0.95 mm)")
@@ -123,7 +110,7 @@ def defocus_svg(pupil: PupilStudy, curves: Curves, focal: tuple[float, float]) -
         grid = np.array([-0.3, 0.3])
         for axis, name, length, sign in ((0, "d_alpha", focal[0], -1.0), (1, "d_beta", focal[1], 1.0)):
             own = np.equal(pupil.offset[:, 1 - axis], 0.0)
-            k = NAMES.index(name)
+            k = turns.NAMES.index(name)
             slope = 1e-6 * pupil.slope[own, k]
             colour = _OF_PARAMETER[name]
             left.plot(1e3 * grid, sign * 1e-6 * grid / length**2 / ARCSEC, "-", color=colour, lw=1.0)
@@ -161,7 +148,7 @@ def field_svg(points: Sequence[FieldPoint]) -> str:
         fine = np.linspace(0.0, float(field.max()), 60)
 
         def gain(form: str, name: str) -> Any:
-            return np.array([p.gains[form][NAMES.index(name)] for p in points])
+            return np.array([p.gains[form][turns.NAMES.index(name)] for p in points])
 
         base = float(gain(CORRECTED, "d_beta")[0])
         axes.plot(np.degrees(fine), 100 * (base * np.cos(fine) ** 2 - 1.0), "-", color=GREY, lw=1.0)
@@ -201,19 +188,19 @@ def fine_text(parameter: str) -> str:
     return "0.04 mm" if parameter == "d_f" else "0.1″"
 
 
-def limit_of(both: Sequence[Range], form: str, kind: str) -> tuple[float, str]:
+def limit_of(both: Sequence[turns.Range], form: str, kind: str) -> tuple[float, str]:
     """Limit in the worse of the two directions, table units, and whence it is known or what ends it."""
-    return min(r.limit(criterion(form, kind)) for r in both)
+    return min(r.limit(turns.criterion(form, kind)) for r in both)
 
 
-def limit_text(both: Sequence[Range], form: str, kind: str, per: float) -> str:
+def limit_text(both: Sequence[turns.Range], form: str, kind: str, per: float) -> str:
     """The same in words."""
     size, whence = limit_of(both, form, kind)
     unit = "mm" if both[0].parameter == "d_f" else "″"
     if size == 0.0:
         return "nowhere"
     if whence not in ("images", "trace"):
-        ended = {CUT: "beam cut"}.get(whence, whence)
+        ended = {turns.CUT: "beam cut"}.get(whence, whence)
         return f"to {fixed_digits(size * per)} {unit} ({ended})".replace(" ″", "″")
     return f"to {fixed_digits(size * per)} {unit}".replace(" ″", "″")
 
@@ -224,7 +211,11 @@ def fixed_digits(value: float) -> str:
 
 
 def causes_shown(
-    context: Context, own: Mapping[str, list[Range]], geometry: MonitorGeometry, local: float, data: dict[str, object]
+    context: Context,
+    own: Mapping[str, list[turns.Range]],
+    geometry: MonitorGeometry,
+    local: float,
+    data: dict[str, object],
 ) -> None:
     """What limits every formula by itself; ``local``: focal length along the line at its centre, metres."""
     f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
@@ -253,44 +244,43 @@ def causes_shown(
         listed.append({"change": name, "form": form, "error_over_change": float(share[-1]), "theory": theory,
                        "bend_within_the_area_ccd": bend, "cause": text})  # fmt: skip
     data["causes"] = listed
-    context.add(
-        Table(
-            "causes",
-            "What limits each formula, one change at a time",
-            "Error over the change at the area CCD's edge, from images; what the named cause alone gives; and by how "
-            "much the share changes from the smallest change to the edge: the formulas are wrong in scale, not bent.",
-            ("change", "form", "measured", "by the cause", "bend", "cause"),
-            rows,
-        )
+    context.table(
+        "causes",
+        "What limits each formula, one change at a time",
+        "Error over the change at the area CCD's edge, from images; what the named cause alone gives; and by how "
+        "much the share changes from the smallest change to the edge: the formulas are wrong in scale, not bent.",
+        ("change", "form", "measured", "by the cause", "bend", "cause"),
+        rows,
     )
 
 
-def singles_shown(context: Context, ranges: Mapping[str, Mapping[str, list[Range]]], data: dict[str, object]) -> None:
+def singles_shown(
+    context: Context, ranges: Mapping[str, Mapping[str, list[turns.Range]]], data: dict[str, object]
+) -> None:
     """Domains of every formula by itself."""
     rows: list[list[Cell]] = []
     found: dict[str, object] = {}
     for instrument, own in ranges.items():
         of_instrument: dict[str, object] = {}
-        for name in NAMES:
+        for name in turns.NAMES:
             both = own[name]
             per, unit = (1e-3, "mm") if name == "d_f" else (1.0, "arcsec")
             window = min(r.window for r in both) * per
             lost = min(r.lost for r in both)
             entry: dict[str, object] = {f"area_ccd_ends_at_{unit}": window, f"beam_cut_at_{unit}": lost * per}
             for form in FORMS:
-                cells = [limit_text(both, form, kind, per) for kind in KINDS]
+                cells = [limit_text(both, form, kind, per) for kind in turns.KINDS]
                 if form in (PRINTED, CORRECTED) or (form == JOINT and name == "d_f"):
                     ends = [f"{fixed_digits(x)} {'mm' if name == 'd_f' else '″'}" for x in (window, lost * per)]
                     rows.append([instrument, SYMBOLS[name], form, *cells, *(x.replace(" ″", "″") for x in ends)])
                 entry[form] = {
                     kind: {f"limit_{unit}": limit_of(both, form, kind)[0] * per, "by": limit_of(both, form, kind)[1]}
-                    for kind in KINDS
+                    for kind in turns.KINDS
                 }
             of_instrument[name] = entry
         found[instrument] = of_instrument
     data["single_changes"] = found
-    context.add(
-        Table(
+    context.table(
             "domains",
             "How far each formula holds, one change at a time",
             "The worse of the two directions. Printed: (2), (3), (5), (7). Corrected: f_x for Δα, half of Δγ times "
@@ -299,61 +289,54 @@ def singles_shown(context: Context, ranges: Mapping[str, Mapping[str, list[Range
             ("instrument", "change", "form", "within 1 %", "within 0.1″ or 0.04 mm", "within what is claimed",
              "area CCD ends at", "aperture cuts the beam at"),
             rows,
-        )
-    )  # fmt: skip
+        )  # fmt: skip
     first = next(iter(ranges))
-    context.add(
-        SvgFigure(
-            "domains-figure",
-            f"Error of each formula over the size of the change, {first}",
-            "Marks: noise-free rendered images through the centroid; lines: exact trace. Shaded: what the instrument's "
-            "area CCDs can record. At the right end an aperture begins to cut the beam.",
-            singles_svg(ranges[first]),
-        )
+    context.figure(
+        "domains-figure",
+        f"Error of each formula over the size of the change, {first}",
+        "Marks: noise-free rendered images through the centroid; lines: exact trace. Shaded: what the instrument's "
+        "area CCDs can record. At the right end an aperture begins to cut the beam.",
+        singles_svg(ranges[first]),
     )
 
 
-def joint_shown(context: Context, corners: Corners, found: Separation, data: dict[str, object]) -> None:
+def joint_shown(context: Context, corners: turns.Corners, found: turns.Separation, data: dict[str, object]) -> None:
     """All four at once."""
     rows: list[list[Cell]] = []
     for form in (JOINT, CORRECTED, CALIBRATED):
-        for read in NAMES:
-            gains = [found.mean(form, read, changed)[0] * _PER[changed] / _PER[read] for changed in NAMES]
+        for read in turns.NAMES:
+            gains = [found.mean(form, read, changed)[0] * _PER[changed] / _PER[read] for changed in turns.NAMES]
             rows.append(
                 [form, f"{SYMBOLS[read]} [{_SHOWN[read]}]", *(_signed(value) for value in gains),
-                 corners.text(key(form, read)), corners.text(key(form, read, fine=True))]
+                 corners.text(turns.key(form, read)), corners.text(turns.key(form, read, fine=True))]
             )  # fmt: skip
     heads = (
-        "form", "reading", *(f"per {SYMBOLS[n]} [{_SHOWN[n]}]" for n in NAMES), "box within the claim",
+        "form", "reading", *(f"per {SYMBOLS[n]} [{_SHOWN[n]}]" for n in turns.NAMES), "box within the claim",
         "box within 0.1″ or 0.04 mm",
     )  # fmt: skip
-    context.add(
-        Table(
-            "joint",
-            "All four changes at once",
-            f"Readings of {found.trials} random states regressed on the true changes, mean of both cameras. Box: "
-            "how many times ±(4″, 4″, 24″, 0.95 mm) may be taken until the error at any of its 16 corners passes the "
-            "limit.",
-            heads,
-            rows,
-        )
+    context.table(
+        "joint",
+        "All four changes at once",
+        f"Readings of {found.trials} random states regressed on the true changes, mean of both cameras. Box: "
+        "how many times ±(4″, 4″, 24″, 0.95 mm) may be taken until the error at any of its 16 corners passes the "
+        "limit.",
+        heads,
+        rows,
     )
     data["all_at_once"] = {
         "box_half_widths": {"d_alpha_arcsec": 4.0, "d_beta_arcsec": 4.0, "d_gamma_arcsec": 24.0, "d_f_um": 950.0},
-        "gain": {form: [[found.mean(form, r, c)[0] for c in NAMES] for r in NAMES] for form in FORMS},
-        "gain_sigma": {form: [[found.mean(form, r, c)[1] for c in NAMES] for r in NAMES] for form in FORMS},
-        "gain_units": [f"{UNITS[r]} per {UNITS[c]}" for r in NAMES for c in NAMES],
+        "gain": {form: [[found.mean(form, r, c)[0] for c in turns.NAMES] for r in turns.NAMES] for form in FORMS},
+        "gain_sigma": {form: [[found.mean(form, r, c)[1] for c in turns.NAMES] for r in turns.NAMES] for form in FORMS},
+        "gain_units": [f"{turns.UNITS[r]} per {turns.UNITS[c]}" for r in turns.NAMES for c in turns.NAMES],
         "box_share": {name: {"limit": corners.limit(name)[0], "by": corners.limit(name)[1]}
                       for name in corners.images.value},
     }  # fmt: skip
-    context.add(
-        SvgFigure(
-            "joint-figure",
-            "All four changes at once: the worst of 16 corners over the size of the box",
-            "1 on the horizontal axis is ±(4″, 4″, 24″, 0.95 mm), which just keeps the spots on the area CCDs. Marks: "
-            "images; lines: exact trace, until an aperture cuts a beam.",
-            joint_svg(corners, (JOINT, CORRECTED, CALIBRATED)),
-        )
+    context.figure(
+        "joint-figure",
+        "All four changes at once: the worst of 16 corners over the size of the box",
+        "1 on the horizontal axis is ±(4″, 4″, 24″, 0.95 mm), which just keeps the spots on the area CCDs. Marks: "
+        "images; lines: exact trace, until an aperture cuts a beam.",
+        joint_svg(corners, (JOINT, CORRECTED, CALIBRATED)),
     )
 
 
@@ -371,8 +354,8 @@ def defocus_shown(
     theory = {"d_alpha": (1.0 / f_x**2 / ARCSEC, None), "d_beta": (None, 1.0 / f**2 / ARCSEC)}
     rows: list[list[Cell]] = []
     listed: dict[str, object] = {}
-    for k, name in enumerate(NAMES):
-        unit = UNITS[name]
+    for k, name in enumerate(turns.NAMES):
+        unit = turns.UNITS[name]
         limits = [curves.crossing(f"{name} {kind}") for kind in ("fine", "claimed")]
         gain_change = max(abs(g[CORRECTED][k] / constant[0.0][CORRECTED][k] - 1.0) for g in constant.values())
         cells: list[Cell] = [f"{1e-9 * pupil.gradient[k, axis]:.4g}" for axis in (0, 1)]
@@ -392,8 +375,7 @@ def defocus_shown(
             "change_of_gain_in_a_defocused_camera": float(gain_change),
         }
     data["defocus"] = listed
-    context.add(
-        Table(
+    context.table(
             "defocus",
             "False readings by defocus between before and after",
             "Corrected factors, reading minus truth. Pupil: by how much the reading per µm changes for each mm by "
@@ -403,16 +385,13 @@ def defocus_shown(
             ("reading", "per µm of piston", "at 40 µm", "0.1″ or 0.04 mm at", "claimed error at",
              "per µm and mm along X", "per µm and mm along Y", "theory, size", "gain, defocused"),
             rows,
-        )
-    )  # fmt: skip
-    context.add(
-        SvgFigure(
-            "defocus-figure",
-            "Defocus and the place of the monitor's beam in the pupil",
-            "Left: false Δα over the sub-aperture's X, false Δβ over its Y, images and theory z h/f². Right: false "
-            "readings of the instrument as built over the motion of the line CCD along Z.",
-            defocus_svg(pupil, curves, (f_x, f)),
-        )
+        )  # fmt: skip
+    context.figure(
+        "defocus-figure",
+        "Defocus and the place of the monitor's beam in the pupil",
+        "Left: false Δα over the sub-aperture's X, false Δβ over its Y, images and theory z h/f². Right: false "
+        "readings of the instrument as built over the motion of the line CCD along Z.",
+        defocus_svg(pupil, curves, (f_x, f)),
     )
 
 
@@ -421,12 +400,11 @@ def field_shown(context: Context, points: Sequence[FieldPoint], data: dict[str, 
     shown = ((PRINTED, "d_beta"), (CORRECTED, "d_beta"), (CORRECTED, "d_alpha"), (CORRECTED, "d_gamma"),
              (CORRECTED, "d_f"))  # fmt: skip
     rows: list[list[Cell]] = [
-        [math.degrees(p.field), p.separation, *(float(p.gains[form][NAMES.index(n)]) for form, n in shown),
-         float(1e-6 * p.slope[NAMES.index("d_alpha")]), float(1e-6 * p.slope[NAMES.index("d_f")])]
+        [math.degrees(p.field), p.separation, *(float(p.gains[form][turns.NAMES.index(n)]) for form, n in shown),
+         float(1e-6 * p.slope[turns.NAMES.index("d_alpha")]), float(1e-6 * p.slope[turns.NAMES.index("d_f")])]
         for p in points
     ]  # fmt: skip
-    context.add(
-        Table(
+    context.table(
             "field",
             "The area CCDs nearer to the middle of the line",
             f"The instrument built anew; {_GAIN_TEXT} of a single change each, and false readings by defocus.",
@@ -434,20 +412,17 @@ def field_shown(context: Context, points: Sequence[FieldPoint], data: dict[str, 
              "false Δf [µm/µm]"),
             rows,
             (2, 4, 5, 5, 5, 5, 5, 6, 5),
-        )
-    )  # fmt: skip
-    context.add(
-        SvgFigure(
-            "field-figure",
-            "Scale of the readings over the field of the area CCDs",
-            "Reading over truth less one. Only the printed cos²β depends on the field: it follows cos²β (line), the "
-            "corrected forms stay within 0.4 %.",
-            field_svg(points),
-        )
+        )  # fmt: skip
+    context.figure(
+        "field-figure",
+        "Scale of the readings over the field of the area CCDs",
+        "Reading over truth less one. Only the printed cos²β depends on the field: it follows cos²β (line), the "
+        "corrected forms stay within 0.4 %.",
+        field_svg(points),
     )
     data["field"] = [
         {"field_deg": math.degrees(p.field), "separation_m": p.separation,
-         "reading_over_truth": {form: dict(zip(NAMES, p.gains[form].tolist(), strict=True)) for form in FORMS},
+         "reading_over_truth": {form: dict(zip(turns.NAMES, p.gains[form].tolist(), strict=True)) for form in FORMS},
          "false_d_alpha_arcsec_per_um": float(p.slope[0] * 1e-6), "false_d_f_um_per_um": float(p.slope[3] * 1e-6)}
         for p in points
     ]  # fmt: skip
@@ -458,18 +433,22 @@ def returns_shown(context: Context, found: Sequence[Response], data: dict[str, o
     rows: list[list[Cell]] = [
         [r.kind, float(r.across.mean()), float(r.along.mean()), *(float(g) for g in r.gain), r.note] for r in found
     ]
-    context.add(
-        Table(
-            "returns",
-            "Kinds of return",
-            "Motion of the spots over that of the line CCD, and corrected readings over truth, by noise-free images.",
-            ("return", "across the line", "along the line", *(f"{SYMBOLS[n]} read / true" for n in NAMES), "remark"),
-            rows,
-            (None, 4, 4, 4, 4, 4, 4),
-        )
+    context.table(
+        "returns",
+        "Kinds of return",
+        "Motion of the spots over that of the line CCD, and corrected readings over truth, by noise-free images.",
+        (
+            "return",
+            "across the line",
+            "along the line",
+            *(f"{SYMBOLS[n]} read / true" for n in turns.NAMES),
+            "remark",
+        ),
+        rows,
+        (None, 4, 4, 4, 4, 4, 4),
     )
     data["returns"] = {
         r.kind: {"spot_per_line_ccd_across": r.across.tolist(), "spot_per_line_ccd_along": r.along.tolist(),
-                 "reading_over_truth": dict(zip(NAMES, r.gain.tolist(), strict=True))}
+                 "reading_over_truth": dict(zip(turns.NAMES, r.gain.tolist(), strict=True))}
         for r in found
     }  # fmt: skip

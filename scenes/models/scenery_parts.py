@@ -59,17 +59,6 @@ class Finishes:
         }[coating]
 
 
-IDEAL = Finishes(
-    mirror=Finish(reflectance=1.0),
-    mirror_back=ABSORBER,
-    coated=Finish(transmission=1.0),
-    ground=ABSORBER,
-    detector=Finish(records=True),
-    board=ABSORBER,
-)
-"""Nothing is lost or scattered on the way: for checks of geometry."""
-
-
 @dataclass(frozen=True)
 class Detector:
     """A pixel grid in the frame of its surface: columns along x, rows along y, centred.
@@ -128,11 +117,7 @@ class SceneSurface:
 
 
 def mirror_surface(
-    element: Element,
-    placed: PlacedBodies,
-    finishes: Finishes,
-    lit_side: float = 1.0,
-    motion: Motion = AT_REST,
+    element: Element, placed: PlacedBodies, finishes: Finishes, lit_side: float = 1.0, motion: Motion = AT_REST
 ) -> SceneSurface:
     """The surface of a reflecting element that is not a face of a solid.
 

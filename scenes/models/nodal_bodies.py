@@ -1,4 +1,5 @@
-"""Bodies that tables of temperatures warm: what is linear of a table, and what the rest does to mirrors and glass.
+"""Tables of nodes that jobs name: mirrors and faces that finite-element programs deformed, and bodies that tables of
+temperatures warm: what is linear of such a table, and what the rest does to mirrors and glass.
 
 The linear part, nearest over the body's volume, goes the way of every linear temperature (``ThermalModel``): the body
 grows, bends and changes its index with it, and what it carries follows. What is left deforms the body's own finite
@@ -13,17 +14,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optics.geometry.aperture import Aperture
+from optics.geometry.pose import Pose
+from optics.geometry.surface import Surface
 from optics.geometry.tree import Motion, State
 from optics.numerics.frozen_map import FrozenMap
+from optics.raytrace.assembly import Interaction
 from optics.thermal.deformation import Displacement, FaceChange
 from optics.thermal.heat import Temperature
 from optics.thermal.nodal_deformation import PRINTED, SEEN, TERMS, NodalDeformation, NodesError, nodal_deformation
 from optics.thermal.nodal_temperature import Coverage, NodalTemperature, linear_part
-from scenes.models.deformed_faces import pose_of_frame
+from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import Held, ThermalModel
 from scenes.specs.job import JobSpec
-from scenes.specs.job_tables import TableTemperatureSpec
-from scenes.yaml.node_table import read_temperatures
+from scenes.specs.job_tables import DeformationSpec, TableTemperatureSpec
+from scenes.yaml.errors import KeyPath, unknown
+from scenes.yaml.node_table import read_nodes, read_temperatures
 
 COARSE_CELLS, FINE_CELLS = 12, 16
 """Finite elements across a mirror for what is not linear; the difference of the two says how well they follow it."""
@@ -224,7 +230,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
         sizes = thermal.face_radii(path)
         for face, change in finer.items():
             motion, lost = Motion(change.rotate, change.shift, figure=FrozenMap(change.figure)), change.residual_rms
-            if thermal.is_mirror(path):
+            if path in thermal.mirrors:
                 nodal = _at_nodes(thermal, path, solved[1])
                 motion, lost = nodal.motion(), nodal.rms(nodal.lost)
             faces[face] = HeatedFace(motion, lost, _apart(change, coarser[face], sizes[face]))
@@ -242,7 +248,7 @@ def _at_nodes(thermal: ThermalModel, path: str, moved: Displacement) -> NodalDef
 
 def _elastic(thermal: ThermalModel, path: str) -> tuple[Held | None, Held | None]:
     """Coarse and fine finite elements of a body with what holds them."""
-    if thermal.is_mirror(path):
+    if path in thermal.mirrors:
         return thermal.elastic(path, cells=COARSE_CELLS), thermal.elastic(path, cells=FINE_CELLS)
     if path not in thermal.solids:
         return None, None
@@ -278,3 +284,68 @@ def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
 def with_heat(fields: Mapping[str, Temperature], heated: Mapping[str, HeatedBody]) -> dict[str, Temperature]:
     """The linear fields of bodies with those of their tables added."""
     return {**fields, **{path: fields.get(path, Temperature()) + body.linear for path, body in heated.items()}}
+
+
+def deformed_face(instrument: Instrument, job: JobSpec, path: str, spec: DeformationSpec) -> NodalDeformation:
+    """What a job's table does to one body.
+
+    Args:
+        instrument: the instrument.
+        job: that names the table, for what is wrong.
+        path: of the body, which has a reflecting or refracting surface.
+        spec: the table, as ``scenes.specs.job.with_tables`` has left it.
+
+    Raises:
+        InputError: no such frame; nodes that are not on the surface or do not cover it.
+    """
+    key = ("perturb", path, "deformation")
+    surface, aperture = _face(instrument, path)
+    nodes = read_nodes(spec.table, spec.unit, spec.field, spec.sha256)
+    pose = pose_of_frame(instrument, job, key, path, spec.frame)
+    points, moves = pose.apply(nodes.points), nodes.moves @ pose.rotation.T
+    try:
+        return nodal_deformation(points, moves, surface, aperture, spec.terms)
+    except NodesError as error:
+        text = f"{spec.table} does not describe {path}: {error}"
+        raise job.error(text, (*key, "table"), allowed=error.allowed) from error
+
+
+def pose_of_frame(instrument: Instrument, job: JobSpec, key: KeyPath, path: str, frame: str | None) -> Pose:
+    """Where the nominal frame in which a table is told stands in that of the body.
+
+    Args:
+        instrument: the instrument.
+        job: that names the table, for what is wrong.
+        key: of the table's specification in there.
+        path: of the body.
+        frame: path of the body in whose frame the nodes are told, None for its own.
+
+    Raises:
+        InputError: no such frame.
+    """
+    if frame is None:
+        return Pose()
+    known = instrument.assembly.tree.paths
+    if frame not in known:
+        raise job.error(unknown("no such node", frame, sorted(known)), (*key, "frame"))
+    placed = instrument.assembly.place()
+    return placed.pose(path).inverse() @ placed.pose(frame)
+
+
+def _face(instrument: Instrument, path: str) -> tuple[Surface, Aperture]:
+    """Shape and clear aperture of a body's optical surface, the widest where several elements use it."""
+    own = [
+        e
+        for e in instrument.assembly.elements.values()
+        if e.body == path and e.aperture is not None and e.interaction is not Interaction.PASS
+    ]
+    widest = max(own, key=lambda e: _area(e.aperture))
+    assert widest.aperture is not None
+    return widest.surface, widest.aperture
+
+
+def _area(aperture: Aperture | None) -> float:
+    if aperture is None:
+        return 0.0
+    x0, x1, y0, y1 = aperture.bounds
+    return (x1 - x0) * (y1 - y0)

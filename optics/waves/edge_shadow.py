@@ -1,0 +1,286 @@
+"""Shadows that the edges of surfaces throw into exit pupils: obscurations, vanes, vignetting.
+
+An edge lies on a surface, a pupil is a function over the stop. The rays of one image meet the surface at places that
+are a smooth function of the stop's coordinates, as long as edges stop no ray in the trace. This function is fitted by
+polynomials and inverted at the corners of the edge's outline. What the edge blocks then is convex polygons on the stop,
+which ``optics.waves.pupil_shadow`` takes out of the pupil exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
+from optics.geometry.polygon import area, clip, compact, difference, intersect, sides, widened
+from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.quadrature import PupilNodes
+from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate
+from optics.waves.pupil_stack import products, to_terms
+
+DEGREE = 10
+"""Of the polynomials from the stop to a surface."""
+
+ROUND_SIDES = 48
+"""Of the polygon that stands for a round edge and has its area."""
+
+MOST_PIECES = 120
+"""Of a shadow: the time of a transfer function grows with the square of their number."""
+
+_WINDOW, _WINDOW_SIDES = 1.2, 16
+"""Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
+
+_STEPS, _CLOSE = 12, 1e-9
+"""Newton's steps for a corner at most, and when it has arrived, in radii of the stop."""
+
+WORST_FIT = 3e-4
+"""Largest distance of the rays from the polynomials, in units of the beam's size on the surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class StopOutlines:
+    """Outlines of edges as the images see them on the stop's unit disk: convex polygons, counterclockwise.
+
+    Attributes:
+        clear: light comes through inside of all of them only, (B, V, 2) each.
+        blocked: light is stopped in any of them, (B, V, 2) each; some are empty.
+    """
+
+    clear: tuple[np.ndarray, ...] = ()
+    blocked: tuple[np.ndarray, ...] = ()
+
+    def __add__(self, other: StopOutlines) -> StopOutlines:
+        """The edges of both."""
+        return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
+
+    def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
+        """What edges and other shadows take of ``count`` pupils.
+
+        Args:
+            count: B.
+            further: convex polygons of other shadows, counterclockwise, (B, V, 2) each.
+
+        Returns:
+            Convex polygons that do not overlap, (B, K, W, 2); some are empty.
+        """
+        # each image by itself: what is one piece in one of them may be many in another
+        each = [self._of_one(number, further) for number in range(count)]
+        if max(map(len, each)) > MOST_PIECES:
+            raise UnphysicalError(
+                f"edges cut the pupil into {max(map(len, each))} pieces of shadow, more than {MOST_PIECES}, which its "
+                "transfer function does not take"
+            )
+        pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
+        out = np.zeros((count, pieces, corners, 2))
+        for number, one in enumerate(each):
+            out[number, : len(one)] = widened(one, corners)
+        return out
+
+    def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
+        """``shadows`` of one image, (K, W, 2)."""
+        some = slice(number, number + 1)
+        lit, rim = _window(1), sides(_window(1, 1.0, RIM_SIDES))
+        for polygon in self.clear:
+            lit = compact(intersect(lit, *sides(polygon[some])))
+        # what is dark already outside of the clear edges is no matter of the others
+        dark = [intersect(polygon[some], *sides(lit)) for polygon in (*self.blocked, *further)]
+        beyond = _outside([lit], 1) if self.clear else []
+        dark, beyond = (
+            [compact(piece) for piece in kind if area(intersect(piece, *rim))[0] > SMALLEST] for kind in (dark, beyond)
+        )
+        pieces, _ = separate(dark, fewest=True)
+        every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
+        width = max((len(piece) for piece in every), default=3)
+        return np.stack([widened(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
+
+
+def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNodes) -> StopOutlines:
+    """The edges of one surface as B images see them.
+
+    Args:
+        places: where the rays through ``nodes`` meet the surface, in its own x and y, (B, N, 2), metres; of rays that
+            edges stop, too.
+        edges: of the surface; light comes through where all let it.
+        nodes: quadrature over the stop's unit disk.
+
+    Raises:
+        UnphysicalError: places that no polynomials follow, as of a surface near a focus.
+    """
+    terms = to_terms(nodes, DEGREE) @ places
+    beam = np.ptp(places, axis=1).max(axis=-1)
+    worst = float(np.max(np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]))
+    if not worst < WORST_FIT:
+        raise UnphysicalError(
+            f"rays meet a surface with edges at places that polynomials of degree {DEGREE} miss by {worst:.2g} of the "
+            f"beam's size (at most {WORST_FIT:g}): no pupil can be cut there"
+        )
+    clear, blocked = [], []
+    for edge in edges:
+        for outlines, blocks in _outlines(edge):
+            seen = [_on_the_stop(outline, terms) for outline in outlines]
+            if edge.blocks and isinstance(edge.shape, Circle) and edge.shape.inner and _covers(edge, edge.shape, terms):
+                # a ring that reaches beyond every beam lets light through its hole alone
+                hole = Edge(Circle(edge.shape.inner, edge.shape.centre), turn=edge.turn)
+                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole))[0]]
+            elif blocks:
+                blocked += seen
+            elif len(seen) == 1:
+                clear += seen
+            else:
+                blocked += _outside(seen, len(places))
+    return StopOutlines(tuple(clear), tuple(blocked))
+
+
+def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
+    """Whether the disk within the outer edge of a ring holds all of the stop in every image."""
+    disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.turn)
+    (outline,), _ = next(_outlines(disk))
+    rim = _window(len(terms), 1.0, RIM_SIDES)
+    inside = intersect(rim, *sides(_on_the_stop(outline, terms)))
+    return bool(np.all(area(rim) - area(inside) < SMALLEST))
+
+
+def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
+    """Convex outlines (V, 2) on the surface, and whether light is stopped in them or outside of all of them."""
+    shape = edge.shape
+    match shape:
+        case Circle():
+            angle = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
+            step = angle[1]
+            unit = np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            outer = shape.radius * unit
+            if not shape.inner:
+                yield _turned([outer], edge), edge.blocks
+            elif edge.blocks:
+                # sectors whose corners are those of their neighbours, so that no gap opens between them on the stop
+                both = np.stack([outer, np.roll(outer, -1, axis=0)], axis=1)
+                sectors = np.concatenate([both, (shape.inner / shape.radius) * both[:, ::-1]], axis=1)
+                yield _turned(list(sectors), edge), True
+            else:
+                yield _turned([outer], edge), False
+                yield _turned([shape.inner * unit], edge), True
+        case Ellipse():
+            angle = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
+            step = angle[1]
+            unit = np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+        case Rectangle():
+            corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+            yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks
+        case Ray():
+            half = 0.5 * shape.width
+            yield _turned([np.array([[0.0, -half], [_FAR, -half], [_FAR, half], [0.0, half]])], edge), edge.blocks
+        case Polygon():
+            corners = np.array(shape.corners) - np.array(shape.centre)
+            yield _turned(_convex_parts(corners), edge), edge.blocks
+
+
+_FAR = 100.0
+"""Where a vane ends, metres: outside of every beam."""
+
+
+def _turned(outlines: list[np.ndarray], edge: Edge) -> list[np.ndarray]:
+    """Outlines about the origin at the edge's place and turn."""
+    c, s = np.cos(edge.turn), np.sin(edge.turn)
+    return [outline @ np.array([[c, s], [-s, c]]) + np.array(edge.shape.centre) for outline in outlines]
+
+
+def _convex_parts(corners: np.ndarray) -> list[np.ndarray]:
+    """A polygon (V, 2) whose sides do not cross, as convex ones: itself, or triangles cut off ear by ear."""
+    rest = corners if area(corners[None])[0] > 0.0 else corners[::-1]
+    out = []
+    while len(rest) > 3:
+        before, after = np.roll(rest, 1, axis=0), np.roll(rest, -1, axis=0)
+        turn = _cross(rest - before, after - rest)
+        if np.all(turn >= 0.0):
+            break
+        for k in np.flatnonzero(turn > 0.0):
+            ear = np.stack([before[k], rest[k], after[k]])
+            others = np.delete(rest, [(k - 1) % len(rest), k, (k + 1) % len(rest)], axis=0)
+            normal, limit = sides(ear[None])
+            if not np.any(np.all(others @ normal[0].T <= limit[0], axis=-1)):
+                out.append(ear)
+                rest = np.delete(rest, k, axis=0)
+                break
+        else:
+            raise UnphysicalError("the sides of a polygonal edge cross each other")
+    return [*out, rest]
+
+
+def _divided(corners: np.ndarray) -> np.ndarray:
+    """A polygon (V, 2) with further corners on its sides, which may bend on the stop."""
+    share = np.arange(_PARTS)[:, None] / _PARTS
+    return np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+
+
+_PARTS = 8
+"""Of each side of a rectangle."""
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _window(count: int, radius: float = _WINDOW, number: int = _WINDOW_SIDES) -> np.ndarray:
+    """A regular polygon about a disk, (B, number, 2)."""
+    angle = 2.0 * np.pi * (np.arange(number) + 0.5) / number
+    corners = radius / np.cos(np.pi / number) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.broadcast_to(corners, (count, *corners.shape))
+
+
+def _on_the_stop(outline: np.ndarray, terms: np.ndarray) -> np.ndarray:
+    """An outline (V, 2) on the surface as seen on the stop of B images, counterclockwise, (B, W, 2); empty where it
+    lies outside of the beam.
+    """
+    middle, slope = _near_the_middle(terms)
+    place = np.broadcast_to(outline, (len(terms), *outline.shape))
+    guess = np.einsum("bij,bvj->bvi", np.linalg.inv(slope), place - middle[:, None])
+    packed = np.concatenate([guess, place], axis=-1)
+    turned = area(packed) < 0.0
+    packed = np.where(turned[:, None, None], packed[:, ::-1], packed)
+    cut = intersect(packed, *sides(_window(len(terms))))
+    at, place = cut[..., :2].copy(), cut[..., 2:]
+    empty = area(cut) < SMALLEST
+    for _ in range(_STEPS):
+        values, rise = _followed(terms, at)
+        step = np.einsum("bvij,bvj->bvi", np.linalg.inv(rise), place - values)
+        at += np.where(empty[:, None, None], 0.0, step)
+        if np.max(np.abs(step), where=~empty[:, None, None], initial=0.0) < _CLOSE:
+            break
+    return np.where(empty[:, None, None], at[:, :1], at)
+
+
+def _near_the_middle(terms: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Place (B, 2) of the ray through the stop's middle, and the derivatives of places there, (B, 2, 2)."""
+    values, rise = _followed(terms, np.zeros((len(terms), 1, 2)))
+    return values[:, 0], rise[:, 0]
+
+
+def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
+    """Places (B, V, 2) of rays through points (B, V, 2) of the stop, and their derivatives, (B, V, 2, 2)."""
+
+    def value(points: np.ndarray) -> np.ndarray:
+        return np.asarray(products(points[..., 0], points[..., 1], DEGREE) @ terms)
+
+    ways = step * np.eye(2)
+    rise = np.stack([(value(at + way) - value(at - way)) / (2.0 * step) for way in ways], axis=-1)
+    return value(at), rise
+
+
+def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
+    """What the window has outside of all clear polygons (B, V, 2), as convex pieces."""
+    rest = [_window(count)]
+    for polygon in clear:
+        pieces = []
+        for part in rest:
+            empty = area(polygon) < SMALLEST
+            whole = np.where(empty[:, None, None], part, part[:, :1])
+            normal, limit = sides(polygon)
+            off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
+            cut = difference(part, polygon, np.argsort(off)[::-1])
+            cut = [np.where(empty[:, None, None], piece[:, :1], piece) for piece in cut]
+            pieces += [piece for piece in (whole, *cut) if np.any(area(piece) > SMALLEST)]
+        rest = pieces
+    return rest

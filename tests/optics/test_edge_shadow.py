@@ -1,0 +1,105 @@
+"""Edges of surfaces as shadows in pupils, against a raster of the same edges."""
+
+import numpy as np
+import pytest
+
+from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
+from optics.geometry.polygon import area, covered
+from optics.numerics import quadrature
+from optics.numerics.physical_error import UnphysicalError
+from optics.waves import edge_shadow
+from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
+from optics.waves.pupil_shadow import separate
+
+NODES = quadrature.disk(14)
+AXIS = (np.arange(300) + 0.5) / 150.0 - 1.0
+POINTS = np.stack([a.ravel() for a in np.meshgrid(AXIS, AXIS)], axis=-1)
+POINTS = POINTS[np.hypot(*POINTS.T) < 1.0]
+
+
+def seen(points: np.ndarray, number: int) -> np.ndarray:
+    """Where rays through points of the stop meet a surface: scaled, turned over, shifted, a little bent; metres."""
+    x, y = points.T
+    flip = -1.0 if number % 2 else 1.0
+    bend = 0.005 * (x * x + y * y)
+    return 0.15 * np.stack([(1.0 + bend) * x + 0.05 * number, flip * (0.97 + bend) * y], axis=-1)
+
+
+def lit(edges: list[Edge], number: int) -> np.ndarray:
+    places = seen(POINTS, number)
+    return np.all([edge.passes(*places.T) for edge in edges], axis=0)
+
+
+def shadows(edges: list[Edge], count: int = 3) -> np.ndarray:
+    places = np.stack([seen(np.stack([NODES.x, NODES.y], axis=-1), k) for k in range(count)])
+    return outlines_on_stop(places, edges, NODES).shadows(count)
+
+
+VANES = [Edge(Ray(0.006), True, turn) for turn in np.radians([30.0, 150.0, 270.0])]
+STAR = Polygon(((0.05, 0.0), (0.015, 0.015), (0.0, 0.06), (-0.015, 0.015), (-0.05, 0.0), (0.0, -0.03)))
+
+
+@pytest.mark.parametrize(
+    "edges",
+    [
+        [Edge(Circle(0.05), True)],
+        [Edge(Circle(0.05), True), *VANES],
+        [Edge(Circle(0.14, (0.02, 0.0)))],
+        [Edge(Circle(0.5, inner=0.12), True)],
+        [Edge(Circle(0.09, (0.03, 0.02), inner=0.05), True)],
+        [Edge(Circle(0.16, inner=0.04))],
+        [Edge(Rectangle(0.1, 0.13), turn=0.3), Edge(Ellipse(0.03, 0.06), True, 0.7)],
+        [Edge(STAR, True)],
+        [Edge(STAR)],
+        [
+            Edge(Circle(0.16)),
+            Edge(Circle(0.05), True),
+            Edge(Circle(0.049), True),
+            Edge(Circle(0.05, (1e-12, 0.0)), True),
+        ],
+    ],
+    ids=["obscured", "spider", "vignetted", "hole", "ring", "annulus", "mixed", "star", "star-hole", "nested"],
+)
+def test_shadows_are_what_edges_block(edges) -> None:
+    pieces = shadows(edges)
+    for number in range(len(pieces)):
+        expected, found = lit(edges, number), ~covered(pieces, POINTS)[number]
+        # along an edge single points of the raster fall on the other side of the polygon that stands for a circle
+        assert np.mean(expected != found) < 4e-3
+        assert np.mean(expected) == pytest.approx(np.mean(found), abs=1.5e-3)
+
+
+def test_no_light_is_taken_twice() -> None:
+    """Pieces do not overlap: their areas within the stop add up to what the raster has."""
+    edges = [
+        Edge(Circle(0.05), True),
+        Edge(Circle(0.05, (0.004, 0.0)), True),
+        *VANES,
+        Edge(Rectangle(0.02, 0.09), True),
+    ]
+    for number, pieces in enumerate(shadows(edges)):
+        within = [covered(piece[None, None], POINTS)[0] for piece in pieces]
+        assert np.mean(np.sum(within, axis=0)) == pytest.approx(1.0 - np.mean(lit(edges, number)), abs=1.5e-3)
+
+
+def test_a_polygon_that_is_empty_but_for_rounding_leaves_a_part_once() -> None:
+    """Of two images one has a sliver where the other has a square: what it is cut from counts once in both."""
+    square = np.array([[0.0, 0.0], [0.4, 0.0], [0.4, 0.4], [0.0, 0.4]])
+    sliver = np.array([[0.1, 0.1], [0.3, 0.1], [0.3, 0.1 + 1e-10], [0.1, 0.1 + 1e-10]])
+    first, second = np.stack([square, sliver]), np.stack([square + 0.2, square + 0.2])
+    for fewest in (False, True):
+        pieces, _ = separate([first, second], fewest=fewest)
+        assert np.sum(area(pieces), axis=-1) == pytest.approx([0.28, 0.16], abs=1e-8)
+
+
+def test_too_many_pieces_and_rays_that_no_polynomials_follow_are_refused(monkeypatch) -> None:
+    with pytest.raises(UnphysicalError, match="polynomials of degree"):
+        outlines_on_stop(np.stack([NODES.x, np.sign(NODES.y)], axis=-1)[None], [Edge(Circle(0.3), True)], NODES)
+    monkeypatch.setattr(edge_shadow, "MOST_PIECES", 3)
+    with pytest.raises(UnphysicalError, match="pieces of shadow"):
+        shadows([Edge(Circle(0.05), True), *VANES])
+
+
+def test_edges_that_stop_nothing_leave_no_shadow() -> None:
+    assert shadows([Edge(Circle(1.0)), Edge(Circle(0.02, (3.0, 0.0)), True)]).shape[1] == 0
+    assert StopOutlines().shadows(2).shape == (2, 0, 3, 2)
