@@ -19,7 +19,8 @@ from optics.raytrace.assembly import Interaction
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.imaging import aim_collimated
-from scenes.lens.prescription import SEQUENCE, Glasses, Prescription
+from scenes.lens.prescription import SEQUENCE, Prescription
+from scenes.lens.statements import Glasses
 
 sys.path.append(str(Path(sys.prefix, "peers")))  # ray-optics, which setup.sh --test keeps out of all else
 
