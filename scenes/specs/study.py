@@ -312,6 +312,7 @@ UNITS = {
     **{name: name for name in ("pm", "nm", "um", "mm", "m", "km")},
     **{name: name for name in ("us", "ms", "s", "K", "mK", "percent", "ppm", "waves", "px", "DN", "mW", "W")},
     "K_per_m": "K/m",
+    "k_per_m": "K/m",
     "m_per_s": "m/s",
 }
 """Ending of a result's key -> unit."""
@@ -509,9 +510,16 @@ class StudySpec(TitledSpec):
 
 def unit_of(key: KeyPath) -> str:
     """The unit that the ending of a result's key says, empty if it says none: "um" for d_f_um, d_f_um_sigma and
-    d_f_um_sigma_noise.
+    d_f_um_sigma_noise, "m/arcsec" for height_m_per_arcsec, "1/mm" for nyquist_per_mm.
     """
     last = next((str(part) for part in reversed(key) if isinstance(part, str)), "")
     last = last.removesuffix(NOISE).removesuffix(TOTAL)
     endings = [ending for ending in UNITS if last.endswith(f"_{ending}")]
-    return UNITS[max(endings, key=len)] if endings else ""
+    if not endings:
+        return ""
+    ending = max(endings, key=len)
+    above = last.removesuffix(f"_{ending}")
+    if not above.endswith("_per"):
+        return UNITS[ending]
+    above = above.removesuffix("_per").removesuffix("etres")
+    return f"{unit_of((f'_{above}',)) or 1}/{UNITS[ending]}"
