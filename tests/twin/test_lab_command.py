@@ -70,7 +70,7 @@ def test_run_folder(done) -> None:
     folder, _ = done
     images = {f"images/{b}_field{k}_{e}" for b in BANDS for k in (1, 2) for e in ("along", "track")}
     artefacts = {"alignment.csv", "defocus.svg", "edges.svg", "mtf-budget.csv", "mtf-curves.svg", "mtf.csv"}
-    artefacts |= {"shims-1.csv", "through-focus.svg"}
+    artefacts |= {"places.csv", "curves.csv", "shims-1.csv", "through-focus.svg"}
     expected = {"manifest.json", "config.yaml", "focus.json", "report.html"}
     expected |= {f"artefacts/{name}" for name in artefacts}
     expected |= {f"{name}.{kind}" for name in images for kind in ("tiff", "png")}
