@@ -37,7 +37,7 @@ def imaging(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[int],
     source = DiskSource(middle, heading, across, 0.28)
 
     def work(seed: int) -> Any:
-        return tracer.run(source, paths, seed, look_up=0)
+        return tracer.run(source, paths, seed)
 
     assert work(0).nominal(detector).count > 0.8 * paths  # the prisms stand in the rest
     return work
@@ -53,7 +53,7 @@ def out_and_back(bench: Workbench, chosen: Instrument, paths: int) -> Callable[[
     source = DiskSource(wide.centre, wide.axis, wide.across, wide.radius, wide.cone, wide.narrow, 1.0 - 1e-9)
 
     def work(seed: int) -> Any:
-        return tracer.run(source, paths, seed, look_up=0)
+        return tracer.run(source, paths, seed)
 
     assert work(0).nominal(f"{channel.key}/area_ccd").count > 0.6 * paths
     return work

@@ -51,12 +51,12 @@ def test_roulette_and_floors_are_unbiased(backend, gf7_pair, sampling: Sampling)
     families = monitor_families(scenery, gf7_pair)
     source = pinhole(gf7_pair, backend, {}, gf7_pair.channels[0])
     tracer = PathTracer(backend, scenery, families, sampling)
-    runs = [tracer.run(source, 20_000, seed, look_up=0) for seed in range(24)]
+    runs = [tracer.run(source, 20_000, seed) for seed in range(24)]
     errors = np.array([run.balance.error for run in runs])
     assert errors.std() > 1e-6  # it is switched on
     assert abs(errors.mean()) < t.ppf(1.0 - 5e-4, 23) * errors.std(ddof=1) / np.sqrt(24)
     energy = np.array([run.nominal(CCD).energy for run in runs])
-    exact = PathTracer(backend, scenery, families).run(source, 400_000, 99, look_up=0).nominal(CCD)
+    exact = PathTracer(backend, scenery, families).run(source, 400_000, 99).nominal(CCD)
     error = np.hypot(energy.std(ddof=1) / np.sqrt(24), exact.error)
     assert abs(energy.mean() - exact.energy) < norm.ppf(1.0 - 5e-4) * error
 

@@ -24,7 +24,6 @@ import pytest
 from analysis.monitor import autocollimator, intersection_angle, monitoring, recovery
 from analysis.units import ARCSEC
 from scenes.specs.load import load_autocollimator_test
-from twin.laboratory import autocollimator_bench
 from twin.laboratory.autocollimator_bench import Reader, run_autocollimator_test
 from twin.validation.checks.check import REPRODUCED, UNDECIDED
 from twin.validation.checks.group import Context
@@ -162,7 +161,7 @@ def relation(change: Callable[[str, int, float, float], float]):
         def broken(axis, unit, between):
             return change(axis, unit, between, sound(axis, unit, between))
 
-        for module in (autocollimator, autocollimator_bench, table2):
+        for module in (autocollimator, table2):
             patch.setattr(module, "relation_factor", broken)
 
     return apply

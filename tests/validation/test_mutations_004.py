@@ -222,8 +222,8 @@ def chauvenet_swapped(monkeypatch):
     """What is to go stays, and the other way round."""
     right = dividing_error.chauvenet
 
-    def broken(readings, repeated=False, present=None):
-        keep = right(readings, repeated, present)
+    def broken(readings, present=None):
+        keep = right(readings, present)
         # where nothing is to go everything would: two readings have to stay for a mean
         out = ~keep
         out[..., :2] = True
