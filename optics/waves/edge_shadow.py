@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
-from optics.geometry.polygon import area, clip, compact, difference, intersect, sides, widened
+from optics.geometry.polygon import area, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
-from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate
+from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate, without
 from optics.waves.pupil_stack import products, to_terms
 
 DEGREE = 10
@@ -25,6 +25,10 @@ DEGREE = 10
 
 ROUND_SIDES = 48
 """Of the polygon that stands for a round edge and has its area."""
+
+_ANGLE = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
+_DISK = np.sqrt(_ANGLE[1] / np.sin(_ANGLE[1])) * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
+"""The polygon of a disk of radius 1, (ROUND_SIDES, 2)."""
 
 MOST_PIECES = 120
 """Of a shadow: the time of a transfer function grows with the square of their number."""
@@ -147,10 +151,7 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
     shape = edge.shape
     match shape:
         case Circle():
-            angle = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
-            step = angle[1]
-            unit = np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            outer = shape.radius * unit
+            outer = shape.radius * _DISK
             if not shape.inner:
                 yield _turned([outer], edge), edge.blocks
             elif edge.blocks:
@@ -160,12 +161,9 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
                 yield _turned(list(sectors), edge), True
             else:
                 yield _turned([outer], edge), False
-                yield _turned([shape.inner * unit], edge), True
+                yield _turned([shape.inner * _DISK], edge), True
         case Ellipse():
-            angle = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
-            step = angle[1]
-            unit = np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-            yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+            yield _turned([_DISK * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
         case Rectangle():
             corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
             yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks
@@ -273,14 +271,5 @@ def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:
     """What the window has outside of all clear polygons (B, V, 2), as convex pieces."""
     rest = [_window(count)]
     for polygon in clear:
-        pieces = []
-        for part in rest:
-            empty = area(polygon) < SMALLEST
-            whole = np.where(empty[:, None, None], part, part[:, :1])
-            normal, limit = sides(polygon)
-            off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
-            cut = difference(part, polygon, np.argsort(off)[::-1])
-            cut = [np.where(empty[:, None, None], piece[:, :1], piece) for piece in cut]
-            pieces += [piece for piece in (whole, *cut) if np.any(area(piece) > SMALLEST)]
-        rest = pieces
+        rest = [piece for part in rest for piece in without(part, polygon, fewest=True)]
     return rest

@@ -211,7 +211,7 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
     for number in order:
         parts = [polygons[number]]
         for before in done:
-            parts = [rest for part in parts for rest in _without(part, before, fewest)]
+            parts = [rest for part in parts for rest in without(part, before, fewest)]
         done += parts
         owners += [number] * len(parts)
     width = max((part.shape[1] for part in done), default=3)
@@ -219,8 +219,14 @@ def separate(polygons: list[np.ndarray], fewest: bool = False) -> tuple[np.ndarr
     return pieces, owners
 
 
-def _without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
-    """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils."""
+def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[np.ndarray]:
+    """Pieces of ``part`` outside of ``before``; itself if they do not meet in any of the pupils.
+
+    Args:
+        part: convex, (B, V, 2).
+        before: convex, counterclockwise, (B, W, 2); some may be empty.
+        fewest: as in `separate`.
+    """
     empty = area(before) < SMALLEST
     if np.all(empty | (area(intersect(part, *sides(before))) < SMALLEST)):
         return [part]

@@ -27,14 +27,14 @@ from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import PupilFunction, RoughWavefrontError, fit_pupils
+from optics.waves.pupil_stack import DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
 
-DEGREES = (8, 10, 12, 14)
+DEGREES = (DEGREE, 10, 12, 14)
 """Of the polynomials of a pupil that edges cut, the first that do: outside of the light, in the middle of an obscured
 beam, wavefronts may bend much more than in it.
 """
@@ -251,10 +251,11 @@ class TargetPath:
             others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
             taken = self._edges(placed, systems, rays.launched, directions).shadows(len(directions), others)
         turned = turned.in_lengths_of(systems.size)
-        for degree in DEGREES if self.model.edges else ():
+        *tried, last = DEGREES if self.model.edges else (DEGREE,)
+        for degree in tried:
             with suppress(RoughWavefrontError):
                 return fit_pupils(turned, self.nodes, degree, taken)
-        return fit_pupils(turned, self.nodes, shadows=taken)
+        return fit_pupils(turned, self.nodes, last, taken)
 
     def _edges(
         self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
