@@ -49,7 +49,7 @@ def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any
     out["residuals"] = _drawing("spot_plots.residuals_svg", run)
     if run.quality is not None and run.quality.obstruction:
         out["pupils"] = _drawing("target_plots.pupils_svg", run.quality)
-    out[SCENE] = partial(_call, "twin.pictures.scene_file", "scene_bytes", instrument, run.state, paths)
+    out[SCENE] = partial(_scene, instrument, run.state, paths)
     return {name: partial(_tried, name, draw) for name, draw in out.items()}
 
 
@@ -62,6 +62,13 @@ def _drawing(function: str, *given: Any) -> Callable[[], Any]:
 def _call(module: str, name: str, *given: Any) -> Any:
     """Import a module and call its function: what draws takes a second to import, in the process that draws."""
     return getattr(import_module(module), name)(*given)
+
+
+def _scene(*given: Any) -> bytes:
+    """The contents of scene.glb."""
+    from twin.pictures.scene_file import scene_bytes
+
+    return scene_bytes(*given)
 
 
 def _tried(name: str, draw: Callable[[], Any]) -> Any:
