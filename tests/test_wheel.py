@@ -58,6 +58,24 @@ def test_no_module_of_a_wheel_asks_for_one_outside_of_it() -> None:
     assert asked > 3000
 
 
+def test_modules_named_as_text_are_those_of_two_lists() -> None:
+    """A wheel puts nothing before a name in a text: what imports by such a name has to know what stands before it."""
+    named = re.compile(rf"({'|'.join(backend.PACKAGES)})(\.\w+){{2,}}(:\w+)?")
+    for path in FILES:
+        if path.relative_to(ROOT).as_posix() in ("twin/__init__.py", "scenes/specs/procedures.py"):
+            continue
+        found = [one.value for one in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(one, ast.Constant)]
+        modules = {text for text in found if isinstance(text, str) and named.fullmatch(text)}
+        own = ".".join(
+            path.relative_to(ROOT).with_suffix("").parts
+        )  # taken off its name, to know what stands before it
+        assert [text for text in modules - {own} if module_file(text).is_file()] == [], path
+
+
+def module_file(name: str) -> Path:
+    return ROOT / (name.partition(":")[0].replace(".", "/") + ".py")
+
+
 @pytest.mark.parametrize(
     ("text", "made"),
     [
@@ -157,10 +175,11 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
         ("camtwin", "study", own / "scenes/examples/study_smoke.yaml", "--workers", "2", "--out", "c", "--yes"),
         ("camtwin", "verify", "a"),
         ("camtwin", "doctor", "--quick"),
+        ("camtwin", "lab", "focus", own / "scenes/lab/measured/focus.yaml", "--out", "d"),
     ):
         done = run(installed, tmp_path, *words)
         assert done.returncode == 0, done.stdout + done.stderr
-    assert all((tmp_path / name / "report.html").is_file() for name in ("a", "b", "c"))
+    assert all((tmp_path / name / "report.html").is_file() for name in ("a", "b", "c", "d"))
     manifest = json.loads((tmp_path / "a/manifest.json").read_text("utf-8"))
     assert (manifest["program"], manifest["versions"]["space-camera-twin"]) == ("twin.render", version())
     assert manifest["provenance"]["source"] == program_digest()

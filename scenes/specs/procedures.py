@@ -17,6 +17,10 @@ from optics.numerics.frozen_map import FrozenMap
 if TYPE_CHECKING:
     from scenes.yaml.spec import Spec
 
+_BEFORE = __name__.removesuffix("scenes.specs.procedures")
+_OURS = ("analysis", "optics", "scenes", "twin")
+"""The packages that a wheel holds within one, and what stands before their names there (docs/wheel)."""
+
 
 @dataclass(frozen=True)
 class Named:
@@ -31,7 +35,8 @@ class Named:
     def get(self) -> Any:
         """The function or the class."""
         module, _, name = self.path.partition(":")
-        return getattr(import_module(module), name)
+        before = _BEFORE if module.partition(".")[0] in _OURS else ""
+        return getattr(import_module(before + module), name)
 
     def __call__(self, *values: Any, **named: Any) -> Any:
         """Import the function and call it."""
