@@ -85,6 +85,8 @@ CAMERA_PARAMETERS = (
     ),
 )  # fmt: skip
 """What is read of every camera. The first four are what estimators estimate; a further one is a combination of them."""
+ESTIMATED = CAMERA_PARAMETERS[:4]
+"""Those that estimators estimate, in the order of a camera's vector of changes."""
 ANGLE = Parameter("change_arcsec", "Δθ", "change of the angle between the cameras' lines of sight, opening positive", 4)
 """What is read of the angle between two cameras."""
 GROUND = (

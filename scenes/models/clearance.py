@@ -72,6 +72,8 @@ def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) ->
     out = {s.path: placed.pose(s.path).apply(solid_mesh(s, placed).mesh.vertices) for s in instrument.solids}
     for camera, model in instrument.cameras.items():
         for mirror in model.mirrors:
+            if model.spec.mirrors[mirror].light == "passes":
+                continue
             path = f"{BASE}/{camera}/{mirror}"
             mesh = mirror_mesh(model.surfaces[mirror], model.apertures[mirror], behind(model, mirror), _CELLS)
             corners = mesh.vertices[ConvexHull(mesh.vertices).vertices]

@@ -27,6 +27,7 @@ from scenes.models.camera_model import (
     camera_sequences,
     derive_camera,
     focal_plane_body,
+    glass_indices,
 )
 from scenes.models.camera_sharpness import no_cameras
 from scenes.models.clearance import check_clearance, check_solids
@@ -91,13 +92,18 @@ def _no_cameras(camera_specs: Mapping[str, object], backend: Backend) -> tuple[I
 def _build(
     spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool, free_bodies: bool
 ) -> Instrument:
-    check_prisms(spec)
+    if spec.monitor is not None:
+        check_prisms(spec)
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
         if site.camera not in derived:
-            camera_specs[site.camera].require_mirrors("a camera of an instrument")  # type: ignore[attr-defined]
+            if spec.monitor is not None:
+                camera_specs[site.camera].require_mirrors("a camera with a monitor")  # type: ignore[attr-defined]
             derived[site.camera] = derive_camera(camera_specs[site.camera], backend)  # type: ignore[arg-type]
-    bodies = [Body(BASE), Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position)))]
+    bodies = [Body(BASE)]
+    if spec.central_prism is not None:
+        bodies.append(Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position))))
+    index: dict[str, float] = {}
     elements: dict[str, Element] = {}
     sequences: dict[str, tuple[str, ...]] = {}
     channels: list[Channel] = []
@@ -110,6 +116,9 @@ def _build(
         bodies += [*camera_bodies(root, to_base, model), *_monitor_bodies(focal_plane_body(root), own)]
         elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
         sequences.update(camera_sequences(name, model))
+        index |= {f"{root}/{lens}": n for lens, n in glass_indices(model.spec).items()}
+        if not own:
+            continue
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
         given = spec.channels_of(name)
         distances = {channel: given[channel.side].prism_180.distance for channel in own}
@@ -127,17 +136,19 @@ def _build(
             chains[channel.key] = chain
         channels += own
     solids = tuple(solid for chain in chains.values() for solid in chain.solids)
-    mirrors = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
-    block = spec.central_prism
-    farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
-    spread = max(x for x, _ in farthest), max(y for _, y in farthest)
-    solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
+    if (block := spec.central_prism) is not None:
+        mirrors = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
+        farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
+        spread = max(x for x, _ in farthest), max(y for _, y in farthest)
+        solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
     _check_temperature(spec, solids)
-    index = {s.path: glass(s.material).vacuum_index(spec.monitor.wavelength) for s in solids if s.transparent}
+    for solid in (solid for solid in solids if solid.transparent):
+        index[solid.path] = glass(solid.material).vacuum_index(spec.autocollimator.wavelength)
     cameras = FrozenMap({name: derived[site.camera] for name, site in spec.cameras.items()})
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
     _check_alike(spec, assembly)
-    assembly = square_facets(assembly, channels, cameras, backend)
+    if channels:
+        assembly = square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
     instrument = Instrument(
@@ -153,7 +164,7 @@ def _build(
     if free_bodies:
         check_solids(instrument.assembly, solids)
         check_clearance(instrument)
-    if free_beams:
+    if free_beams and channels:
         check_beams(instrument, backend)
     return instrument
 
@@ -194,6 +205,8 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
     Raises:
         InputError: two of them would stand in each other.
     """
+    if spec.monitor is None:
+        return []
     ccd = spec.monitor.area_ccd
     dx, dy = ccd.offset
     out = []
@@ -257,17 +270,31 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
     # a figure belongs to the element's own body: a face that the beam meets twice has one for each passage
     shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
     roots = {f"{BASE}/{name}" for name in cameras}
+    cold = _without_heat(cameras)
     out = {}
     for body in assembly.tree.bodies:
         if body.path == BASE:
-            out[BASE] = NodeInfo(allows=frozenset({"temperature"}))
+            out[BASE] = NodeInfo(allows=frozenset(() if BASE in cold else ("temperature",)))
             continue
         allows = {"rotate", "shift"}
-        if not any(body.path.startswith(f"{solid.path}/") for solid in solids):
+        if body.path not in cold and not any(body.path.startswith(f"{solid.path}/") for solid in solids):
             allows.add("temperature")
         if body.path in shaped:
             allows.add("figure")
         if body.path in roots:
             allows.add("scale")
         out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows))
+    return out
+
+
+def _without_heat(cameras: Mapping[str, CameraModel]) -> set[str]:
+    """Bodies of which nothing says what heat does to them: faces of lenses, whose index and expansion are not given,
+    planes that light passes, and what carries a lens.
+    """
+    out = set()
+    for name, model in cameras.items():
+        root = f"{BASE}/{name}"
+        out |= {f"{root}/{face}" for face, mirror in model.spec.mirrors.items() if mirror.light is not None}
+        if any(mirror.light == "refracts" for mirror in model.spec.mirrors.values()):
+            out |= {root, BASE}
     return out

@@ -56,9 +56,11 @@ class Instrument:
 
     @property
     def separation(self) -> Mapping[str, float]:
-        """Camera -> distance of its pair of area CCDs (the papers' L), metres; without a pair the largest of two."""
-        out = {}
-        for name in self.cameras:
+        """Camera -> distance of its pair of area CCDs (the papers' L), metres; without a pair the largest of two.
+        Empty without a monitor.
+        """
+        out: dict[str, float] = {}
+        for name in self.cameras if self.channels else ():
             places = {c.side: c.ccd[1] for c in self.channels if c.camera == name}
             pair = [places[side] for side in SIDES] if set(SIDES) <= set(places) else list(places.values())
             out[name] = abs(max(pair) - min(pair))

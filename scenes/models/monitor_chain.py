@@ -172,7 +172,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
         InputError: two beams share a facet, or a facet would lie under its neighbour: of two in one corner the one that
             leans more has to stand farther out.
     """
-    apex = np.array(spec.central_prism.position)
+    apex = np.array(spec.reference_prism.position)
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
     out = {}
     for channel, beam in beams.items():
@@ -222,7 +222,7 @@ def monitor_chain(
             small for the rhomboid's width.
     """
     up, made, small = beam.direction, given.prism_180, given.prism_0
-    apex = np.array(spec.central_prism.position)
+    apex = np.array(spec.reference_prism.position)
     across = centre - beam.middle
     across = across - inner(across, up) * up
     whole = float(norm(across))
@@ -292,7 +292,7 @@ def check_prisms(spec: InstrumentSpec) -> None:
     Raises:
         InputError: one of them does not.
     """
-    wavelength = spec.monitor.wavelength
+    wavelength = spec.autocollimator.wavelength
     kinds: dict[str, Reflector] = {}
     for camera in spec.cameras:
         for side, given in spec.channels_of(camera).items():

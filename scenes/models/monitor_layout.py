@@ -141,7 +141,7 @@ def start_beams(setup: MonitorDesignSetup) -> Layout:
 
 def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
     """Name of the prisms that a channel of the start has."""
-    monitor = setup.instrument.monitor
+    monitor = setup.instrument.autocollimator
     has = [(prism.material, prism.kind) for prism in (one.prism_180, one.prism_0)]
     known = {AS_STARTED: [(prism.material, prism.kind) for prism in (monitor.prism_180, monitor.prism_0)]}
     for name, chosen in (setup.test.prisms or {}).items():
@@ -156,7 +156,7 @@ def _prisms_of(setup: MonitorDesignSetup, one: instruments.ChannelParts) -> str:
 
 def _ccd_of(setup: MonitorDesignSetup) -> str:
     """Name of the area CCD that the start has."""
-    own = setup.instrument.monitor.area_ccd
+    own = setup.instrument.autocollimator.area_ccd
     for name, one in (setup.test.area_ccds or {}).items():
         if (one.detector, one.pitch, one.rows, one.columns) == (own.detector, own.pitch, own.rows, own.columns):
             return name
@@ -169,7 +169,7 @@ def _flat(places: Sequence[tuple[float, tuple[float, float], tuple[float, float]
 
 def _toward(spec: instruments.InstrumentSpec, site: instruments.MountedCameraSpec) -> float:
     """+1 where the central prism lies on the camera's +X side, else -1."""
-    return 1.0 if spec.central_prism.position[0] > site.position[0] else -1.0
+    return 1.0 if spec.reference_prism.position[0] > site.position[0] else -1.0
 
 
 def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.InstrumentSpec:
@@ -181,7 +181,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
         beams: each becomes a channel at both ends of both lines: ``left`` and ``right``, ``left_2`` and ``right_2``.
     """
     start, test = setup.instrument, setup.test
-    monitor = start.monitor
+    monitor = start.autocollimator
     sites = {}
     for name, site in start.cameras.items():
         channels = {}
@@ -196,7 +196,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
     own = {} if chosen is None else {name: getattr(chosen, name) for name in type(chosen).model_fields}
     ccd = monitor.area_ccd.model_copy(update=own)
     monitor = monitor.model_copy(update={"reticle": reticle, "frames": test.frames or monitor.frames, "area_ccd": ccd})
-    block = start.central_prism
+    block = start.reference_prism
     block = block.model_copy(update={"material": test.central_material or block.material})
     update = {
         "central_prism": block,
@@ -210,7 +210,7 @@ def layout_spec(setup: MonitorDesignSetup, beams: Layout) -> instruments.Instrum
 
 def _light(setup: MonitorDesignSetup) -> float:
     """Photons of a spot and frame where a beam has none of its own."""
-    return setup.test.photons_per_frame or setup.instrument.monitor.reticle.photons_per_frame
+    return setup.test.photons_per_frame or setup.instrument.autocollimator.reticle.photons_per_frame
 
 
 def channel_name(side: str, number: int) -> str:
@@ -221,7 +221,7 @@ def channel_name(side: str, number: int) -> str:
 def _channel(
     setup: MonitorDesignSetup, beam: Beam, field: float, offset: tuple[float, float]
 ) -> instruments.ChannelSpec:
-    monitor = setup.instrument.monitor
+    monitor = setup.instrument.autocollimator
     rim = monitor.prism_180.width - monitor.return_face.aperture, monitor.prism_0.width - monitor.return_face.aperture
     chosen = (setup.test.prisms or {}).get(beam.prisms)
     kinds = [{} if chosen is None else dict(one) for one in _parts(chosen)]
@@ -246,7 +246,7 @@ def _parts(chosen: PrismChoiceSpec | None) -> Iterator[Mapping[str, object]]:
 
 def kinds_of(setup: MonitorDesignSetup, beam: Beam) -> tuple[str | None, str | None]:
     """Kinds of a beam's two reflectors; None for the prism itself."""
-    monitor, chosen = setup.instrument.monitor, (setup.test.prisms or {}).get(beam.prisms)
+    monitor, chosen = setup.instrument.autocollimator, (setup.test.prisms or {}).get(beam.prisms)
     own = (monitor.prism_180.kind, monitor.prism_0.kind)
     return own if chosen is None else (chosen.prism_180.kind, chosen.prism_0.kind)
 

@@ -213,7 +213,7 @@ def _heated(thermal: ThermalModel, path: str, nodes: NodalTemperature) -> Heated
     largest = float(np.max(np.abs(rest)))
     left = float(np.sqrt(np.average(rest**2, weights=elastic.volumes))), largest
     index_path = thermal.index_path(path, linear, largest)
-    if index_path > INDEX_WAVES * thermal.instrument.spec.monitor.wavelength:
+    if index_path > INDEX_WAVES * thermal.instrument.spec.autocollimator.wavelength:
         raise NodesError(
             f"the rays through its glass follow a linear index only; what the table has beyond, up to {largest:.3g} K, "
             f"is worth up to {1e9 * index_path:.3g} nm of path",

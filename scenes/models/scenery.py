@@ -106,7 +106,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
         base = built_in.board if kind == "black" else getattr(built_in, kind)
         if spec.coating is not None:
             try:
-                coatings[kind] = read_coating(spec.coating.table).at(resolved.instrument.monitor.wavelength)
+                coatings[kind] = read_coating(spec.coating.table).at(resolved.instrument.autocollimator.wavelength)
             except ValueError as error:
                 text = f"the monitor's wavelength is not in the coating's table: {error}"
                 raise resolved.job.error(text, (*key, "coating"), found=spec.coating.table) from None
@@ -268,7 +268,7 @@ def _focal_plane(
     pitch = line.pitch * float(placed.size(chip)[0])
     grids = [Detector(element, 1, line.pixels, (pitch, pitch))]
     surfaces = [detector_surface(grids[0], placed.pose(chip) @ FACING_THE_LIGHT, finishes, (element,))]
-    ccd = instrument.spec.monitor.area_ccd
+    ccd = instrument.spec.autocollimator.area_ccd
     for channel in channels:
         name = f"{channel.key}/area_ccd"
         pitch = ccd.pitch * float(placed.size(channel.ccd_body)[0])

@@ -9,8 +9,8 @@ them no substrates.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from typing import assert_never
@@ -27,9 +27,11 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
+from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
 from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, quadrature_within, separate, tiled
 from optics.waves.pupil_stack import products, to_terms
+from scenes.models.camera_model import CameraModel
 from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_model import Instrument
 from scenes.models.obstruction import imaging_segments, rays_taken
@@ -82,6 +84,7 @@ class Shadows:
         points: nodes of a quadrature over all of them within the disk, complex, (B, Q).
         weights: of the area, (B, Q).
         areas: of each within the disk, (B, K).
+        known: name -> share of the stop's area, (B,), where the pieces alone do not say it; None where they do.
     """
 
     pieces: np.ndarray
@@ -89,6 +92,7 @@ class Shadows:
     points: np.ndarray
     weights: np.ndarray
     areas: np.ndarray
+    known: Mapping[str, np.ndarray] | None = None
 
     @classmethod
     def of(cls, outlines: list[tuple[str, np.ndarray]], count: int) -> Shadows:
@@ -96,6 +100,12 @@ class Shadows:
         lit = [(name, outline) for name, outline in outlines if np.any(area(outline) > SMALLEST)]
         pieces, numbers = separate([outline for _, outline in lit])
         pieces = pieces if lit else np.zeros((count, 0, 3, 2))
+        return cls.within(pieces, tuple(lit[k][0] for k in numbers))
+
+    @classmethod
+    def within(cls, pieces: np.ndarray, owners: tuple[str, ...]) -> Shadows:
+        """Shadows of convex polygons (B, K, V, 2) that do not overlap, with the K names of what throws them."""
+        count = len(pieces)
         tiles, tiled_from = tiled(pieces)
         flat = tiles.reshape(-1, *tiles.shape[2:])
         points, weights = (
@@ -104,10 +114,29 @@ class Shadows:
         )
         areas = np.sum(weights, axis=-1) @ (tiled_from[:, None] == np.arange(pieces.shape[1]))
         points, weights = (a.reshape(count, -1) if pieces.shape[1] else np.zeros((count, 0)) for a in (points, weights))
-        return cls(pieces, tuple(lit[k][0] for k in numbers), points, weights, areas)
+        return cls(pieces, owners, points, weights, areas)
+
+    def and_edges(self, outlines: StopOutlines, name: str) -> Shadows:
+        """These shadows together with those of edges of surfaces.
+
+        Args:
+            outlines: of the edges.
+            name: under which ``shares`` tells what the edges take beside all bodies.
+
+        Raises:
+            UnphysicalError: they cut a pupil into too many pieces.
+        """
+        pieces = outlines.shadows(len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
+        whole = Shadows.within(pieces, (name,) * pieces.shape[1])
+        bodies = self.shares()
+        rest = np.sum(whole.areas, axis=-1) / np.pi - sum(bodies.values())
+        # by rounding a little less than nothing where a body stands in the shadow of an edge
+        return replace(whole, known={**bodies, name: np.maximum(rest, 0.0)})
 
     def shares(self) -> dict[str, np.ndarray]:
         """Share of the stop's area that each body takes, (B,)."""
+        if self.known is not None:
+            return dict(self.known)
         out: dict[str, np.ndarray] = {}
         for k, name in enumerate(self.owners):
             out[name] = out.get(name, np.zeros(len(self.pieces))) + self.areas[:, k] / np.pi
@@ -234,6 +263,37 @@ class ImagingShadows:
             turn, shift = placed.rotation[beams.owner, body].real, placed.translation[beams.owner, body].real
             out.append(traced.hit(k) @ np.swapaxes(turn, 1, 2) + shift[:, None])
         return out
+
+
+def no_shadows(count: int) -> Shadows:
+    """Those in the ``count`` pupils of free beams."""
+    return Shadows.within(np.zeros((count, 0, 3, 2)), ())
+
+
+def edge_outlines(beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> StopOutlines:
+    """The edges of a camera's surfaces as its images see them on the stop.
+
+    Args:
+        beams: to the images.
+        model: of the camera.
+        camera: its name in the assembly, that its elements' names begin with.
+        backend: where to trace.
+
+    Raises:
+        UnphysicalError: rays meet a surface at places that no polynomials follow.
+    """
+    cut = {name: model.mirrors.index(name) for name in model.edges}
+    launched = beams.rays.launched
+    heading = np.broadcast_to(beams.heading, (len(launched), 3))[:, None]
+    sent = make_rays(backend, launched, np.broadcast_to(heading, launched.shape))
+    traced = trace(backend, beams.systems, sent, keep=tuple(cut.values()))
+    found = StopOutlines()
+    for name, number in cut.items():
+        body = beams.assembly.elements[f"{camera}/{name}"].body
+        size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
+        places = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
+        found += outlines_on_stop(places, model.edges[name], beams.nodes)
+    return found
 
 
 @lru_cache(maxsize=8)

@@ -241,7 +241,7 @@ class ThermalModel:
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
         """Change of index at a solid's origin, and its gradient, 1/m."""
-        kind, wavelength = glass(self.solids[path].material), self.instrument.spec.monitor.wavelength
+        kind, wavelength = glass(self.solids[path].material), self.instrument.spec.autocollimator.wavelength
         if field.change == 0.0 and not any(field.gradient):
             return 0.0, (0.0, 0.0, 0.0)
         here = self.reference + field.change
@@ -273,7 +273,7 @@ class ThermalModel:
         if path not in self.solids or not self.solids[path].transparent:
             return 0.0
         here = self.reference + field.change
-        slope = glass(self.solids[path].material).dn_dt(self.instrument.spec.monitor.wavelength, here)
+        slope = glass(self.solids[path].material).dn_dt(self.instrument.spec.autocollimator.wavelength, here)
         return float(abs(slope) * rest * 2.0 * np.max(np.ptp(self.extent(path), axis=0)))
 
     def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:

@@ -14,7 +14,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch
-from scenes.yaml.errors import KeyPath, unknown
+from scenes.yaml.errors import InputError, KeyPath, Problem, unknown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
     Catalogued,
@@ -34,6 +34,8 @@ from scenes.yaml.spec import (
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
 BASE = "base"
+ALONE = "camera"
+"""Name of a camera that is an instrument by itself."""
 SIDES = ("left", "right")
 PRISM_180, PRISM_0 = "prism_180", "prism_0"
 PRISMS = (PRISM_180, PRISM_0)
@@ -347,7 +349,7 @@ class ChannelParts:
 
 class MountedCameraSpec(Spec):
     """A camera in its place on the base, with the channels of its monitor: a plain pair at both ends of the line,
-    through the same part of the pupil, or any number of channels.
+    through the same part of the pupil, or any number of channels; none in an instrument without a monitor.
 
     Attributes:
         camera: which camera, by name or path.
@@ -364,19 +366,14 @@ class MountedCameraSpec(Spec):
     pupil_offset: Vector2 | None = None
     channels: Annotated[Named[ChannelSpec], Field(min_length=1)] | None = None
 
-    @model_validator(mode="after")
-    def _one_of_both(self) -> MountedCameraSpec:
-        allowed = "one of pupil_offset and channels"
-        one_given(self, ("pupil_offset", "channels"), "which channels does its monitor have?", allowed)
-        return self
-
     @property
     def mirrored(self) -> MountedCameraSpec:
         """The camera with every beam through the opposite part of the pupil."""
-        if self.channels is None:
-            assert self.pupil_offset is not None
+        if self.pupil_offset is not None:
             x, y = self.pupil_offset
             return self.model_copy(update={"pupil_offset": (-x, -y)})
+        if self.channels is None:
+            return self
         turned = {
             name: one.model_copy(update={"pupil_offset": (-one.pupil_offset[0], -one.pupil_offset[1])})
             for name, one in self.channels.items()
@@ -433,14 +430,14 @@ class MonitorSpec(Spec):
 
 
 class InstrumentSpec(TitledSpec):
-    """Cameras on a common base, each with its monitor.
+    """Cameras on a common base, each with its monitor, or all without one.
 
     Attributes:
         name: as the file is called.
         description: for people.
         cameras: by name; the first is the reference for the change of the intersection angle.
-        central_prism: common reference.
-        monitor: of every camera.
+        central_prism: common reference of the monitor.
+        monitor: of every camera; left out, with the central prism, where there is none.
         temperature: at which everything has its nominal shape, kelvin.
         materials: what the parts are made of.
         baffles: by name; none by default.
@@ -450,13 +447,64 @@ class InstrumentSpec(TitledSpec):
     """
 
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
-    central_prism: CentralPrismSpec
-    monitor: MonitorSpec
+    central_prism: CentralPrismSpec | None = None
+    monitor: MonitorSpec | None = None
     temperature: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="1000 K")] = 293.15
     materials: Annotated[MaterialsSpec, NothingIsEmpty] = MaterialsSpec()
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None
+
+    @model_validator(mode="after")
+    def _monitor_is_whole(self) -> InstrumentSpec:
+        if (self.monitor is None) != (self.central_prism is None):
+            missing = "monitor" if self.monitor is None else CENTRAL_KEY
+            text = "a monitor needs both its description and the central prism that its beams return from"
+            raise Problem(text, f"no {missing}", f"{missing}, or neither of the two", within=())
+        for name, site in self.cameras.items():
+            if self.monitor is not None:
+                allowed = "one of pupil_offset and channels"
+                asked = "which channels does its monitor have?"
+                one_given(site, ("pupil_offset", "channels"), asked, allowed, ("cameras", name))
+                continue
+            given = [key for key in ("pupil_offset", "channels") if getattr(site, key) is not None]
+            if given:
+                text = "a camera of an instrument without a monitor has no channels"
+                raise Problem(text, given[0], "neither, or a monitor and a central_prism", within=("cameras", name))
+        return self
+
+    @classmethod
+    def of_camera(cls, name: str, camera: str) -> InstrumentSpec:
+        """A camera by itself as an instrument: on the base, without a look angle and without a monitor.
+
+        Args:
+            name: of the instrument.
+            camera: which camera, by name or path.
+        """
+        site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
+        return cls.model_construct(name=name, cameras=FrozenMap({ALONE: site}))
+
+    @property
+    def autocollimator(self) -> MonitorSpec:
+        """The monitor of an instrument that has one.
+
+        Raises:
+            InputError: it has none.
+        """
+        if self.monitor is None:
+            raise self._without_monitor()
+        return self.monitor
+
+    @property
+    def reference_prism(self) -> CentralPrismSpec:
+        """The central prism of an instrument that has one. Raises InputError: it has none."""
+        if self.central_prism is None:
+            raise self._without_monitor()
+        return self.central_prism
+
+    def _without_monitor(self) -> InputError:
+        text = f"{self.name} has no monitor, so that no spot tells of its changes"
+        return self.error(text, ("monitor",), allowed="an instrument with a monitor and a central_prism")
 
     def key_of(self, camera: str, channel: str, key: KeyPath) -> KeyPath:
         """Where the file says something of a channel: at the channel itself if it does there, else where it says it of
@@ -485,12 +533,15 @@ class InstrumentSpec(TitledSpec):
         return key
 
     def channels_of(self, camera: str) -> dict[str, ChannelParts]:
-        """All channels of a camera's monitor, by name.
+        """All channels of a camera's monitor, by name; none where there is no monitor.
 
         Args:
             camera: its name.
         """
-        site, monitor = self.cameras[camera], self.monitor
+        site = self.cameras[camera]
+        if self.monitor is None or self.central_prism is None:
+            return {}
+        monitor, prism = self.monitor, self.central_prism
         given = site.channels
         if given is None:
             assert site.pupil_offset is not None
@@ -501,7 +552,7 @@ class InstrumentSpec(TitledSpec):
                 one.field,
                 one.pupil_offset,
                 one.return_face or monitor.return_face,
-                one.spread or self.central_prism.spread,
+                one.spread or prism.spread,
                 one.photons_per_frame or monitor.reticle.photons_per_frame,
                 one.prism_180 or monitor.prism_180,
                 one.prism_0 or monitor.prism_0,
@@ -541,7 +592,7 @@ class ErrorBudgetSpec(Spec):
 
     def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
         """The instrument with this budget's angle errors and light."""
-        monitor = instrument.monitor
+        monitor = instrument.autocollimator
         changed = {
             prism: getattr(monitor, prism).model_copy(update={"angle_errors": errors})
             for prism, errors in self.angle_errors.items()

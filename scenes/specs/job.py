@@ -214,12 +214,17 @@ def pivot_problem(
     return None
 
 
+def _alone(value: Any) -> Any:
+    """`{camera: my.yaml}` is the camera by itself."""
+    return value["camera"] if isinstance(value, Mapping) and set(value) == {"camera"} else value
+
+
 class JobSpec(Spec):
     """A job.
 
     Attributes:
         instrument: name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's
-            file.
+            file. A camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
         perturb: node path -> perturbation; empty for the nominal state.
         course: temperatures and motions that change with time, None for a single state.
         disturbances: what is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the
@@ -228,7 +233,7 @@ class JobSpec(Spec):
         analysis: how it is analysed.
     """
 
-    instrument: Reference
+    instrument: Annotated[Reference, BeforeValidator(_alone)]
     perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None

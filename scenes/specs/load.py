@@ -17,7 +17,7 @@ from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
 from scenes.yaml.input_file import is_file, unusable
-from scenes.yaml.spec import Spec, validate
+from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
@@ -57,6 +57,8 @@ def instrument_path(job: JobSpec) -> Path:
     Raises:
         InputError: there is none, said with the line of the job's file.
     """
+    if place_of(INSTRUMENTS, job.instrument, Path()) is None and job.instrument in library_names(CAMERAS):
+        return find_named(CAMERAS, job.instrument, job, ("instrument",))
     return find_named(INSTRUMENTS, job.instrument, job, ("instrument",))
 
 
@@ -70,15 +72,28 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
 
     Args:
         name_or_path: a name in the library, or a path from the current folder (anything with a slash or ending in
-            .yaml or .yml).
+            .yaml or .yml). Of a camera it is the instrument that consists of this camera alone.
 
     Raises:
         InputError: as `load_job`.
     """
+    path = place_of(INSTRUMENTS, name_or_path, Path())
+    if path is None and str(name_or_path) in library_names(CAMERAS):
+        path = place_of(CAMERAS, name_or_path, Path())
+    if path is not None and is_camera(path):
+        camera = validate(CameraSpec, read_yaml(path))
+        return InstrumentSpec.of_camera(camera.name, path.name).with_source(Source(str(path)))
     instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path)
     paths_of_cameras(instrument)
-    path_of_detector(instrument)
+    if instrument.monitor is not None:
+        path_of_detector(instrument)
     return instrument
+
+
+def is_camera(path: str | Path) -> bool:
+    """Whether a file is a camera's prescription and not an instrument. Raises InputError: it cannot be read."""
+    data = read_yaml(path).data
+    return isinstance(data, dict) and "mirrors" in data
 
 
 def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
@@ -155,8 +170,9 @@ def load_cameras(instrument: InstrumentSpec) -> FrozenMap[str, CameraSpec]:
 
 
 def path_of_detector(instrument: InstrumentSpec) -> Path:
-    """The file of the area CCD's data sheet. Raises InputError if there is none."""
-    return find_named(DETECTORS, instrument.monitor.area_ccd.detector, instrument, ("monitor", "area_ccd", "detector"))
+    """The file of the area CCD's data sheet. Raises InputError: there is none, or no monitor that has one."""
+    key = ("monitor", "area_ccd", "detector")
+    return find_named(DETECTORS, instrument.autocollimator.area_ccd.detector, instrument, key)
 
 
 def load_camera(name_or_path: str | Path) -> CameraSpec:

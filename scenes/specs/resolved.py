@@ -35,7 +35,7 @@ class ResolvedJob(Spec):
         job: as the user wrote it, defaults filled in.
         instrument: what `job.instrument` names.
         cameras: what `instrument.cameras.<name>.camera` says -> prescription.
-        detector: data sheet of the monitor's area CCDs.
+        detector: data sheet of the monitor's area CCDs; None where there is no monitor.
         line_detectors: as cameras -> data sheet of the line CCD on which targets are imaged, None without targets.
         disturbances: on which the sigmas rest, the job's changes made; None for the noise alone.
     """
@@ -43,14 +43,27 @@ class ResolvedJob(Spec):
     job: JobSpec
     instrument: InstrumentSpec
     cameras: Annotated[Paths[CameraSpec], Field(min_length=1)]
-    detector: DetectorSpec
+    detector: DetectorSpec | None = None
     line_detectors: Paths[DetectorSpec] | None = None
     disturbances: DisturbancesSpec | None = None
 
     @property
     def frames(self) -> int:
-        """Number of frames: the job's if it gives one, else the instrument's."""
-        return self.job.render.frames or self.instrument.monitor.frames
+        """Number of frames: the job's if it gives one, else the monitor's; one where there is no monitor."""
+        monitor = self.instrument.monitor
+        return self.job.render.frames or (1 if monitor is None else monitor.frames)
+
+    @property
+    def area_detector(self) -> DetectorSpec:
+        """Data sheet of the monitor's area CCDs. Raises InputError: the instrument has no monitor."""
+        self.instrument.autocollimator  # noqa: B018 - says so where there is none
+        assert self.detector is not None
+        return self.detector
+
+    @property
+    def quality(self) -> bool:
+        """Whether image quality is worked out: where the job asks for it, and always where there is no monitor."""
+        return self.job.render.quality or self.instrument.monitor is None
 
     @property
     def targets(self) -> TargetsSpec:
@@ -95,7 +108,7 @@ def _with_instrument(job: JobSpec, instrument: InstrumentSpec) -> ResolvedJob:
         job=job,
         instrument=instrument,
         cameras=cameras,
-        detector=load.load_detector(load.path_of_detector(instrument)),
+        detector=None if instrument.monitor is None else load.load_detector(load.path_of_detector(instrument)),
         line_detectors=line_detectors,
         disturbances=load.find_disturbances(job, instrument),
     )
@@ -128,7 +141,7 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
     """
     text = str(file)
     named = not load.is_path(text) and not Path(text).is_file()
-    if named or "monitor" in _keys(file):
+    if named or ({"mirrors", "cameras"} & set(_keys(file)) and "job" not in _keys(file)):
         instrument = load.load_instrument(text if named else Path(text))
         job = JobSpec.model_validate({"instrument": text})
         resolved = _with_instrument(job, instrument)
@@ -163,6 +176,9 @@ def _line_detector(camera: CameraSpec) -> DetectorSpec:
 
 def _complete(resolved: ResolvedJob) -> ResolvedJob:
     """Check that every camera of the instrument is there, and read the job's tables."""
+    if (resolved.detector is None) != (resolved.instrument.monitor is None):
+        text = "the data sheet of the monitor's area CCDs belongs to an instrument with a monitor"
+        raise resolved.error(text, ("detector",), allowed="both, or neither")
     for mounted in resolved.instrument.cameras.values():
         if mounted.camera not in resolved.cameras:
             raise resolved.error(f"camera {mounted.camera!r} of the instrument is missing", ("cameras",))

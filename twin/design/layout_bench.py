@@ -151,7 +151,7 @@ class LayoutBench:
     def detector(self, name: str = monitor_layout.AS_STARTED) -> EmvaDetector:
         """Detector of the area CCD that a beam names."""
         sheet = self.setup.detectors.get(name, self.setup.detector)
-        return EmvaDetector.from_sheet(sheet, self.setup.instrument.monitor.area_ccd.exposure)
+        return EmvaDetector.from_sheet(sheet, self.setup.instrument.autocollimator.area_ccd.exposure)
 
     def goals_of(self, name: str) -> tuple[str, ...]:
         """Quantities of which a goal's value is the worst: ``d_f`` of every camera."""
@@ -159,7 +159,7 @@ class LayoutBench:
 
     def boards_apart(self, one: monitor_layout.Beam, other: monitor_layout.Beam) -> bool:
         """Whether the area CCDs of two beams have room beside each other at an end of every line."""
-        ccd = monitor_layout.layout_spec(self.setup, (one,)).monitor.area_ccd
+        ccd = monitor_layout.layout_spec(self.setup, (one,)).autocollimator.area_ccd
         return all(
             abs(camera.line_focal_length * (np.tan(one.field) - np.tan(other.field))) >= ccd.rows * ccd.pitch
             for camera in self.start.cameras.values()
@@ -261,7 +261,7 @@ class LayoutBench:
             raise _OutsideLimitsError(f"its prisms have a mass of {mass:.4g} kg")
 
     def _check_spots(self, information: Mapping[str, Information], instrument: Instrument) -> None:
-        ccd = instrument.spec.monitor.area_ccd
+        ccd = instrument.spec.autocollimator.area_ccd
         room = 0.5 * min(ccd.rows, ccd.columns) - EDGE_PX
         reach = self.setup.test.limits.spot_sigmas * max(float(one.spot_sigma.max()) for one in information.values())
         if reach > room:

@@ -86,7 +86,7 @@ def run_cards(program: str, seed: int) -> list[Card]:
 
 def detector_cards(job: ResolvedJob) -> list[Card]:
     """The monitor's area CCD by its data sheet (EMVA 1288), and its light."""
-    detector, light = job.detector, job.instrument.monitor
+    detector, light = job.area_detector, job.instrument.autocollimator
     return [
         ("INSTRUME", ascii_text(job.instrument.name), "instrument"),
         ("DETECTOR", ascii_text(detector.name), "data sheet of the area CCD"),

@@ -14,7 +14,7 @@ from scenes.models.nodal_bodies import HeatedBody, HeatedFace
 from scenes.specs.job import JobSpec
 from scenes.specs.job_tables import FinishTableSpec
 from scenes.specs.resolved import ResolvedJob
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun
 from twin.run.quantity import Quantity, Record
 
 
@@ -67,12 +67,12 @@ def config_text(resolved: ResolvedJob) -> str:
     return resolved.model_copy(update={"job": job}).to_yaml()
 
 
-def faces_of(run: RenderRun) -> Mapping[str, NodalDeformation]:
+def faces_of(run: JobRun) -> Mapping[str, NodalDeformation]:
     """Body -> what its table is."""
     return run.experiment.deformed(run.resolved.job)
 
 
-def heated_of(run: RenderRun) -> Mapping[str, HeatedBody]:
+def heated_of(run: JobRun) -> Mapping[str, HeatedBody]:
     """Body -> what its table of temperatures is.
 
     Args:
@@ -133,7 +133,7 @@ WARMED: Record[HeatedBody] = Record(
 )
 
 
-def table_numbers(run: RenderRun, kind: str) -> dict[str, Any]:
+def table_numbers(run: JobRun, kind: str) -> dict[str, Any]:
     """Contents of deformation.json or temperature.json.
 
     Args:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
 from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
@@ -21,7 +21,7 @@ _WHEN = ("before", "after")
 FREE = "the pupils are free: `obstruction: ignore`"
 
 
-def quality_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:
+def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     """Wavefront errors, focus and MTF of the line CCDs; None when they were not asked for."""
     quality = run.quality
     if quality is None:
@@ -111,7 +111,7 @@ _DECIMALS = 4
 """Of an MTF."""
 
 
-def target_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:
+def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
     """MTF from images of targets, and these images; None when no targets were asked for."""
     targets = run.targets
     if targets is None:

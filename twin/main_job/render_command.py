@@ -15,14 +15,16 @@ from twin.main_job.assumptions import assumed
 from twin.main_job.render_drawings import load_drawing
 from twin.main_job.render_folder import write_run
 from twin.main_job.render_job import render_job
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun, quality_dict
 from twin.main_job.verdict import judge, recovered_numbers
+from twin.monitor.image_quality import PLACES
 from twin.run.cli import print_verdict, print_whole, result_table
 from twin.run.command import Result, print_warnings
 from twin.run.procedure import Session
 from twin.run.reference_frames import described
 from twin.run.second_process import SecondProcess
-from twin.targets.target_images import DIRECTIONS, PLACES
+from twin.targets.target_images import DIRECTIONS
+from twin.targets.target_images import PLACES as TARGET_PLACES
 from twin.targets.target_measurement import EdgeReading, TargetRun
 
 NUMBER = 7
@@ -54,27 +56,34 @@ def run_render(resolved: ResolvedJob, session: Session, frames: int | None, seed
     return Result(_numbers(run), lambda console: _print_result(run, console), problem)
 
 
-def _numbers(run: RenderRun) -> dict[str, Any]:
+def _numbers(run: JobRun) -> dict[str, Any]:
     """What ``--json`` prints: contents of the files with the main results, by their kind."""
-    parts = {"truth": run.truth_dict(), "recovered": recovered_numbers(run)}
-    if run.series is not None:
-        parts["course"] = run.series.to_dict()
+    parts = {"truth": run.truth_dict()}
+    if isinstance(run, RenderRun):
+        parts["recovered"] = recovered_numbers(run)
+        if run.series is not None:
+            parts["course"] = run.series.to_dict()
+    elif run.quality is not None:
+        parts["quality"] = quality_dict(run.quality)
     if run.targets is not None:
         parts["mtf"] = run.targets.to_dict()
     return {kind: described(kind, data) for kind, data in parts.items()}
 
 
-def _print_result(run: RenderRun, console: Console) -> None:
+def _print_result(run: JobRun, console: Console) -> None:
     """The verdict, the result table and what to bear in mind."""
     told = judge(run)
     print_verdict(console, told.verdict)
-    print_whole(console, _table(run, console.width >= _WIDE))
-    console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
+    if isinstance(run, RenderRun):
+        print_whole(console, _table(run, console.width >= _WIDE))
+        console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
+    else:
+        print_whole(console, _changes(run))
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:
             console.print(lines)
-    if run.series is not None:
+    if isinstance(run, RenderRun) and run.series is not None:
         count, ends = len(run.series.times), [moment(float(run.series.times[k])) for k in (0, -1)]
         console.print(
             f"course: {count} times from {ends[0]} to {ends[1]} are in course.json, course.nc and the report.",
@@ -88,7 +97,7 @@ def _mtf_table(targets: TargetRun) -> Table | None:
     title = f"MTF at the Nyquist frequency from the knife edge ({targets.frames} frames)"
     title += "\nbefore -> after, below it the true one"
     table = result_table(title)
-    for head in ("", *PLACES):
+    for head in ("", *TARGET_PLACES):
         table.add_column(head, no_wrap=True)
     for name, camera in targets.cameras.items():
         for direction in DIRECTIONS:
@@ -117,6 +126,32 @@ def _head(name: str) -> str:
         word if len(word) <= NUMBER else f"{word[: NUMBER - 2]}-\n{word[NUMBER - 2 :]}" for word in name.split("_")
     ]
     return "\n".join(words)
+
+
+def _changes(run: JobRun) -> Table:
+    """True changes, and wavefront error and MTF at the middle of the line and at its ends, of what has no monitor."""
+    table = result_table(f"{run.resolved.instrument.name}: what changes, by exact tracing")
+    for head in ("", "change"):
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+    group = ""
+    for of, one, value in run.true_changes():
+        if of != group:
+            group = of
+            table.add_row(f"[bold]{escape(group)}[/]")
+        table.add_row(escape(one.label), f"{round(value, one.decimals) + 0.0:+.{one.decimals}f}")
+    if run.quality is None:
+        return table
+    for name, camera in run.quality.cameras.items():
+        table.add_row(f"[bold]{escape(name)}[/], left / centre / right", "before -> after")
+        for label, values in (
+            ("wavefront error [waves rms]", camera.wfe),
+            ("MTF at Nyquist along the line", camera.mtf_along_line),
+            ("MTF at Nyquist along the track", camera.mtf_along_track),
+        ):
+            places = [run.quality.fields.index(field) for field in PLACES.values()]
+            pairs = (f"{values[0, k]:.4f} -> {values[1, k]:.4f}" for k in places)
+            table.add_row(escape(label), " / ".join(pairs))
+    return table
 
 
 def _table(run: RenderRun, wide: bool) -> Table:

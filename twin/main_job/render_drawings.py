@@ -8,7 +8,7 @@ from importlib import import_module
 from typing import Any
 from xml.sax.saxutils import escape
 
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.pictures.light_paths import LightPaths
 from twin.run.artefact import Undrawn
 
@@ -21,36 +21,42 @@ FILES = {IRRADIANCE: "irradiance.nc", SCENE: "scene.glb", SUMMARY: "summary.png"
 """Where these are written."""
 
 
-def drawings(run: RenderRun, paths: LightPaths) -> Mapping[str, Callable[[], Any]]:
+def drawings(run: JobRun, paths: LightPaths) -> Mapping[str, Callable[[], Any]]:
     """Name -> what draws it, the longest first: <svg> elements but for ``APART``, which are written as they are.
 
     Args:
         run: the run; what it works out on demand is taken as it is now.
         paths: its light, traced.
     """
-    instrument, series, targets = run.experiment.instrument, run.series, run.targets
-    out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots.motion_map_svg", run)}
-    out |= {f"spots {name}": _drawing("spot_plots.spots_svg", run, name) for name in instrument.cameras}
-    out[IRRADIANCE] = _drawing("render_files.irradiance_file", run)
+    instrument, targets = run.experiment.instrument, run.targets
+    out = _of_monitor(run) if isinstance(run, RenderRun) else {}
     out["footprints"] = _drawing("light_path_plots.footprints_svg", instrument, paths)
     if targets is not None:
         for name, camera in targets.cameras.items():
             out[f"targets {name}"] = _drawing("target_plots.images_svg", name, camera)
             if targets.has_edges:
                 out[f"mtf {name}"] = _drawing("target_plots.curves_svg", name, camera)
-    if series is not None:
+    out["side"] = _drawing("light_path_plots.side_view_svg", instrument, paths)
+    if run.quality is not None and run.quality.obstruction:
+        out["pupils"] = _drawing("target_plots.pupils_svg", run.quality)
+    out[SCENE] = partial(_scene, instrument, run.state, paths)
+    return {name: partial(_tried, name, draw) for name, draw in out.items()}
+
+
+def _of_monitor(run: RenderRun) -> dict[str, Callable[[], Any]]:
+    """Drawings of what the monitor recorded and reads."""
+    out: dict[str, Callable[[], Any]] = {"motions": _drawing("spot_plots.motion_map_svg", run)}
+    out |= {f"spots {name}": _drawing("spot_plots.spots_svg", run, name) for name in run.experiment.instrument.cameras}
+    out[IRRADIANCE] = _drawing("render_files.irradiance_file", run)
+    if (series := run.series) is not None:
         titles = {name: estimator.title for name, estimator in run.estimators.items()}
         out["course"] = _drawing("series_plots.parameters_svg", series, titles)
         out["temperatures"] = _drawing("series_plots.temperatures_svg", series)
         if series.smoothed is not None:
             out["smoothed"] = _drawing("series_plots.smoothed_svg", series)
     out[SUMMARY] = _drawing("summary_plot.summary_png", run)
-    out["side"] = _drawing("light_path_plots.side_view_svg", instrument, paths)
     out["residuals"] = _drawing("spot_plots.residuals_svg", run)
-    if run.quality is not None and run.quality.obstruction:
-        out["pupils"] = _drawing("target_plots.pupils_svg", run.quality)
-    out[SCENE] = partial(_scene, instrument, run.state, paths)
-    return {name: partial(_tried, name, draw) for name, draw in out.items()}
+    return out
 
 
 def _drawing(function: str, *given: Any) -> Callable[[], Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scenes.specs.instrument import Channel
 from twin.main_job import job_tables
-from twin.main_job.render_results import RenderRun, quality_dict
+from twin.main_job.render_results import JobRun, RenderRun, quality_dict
 from twin.main_job.verdict import recovered_numbers
 from twin.monitor.time_series import TimeSeries
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
@@ -40,7 +40,7 @@ def irradiance_file(run: RenderRun) -> bytes:
     return netcdf(irradiance(run))
 
 
-def write_results(run: RenderRun, folder: RunFolder) -> None:
+def write_results(run: JobRun, folder: RunFolder) -> None:
     """The same without irradiance.nc.
 
     Args:
@@ -48,7 +48,6 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
         folder: an open run folder.
     """
     # TIFF and netCDF are made in memory: on a full disk NumPy's writer does not say why, and HDF5 crashes the process
-    channels = run.experiment.path.channels
     folder.write_text("config.yaml", job_tables.config_text(run.resolved))
     for (path, kind), name in job_tables.table_names(run.resolved.job).items():
         given = getattr(run.resolved.job.perturb[path], kind)
@@ -56,13 +55,27 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
     finishes = job_tables.finish_tables(run.resolved.job)
     for key, name in job_tables.finish_names(run.resolved.job).items():
         folder.write_bytes(name, Path(finishes[key].table).read_bytes())
+    _write_numbers(folder, "truth", run.truth_dict())
+    if isinstance(run, RenderRun):
+        _write_monitor(run, folder)
+    if run.targets is not None:
+        _write_targets(run.targets, folder)
+    if job_tables.faces_of(run):
+        _write_numbers(folder, "deformation", job_tables.table_numbers(run, "deformation"))
+    if job_tables.heated_of(run):
+        _write_numbers(folder, "temperature", job_tables.table_numbers(run, "temperature"))
+    if run.quality is not None:
+        _write_numbers(folder, "quality", quality_dict(run.quality))
+
+
+def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
+    """What the monitor recorded and what it reads."""
     crosstalk = {name: table.to_dict() for name, table in run.crosstalk.items()}
-    recovered = recovered_numbers(run)
-    for kind, data in (("truth", run.truth_dict()), ("recovered", recovered), ("crosstalk", crosstalk)):
+    for kind, data in (("recovered", recovered_numbers(run)), ("crosstalk", crosstalk)):
         _write_numbers(folder, kind, data)
     if run.limits is not None:
         _write_numbers(folder, "uncertainty", LIMITS(run.limits))
-    for i, channel in enumerate(channels):
+    for i, channel in enumerate(run.experiment.path.channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
             facts = _spot_facts(run, channel, "nominal" if when == "before" else "perturbed")
             if when == "after" and run.series is not None:
@@ -73,14 +86,6 @@ def write_results(run: RenderRun, folder: RunFolder) -> None:
         _write_numbers(folder, "stray", run.stray.to_dict())
     if run.series is not None:
         _write_series(run, run.series, folder)
-    if run.targets is not None:
-        _write_targets(run.targets, folder)
-    if job_tables.faces_of(run):
-        _write_numbers(folder, "deformation", job_tables.table_numbers(run, "deformation"))
-    if job_tables.heated_of(run):
-        _write_numbers(folder, "temperature", job_tables.table_numbers(run, "temperature"))
-    if run.quality is not None:
-        _write_numbers(folder, "quality", quality_dict(run.quality))
 
 
 def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> None:

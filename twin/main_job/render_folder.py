@@ -15,7 +15,7 @@ from twin.main_job.job_tables import config_text, faces_of, heated_of
 from twin.main_job.part_sections import finish_section, quality_section, stray_section, target_section
 from twin.main_job.render_drawings import APART, FILES, SCENE, drawings, load_drawing, without_failed
 from twin.main_job.render_files import write_results
-from twin.main_job.render_results import PROGRAM, RenderRun
+from twin.main_job.render_results import PROGRAM, JobRun, RenderRun
 from twin.main_job.result_sections import (
     IN_PAGE,
     course_sections,
@@ -37,7 +37,7 @@ from twin.run.run_folder import write_manifest
 from twin.run.second_process import SecondProcess
 
 
-def write_run(run: RenderRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:
+def write_run(run: JobRun, session: Session, picture: bool = False, beside: SecondProcess | None = None) -> str:
     """Write all files of a run: its data, then what they look like.
 
     Args:
@@ -56,15 +56,17 @@ def write_run(run: RenderRun, session: Session, picture: bool = False, beside: S
     session.advance(WRITE, 0, 1)
     beside.start(drawings(run, trace_light_paths(run.experiment.instrument, run.experiment.backend, run.state)))
     write_results(run, folder)
-    made = (*_tabled(run), finish_section(run))
-    tables = tuple(section for section in made if section is not None)
+    tables = tuple(section for section in _tabled(run) if section is not None)
     further = further_sections("render", run)
-    limits = _limits(run)
+    limits: tuple[Section, ...] = ()
+    if isinstance(run, RenderRun):
+        finishes = finish_section(run)
+        limits = (*(() if finishes is None else (finishes,)), _limits(run))
     drawn, missing = without_failed(beside.results())
     for name, file in FILES.items():
         if name in drawn:
             folder.write_bytes(file, drawn[name])
-    sections = (*tables, limits, *further)
+    sections = (*tables, *limits, *further)
     write_artefacts((a for section in sections for a in section.artefacts), folder)
     problems = [*missing, _pictures(run, session) if picture else ""]
     pictures = [place for name in _PICTURES if (place := folder.path / name).exists()]
@@ -84,7 +86,7 @@ def _limits(run: RenderRun) -> Section:
     return limits_section(run.limits)
 
 
-def _tabled(run: RenderRun) -> tuple[Section | None, ...]:
+def _tabled(run: JobRun) -> tuple[Section | None, ...]:
     """The sections on bodies that tables of nodes deform or warm, if there are any."""
     if not faces_of(run) and not heated_of(run):
         return ()
@@ -93,7 +95,7 @@ def _tabled(run: RenderRun) -> tuple[Section | None, ...]:
     return deformation_section(run), heat_section(run)
 
 
-def _pictures(run: RenderRun, session: Session) -> str:
+def _pictures(run: JobRun, session: Session) -> str:
     """Render them; why they are not complete, else nothing."""
     from twin.pictures.picture import PictureError, write_pictures
 
@@ -119,7 +121,7 @@ AGAIN = (
 
 
 def render_report(
-    run: RenderRun,
+    run: JobRun,
     sections: Sequence[Section] = (),
     scene: bytes | None = None,
     pictures: Sequence[Path] = (),
@@ -141,25 +143,24 @@ def render_report(
     summary, *shown = result_tables(run)
     done, told = done_table(run), judge(run)
     moved = ", ".join(str(row[0]) for row in done.rows)
+    read = run if isinstance(run, RenderRun) else None
     parts = (
-        *(course_sections(run, drawn, *shown) if shown else ()),
+        *(course_sections(read, drawn, *shown) if shown and read else ()),
         Section(f"What was done{shown_time(run)}", (), (done,), name="done") if done.rows else None,
         setup_section(run),
-        _instrument(drawn["side"], pictures, viewer_markup(moved) if scene else Markup()),
-        spot_section(run, drawn),
-        residual_section(run, drawn),
+        _instrument(drawn["side"], pictures, viewer_markup(moved) if scene else Markup(), read is not None),
+        *((spot_section(read, drawn), residual_section(read, drawn)) if read else ()),
         quality_section(run, drawn),
         target_section(run, drawn),
-        stray_section(run),
-        motion_section(run, drawn),
-        crosstalk_section(run),
-        formula_section(run),
-        _light(drawn),
+        *((stray_section(read), motion_section(read, drawn), crosstalk_section(read)) if read else ()),
+        formula_section(read) if read else None,
+        _light(drawn, read is not None),
         *sections,
     )
+    about = "what its monitor sees, and what it makes of it" if read else "what changes, and what its images lose"
     return report_page(
         Report(
-            f"{run.resolved.instrument.name}: what its monitor sees, and what it makes of it",
+            f"{run.resolved.instrument.name}: {about}",
             told.verdict,
             (),
             facts(run),
@@ -180,33 +181,41 @@ def render_report(
 
 SIDE = (
     "Side view in the base frame. The cameras' planes of symmetry are parallel to it. The line CCDs stand square to "
-    "the page; a focal plane is drawn wider than it is. Monitor beams leave a pinhole beside an area CCD, go back "
-    "through the mirrors and the 180° and the 0° reflector to a mirror facet of the central prism and return the same "
-    "way; channels at both ends of the line lie in front of each other. Arrows: lines of sight."
+    "the page; a focal plane is drawn wider than it is."
 )
+BEAMS = (
+    " Monitor beams leave a pinhole beside an area CCD, go back "
+    "through the mirrors and the 180° and the 0° reflector to a mirror facet of the central prism and return the same "
+    "way; channels at both ends of the line lie in front of each other."
+)
+ARROWS = " Arrows: lines of sight."
 
 
-def _instrument(side: str, pictures: Sequence[Path], viewer: Markup) -> Section:
+def _instrument(side: str, pictures: Sequence[Path], viewer: Markup, monitored: bool) -> Section:
     """The view that can be turned, the drawing that stands in for it, and rendered pictures."""
     drawing = '<figure id="fallback"><div class="card">{}</div><figcaption>{}</figcaption></figure>'
-    markup = viewer + Markup(drawing).format(Markup(side), SIDE)
+    markup = viewer + Markup(drawing).format(Markup(side), f"{SIDE}{BEAMS if monitored else ''}{ARROWS}")
     if pictures:
         markup += Markup('<div class="pictures">{}</div>').format(Markup().join(map(_picture, pictures)))
     return Section("The instrument", (), (Piece("instrument", "", "", markup, within=IN_PAGE),), name="instrument")
 
 
-def _light(drawn: Mapping[str, str]) -> Section:
+def _light(drawn: Mapping[str, str], monitored: bool) -> Section:
     caption = (
         "Clear apertures and footprints on every mirror, in the mirror's own frame (origin at the parent's vertex). "
-        "Imaging beams of the line CCD's ends and centre fill the apertures; the monitor's beams, limited by the "
-        "return face, use a small part off the middle, out and back. A wavefront or focus error over that part moves "
-        "the spot, which is why defocus reads as a rotation."
+        "Imaging beams of the line CCD's ends and centre fill the apertures"
+    )
+    caption += (
+        "; the monitor's beams, limited by the return face, use a small part off the middle, out and back. A wavefront "
+        "or focus error over that part moves the spot, which is why defocus reads as a rotation."
+        if monitored
+        else "."
     )
     footprints = figure(drawn, "footprints", caption)
     return Section("Light path and footprints", (), (footprints,), name="light", closed=True)
 
 
-def _again_words(run: RenderRun, backend: str, pictures: bool) -> tuple[str, ...]:
+def _again_words(run: JobRun, backend: str, pictures: bool) -> tuple[str, ...]:
     """Words of the command that makes a run again from its own folder."""
     options = ("--seed", str(run.seed), "--frames", str(run.frames), "--backend", backend)
     return (PROGRAM, "config.yaml", *options, *(("--picture",) if pictures else ()))

@@ -19,9 +19,9 @@ from scenes.specs.job import check_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.main_job.job_tables import deformation_warnings
-from twin.main_job.render_results import RenderRun, StrayPair
+from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.image_quality import image_quality
+from twin.monitor.image_quality import ImageQuality, image_quality
 from twin.monitor.monitor_beams import SpotFocus
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import require_memory
@@ -73,8 +73,11 @@ def render_job(
     seed: int | None = None,
     advance: Advance = silent,
     experiment: MonitorExperiment | None = None,
-) -> RenderRun:
+) -> JobRun:
     """Run a job. Of a course, the time ``course.detail`` is the single state that most of the result is about.
+
+    Of an instrument with a monitor the result is a `RenderRun`; one without is perturbed and traced, and its cameras'
+    images are looked at.
 
     Args:
         resolved: the job.
@@ -94,6 +97,8 @@ def render_job(
     # the run's config.yaml has to repeat the run, overrides included
     resolved = resolved.with_render(count, number)
     check_targets(resolved)
+    if resolved.instrument.monitor is None:
+        return _without_monitor(resolved, backend, advance, experiment)
     stage = _Stages(advance)
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
@@ -146,14 +151,8 @@ def render_job(
     stage.begin(7)
     tables = crosstalk(experiment, recovery.shift_covariance[0])
     stage.end()
-    targets = _targets(experiment, resolved, state, number, advance) if resolved.job.render.target_images else None
+    targets, quality = _images(experiment, resolved, state, number, advance)
     instrument = experiment.instrument
-    render = resolved.job.render
-    quality = None
-    if render.quality:
-        advance(QUALITY, 0, 1)
-        quality = image_quality(instrument, backend, [{}, state], obstruction=render.obstructed)
-        advance(QUALITY, 1, 1)
     deformed = experiment.deformed(resolved.job)
     of_glass = {e.body for e in instrument.assembly.elements.values() if e.solid is not None}
     return RenderRun(
@@ -180,14 +179,91 @@ def render_job(
             *(_in_the_way(stray) if stray is not None else ()),
             *(stray.measured.warnings() if stray is not None and stray.measured is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
-            *(targets.warnings if targets is not None else ()),
-            *(quality.warnings if quality is not None else ()),
-            *((_FREE_PUPILS,) if not render.obstructed and (quality is not None or targets is not None) else ()),
+            *_image_warnings(resolved, targets, quality),
         ),
         series=series,
         stray=stray,
         targets=targets,
         quality=quality,
+    )
+
+
+def _without_monitor(
+    resolved: ResolvedJob, backend: Backend, advance: Advance, experiment: MonitorExperiment | None
+) -> JobRun:
+    """The job of an instrument without a monitor: its state, the truth about it, and the cameras' images.
+
+    Raises:
+        InputError: as `render_job`; or the job asks for what only a monitor gives.
+    """
+    job = resolved.job
+    for asked, key, what in (
+        (job.course is not None, ("course",), "a course is followed by the monitor's spots"),
+        (job.render.stray is not None, ("render", "stray"), "stray light is traced to the monitor's area CCDs"),
+        (job.disturbances is not None, ("disturbances",), "sigmas on disturbances are those of a monitor's readings"),
+    ):
+        if asked:
+            allowed = "without it: the job's one state, with image quality and targets; or an instrument with a monitor"
+            raise job.error(f"{what}, and {resolved.instrument.name} has none", key, allowed=allowed)
+    stage = _Stages(advance)
+    stage.begin(0)
+    experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
+    check_nodes(job, experiment.instrument.nodes)
+    stage.begin(1)
+    state = experiment.state(job)
+    stage.begin(2)
+    try:
+        truth = experiment.sight.truth([state])
+    except LOST as error:
+        raise _too_large(resolved, str(error)) from error
+    stage.end()
+    seed = job.render.seed
+    targets, quality = _images(experiment, resolved, state, seed, advance)
+    return JobRun(
+        resolved=resolved,
+        experiment=experiment,
+        state=state,
+        frames=resolved.frames,
+        seed=seed,
+        truth=truth,
+        warnings=(
+            *blur_warnings(resolved, backend),
+            *deformation_warnings(experiment.deformed(job), []),
+            *(text for path, body in experiment.heated(job).items() for text in body.warnings(path)),
+            *_image_warnings(resolved, targets, quality),
+        ),
+        targets=targets,
+        quality=quality,
+    )
+
+
+def _images(
+    experiment: MonitorExperiment, resolved: ResolvedJob, state: State, seed: int, advance: Advance
+) -> tuple[TargetRun | None, ImageQuality | None]:
+    """Targets and image quality of the cameras, where the job asks for them.
+
+    Raises:
+        InputError: the light of the targets is lost.
+    """
+    render = resolved.job.render
+    targets = _targets(experiment, resolved, state, seed, advance) if render.target_images else None
+    if not resolved.quality:
+        return targets, None
+    advance(QUALITY, 0, 1)
+    quality = image_quality(experiment.instrument, experiment.backend, [{}, state], obstruction=render.obstructed)
+    advance(QUALITY, 1, 1)
+    return targets, quality
+
+
+def _image_warnings(resolved: ResolvedJob, targets: TargetRun | None, quality: ImageQuality | None) -> tuple[str, ...]:
+    return (
+        *(targets.warnings if targets is not None else ()),
+        *(quality.warnings if quality is not None else ()),
+        *(
+            (_FREE_PUPILS,)
+            if not resolved.job.render.obstructed and (quality is not None or targets is not None)
+            else ()
+        ),
     )
 
 

@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from analysis.monitor import parameters
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
+from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
@@ -46,23 +49,17 @@ class StrayPair:
         return out if self.measured is None else {**out, "finishes": self.measured.to_dict()}
 
 
-@dataclass(frozen=True, eq=False)
-class RenderRun:
-    """One job's outcome.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JobRun:
+    """What a job does to an instrument, whether it has a monitor or not.
 
     Attributes:
         resolved: the job with everything it names.
-        experiment: the instrument and its calibration.
+        experiment: the instrument, with the calibration of its monitor if it has one.
         state: what was perturbed.
         frames, seed: of the exposures.
         truth: by exact tracing.
-        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns), stray light included.
-        before, after: grey values, uint16 (C, frames, rows, columns).
-        recovery: what the images say (one state).
-        crosstalk: camera -> response to elementary motions.
         warnings: what the user should know.
-        series: all times of the job's course, None if it has none; the rest is then about the time it shows.
-        stray: ghosts and stray light, None if not asked for.
         targets: test targets on the line CCDs, None if not asked for.
         quality: image quality of the nominal and of the perturbed state, None if not asked for.
     """
@@ -73,27 +70,72 @@ class RenderRun:
     frames: int
     seed: int
     truth: Truth
+    warnings: tuple[str, ...]
+    targets: TargetRun | None = None
+    quality: ImageQuality | None = None
+
+    def truth_dict(self) -> dict[str, Any]:
+        """Contents of truth.json."""
+        out: dict[str, Any] = {"cameras": {}}
+        for group, one, value in self.true_changes():
+            held = out if group in (ANGLE_GROUP, GROUND_GROUP) else out["cameras"]
+            held.setdefault(group, {})[one.key] = value
+        return self._with_nominal(out)
+
+    def true_changes(self) -> list[tuple[str, Parameter, float]]:
+        """Camera or group of two cameras, parameter, and how it truly changed, in the parameter's unit."""
+        truth = self.truth
+        out = [
+            (name, one, one.per_si * float(value) + 0.0)
+            for name in truth.cameras
+            for one, value in zip(parameters.ESTIMATED, truth.vector(name)[0], strict=True)
+        ]
+        if len(truth.cameras) == 2:
+            out.append((ANGLE_GROUP, parameters.ANGLE, float(truth.angle_change[0]) / ARCSEC + 0.0))
+        if (ground := self.experiment.ground) is not None:
+            errors = zip(parameters.GROUND, truth.ground_error(ground)[0], strict=True)
+            out += [(GROUND_GROUP, one, float(value) + 0.0) for one, value in errors]
+        return out
+
+    def _with_nominal(self, out: dict[str, Any]) -> dict[str, Any]:
+        """True changes with the nominal principal distances and angle beside them."""
+        for name, group in out["cameras"].items():
+            group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
+        if ANGLE_GROUP in out:
+            out[ANGLE_GROUP] = {"nominal_deg": float(np.degrees(self.truth.angle))} | out[ANGLE_GROUP]
+        return out
+
+    @property
+    def checks(self) -> tuple[SelfCheck, ...]:
+        """What was checked on the way."""
+        return ()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderRun(JobRun):
+    """One job's outcome, of an instrument with a monitor: also what its spots say.
+
+    Attributes:
+        photons_before, photons_after: expected photons per pixel and frame, (C, rows, columns), stray light included.
+        before, after: grey values, uint16 (C, frames, rows, columns).
+        recovery: what the images say (one state).
+        crosstalk: camera -> response to elementary motions.
+        series: all times of the job's course, None if it has none; the rest is then about the time it shows.
+        stray: ghosts and stray light, None if not asked for.
+    """
+
     photons_before: np.ndarray
     photons_after: np.ndarray
     before: np.ndarray
     after: np.ndarray
     recovery: Recovery
     crosstalk: Mapping[str, CameraCrosstalk]
-    warnings: tuple[str, ...]
     series: TimeSeries | None = None
     stray: StrayPair | None = None
-    targets: TargetRun | None = None
-    quality: ImageQuality | None = None
 
     def truth_dict(self) -> dict[str, Any]:
         """Contents of truth.json."""
-        out = self.reading.table.true()
-        for name, group in out["cameras"].items():
-            group["principal_distance_mm"] = 1e3 * float(self.truth.principal_distance[name])
-        if "intersection_angle" in out:
-            nominal = {"nominal_deg": float(np.degrees(self.truth.angle))}
-            out["intersection_angle"] = nominal | out["intersection_angle"]
-        return out
+        return self._with_nominal(self.reading.table.true())
 
     @cached_property
     def reading(self) -> MonitorReading:

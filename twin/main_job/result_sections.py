@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from analysis.monitor.parameters import GROUND_GROUP
+from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.course import moment
 from twin.main_job.assumptions import assumed, course_agrees
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import joined, systematics
 from twin.monitor.reading_table import Reading, ReadingTable
 from twin.monitor.time_series import TimeSeries
@@ -44,16 +44,46 @@ def figure(
     return SvgFigure(own, title, caption, drawn[name], within=IN_PAGE, full=full)
 
 
-def shown_time(run: RenderRun) -> str:
+def shown_time(run: JobRun) -> str:
     """``, at 12 min``: the time of a course that a run shows in full; empty without a course."""
+    if not isinstance(run, RenderRun):
+        return ""
     return "" if run.series is None else f", at {moment(float(run.series.times[run.series.shown]))}"
 
 
-def result_tables(run: RenderRun) -> tuple[Table, ...]:
-    """Recovered against true; of a course first the errors over all its times, then one of these times."""
+def result_tables(run: JobRun) -> tuple[Table, ...]:
+    """Recovered against true; of a course first the errors over all its times, then one of these times. Without a
+    monitor the true changes alone.
+    """
+    if not isinstance(run, RenderRun):
+        return (_change_table(run),)
     if run.series is None:
         return (_state_table(run, "results", "Recovered against true"),)
     return _course_table(run, run.series), _state_table(run, "shown_time", "")
+
+
+def _change_table(run: JobRun) -> Table:
+    """True changes of the cameras, of the angle between two, and on the ground."""
+    rows: list[list[Cell]] = []
+    bands: dict[int, str] = {}
+    for group, one, value in run.true_changes():
+        title = {ANGLE_GROUP: _ANGLE_TITLE, GROUND_GROUP: _GROUND_TITLE}.get(group, f"Camera {group}")
+        if title not in bands.values():
+            bands[len(rows)] = title
+        key = f"{group}.{one.key}"
+        label = Marked(one.label, one.meaning, "text")
+        rows.append([label, Marked(fixed(value, one.decimals, sign=True), "", "truth", key)])
+    full: list[list[Cell]] = [[group, one.symbol, one.unit, value] for group, one, value in run.true_changes()]
+    return Table(
+        "results",
+        "What changed, by exact chief rays",
+        "Perturbed minus nominal. Angles are right-handed about the camera's own axes; Δf is in pixels of its line.",
+        ("Parameter", "change"),
+        rows,
+        bands=bands,
+        within=IN_PAGE,
+        full=Table("results", "Results", "", ["of", "parameter", "unit", "change"], full),
+    )
 
 
 def part_title(run: RenderRun, reading: Reading, nominal: bool = True) -> str:

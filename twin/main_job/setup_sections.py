@@ -9,7 +9,7 @@ from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
 from twin.main_job.monitor_reading import CENTROID_NOTES
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE
 from twin.run.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
 from twin.run.report import Section
@@ -18,11 +18,17 @@ _PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/
 ZERO_CELSIUS = 273.15
 
 
-def facts(run: RenderRun) -> tuple[tuple[str, str], ...]:
+def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     """What was set up, and what the estimators assume."""
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, stated = resolved.instrument, run.experiment.stated is not None
-    monitor, ccd = spec.monitor, spec.monitor.area_ccd
+    own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
+    free = "Structures expand freely and carry what stands on them, mirrors and prisms bend (finite elements), glass "
+    free += "changes its index."
+    if not isinstance(run, RenderRun):
+        without = "The instrument has no monitor: changes are those of the exact trace, and nothing is measured."
+        return ("Assumptions", f"{without} {free}"), own
+    monitor, ccd, bits = spec.autocollimator, spec.autocollimator.area_ccd, resolved.area_detector.bit_depth
     fields = [float(np.degrees(one.field)) for name in spec.cameras for one in spec.channels_of(name).values()]
     family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
     judged = run.estimators[run.judged].title
@@ -31,14 +37,13 @@ def facts(run: RenderRun) -> tuple[tuple[str, str], ...]:
         f"{family}. Any other motion is read as a mixture of these, an error that no number of frames reduces "
         f"(Residuals, Crosstalk){'; σ holds it, as far as it is by stated disturbances' if stated else ''}. "
         + (f"The {judged} weighs all stated motions against the noise. " if stated else "")
-        + "Structures expand freely and carry what stands on them, mirrors and prisms bend (finite elements), glass "
-        "changes its index."
+        + free
     )
     return (
         ("Assumptions", about),
         *((estimator.title, estimator.note) for estimator in run.estimators.values()),
         ("Paper", _PAPER),
-        ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name),
+        own,
         (
             "Monitor",
             f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
@@ -47,7 +52,7 @@ def facts(run: RenderRun) -> tuple[tuple[str, str], ...]:
         ),
         (
             "Area CCD",
-            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, {resolved.detector.bit_depth} bits, "
+            f"{ccd.rows} × {ccd.columns} pixels of {plain(1e6 * ccd.pitch)} µm, {bits} bits, "
             f"exposure {plain(1e3 * ccd.exposure)} ms",
         ),
         (
@@ -74,7 +79,7 @@ def _fields(degrees: list[float]) -> str:
     return ", ".join(signs[frozenset(own)] + size for size, own in ends.items())
 
 
-def setup_section(run: RenderRun) -> Section:
+def setup_section(run: JobRun) -> Section:
     """The cameras, and cause by cause what is stated to move."""
     spec, instrument = run.resolved.instrument, run.experiment.instrument
     rows: list[list[Cell]] = []
@@ -82,17 +87,17 @@ def setup_section(run: RenderRun) -> Section:
         focal, line = float(run.experiment.nominal_truth.principal_distance[name]), model.spec.line
         row: list[Cell] = [name, model.spec.name, float(np.degrees(spec.cameras[name].look)), focal]
         row += [focal / model.spec.entrance_pupil, line.pixels, 1e6 * line.pitch, 1e3 * line.pixels * line.pitch]
-        rows.append([*row, 1e3 * float(instrument.separation[name])])
+        rows.append([*row, 1e3 * float(instrument.separation[name])] if instrument.channels else row)
     heads = ["camera", "prescription", "look angle [deg]", "principal distance [m]", "F-number", "pixels"]
-    heads += ["pitch [µm]", "line [mm]", "distance of the area CCDs [mm]"]
-    decimals = (None, None, 2, 4, 1, None, None, 1, 2)
+    heads += ["pitch [µm]", "line [mm]", *(["distance of the area CCDs [mm]"] if instrument.channels else [])]
+    decimals = (None, None, 2, 4, 1, None, None, 1, 2)[: len(heads)]
     cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
     stated = () if run.experiment.stated is None else (_stated(run),)
     title = "Cameras, and what is stated to move" if stated else "Cameras"
     return Section(title, (), (*stated, cameras), closed=True)
 
 
-def _stated(run: RenderRun) -> Table:
+def _stated(run: JobRun) -> Table:
     motions, spec = run.experiment.stated, run.resolved.disturbances
     assert motions is not None
     assert spec is not None
@@ -130,10 +135,10 @@ def _stated(run: RenderRun) -> Table:
     )
 
 
-def done_table(run: RenderRun) -> Table:
+def done_table(run: JobRun) -> Table:
     """What the job does to each node, at the time that is shown; not what follows from it for other bodies."""
     job = run.resolved.job
-    shown = None if run.series is None else run.series.shown
+    shown = _shown(run)
     motions, fields = motions_of(job, shown), job.fields(shown)
     rows: list[list[Cell]] = []
     for path in dict.fromkeys((*motions, *fields)):
@@ -157,10 +162,15 @@ def done_table(run: RenderRun) -> Table:
     return Table("perturbation", "", caption, ("body", "motion", "pivot"), rows, within=IN_PAGE)
 
 
-def _heated(run: RenderRun) -> int:
+def _shown(run: JobRun) -> int | None:
+    """Number of the time of a course that is shown; None without one."""
+    return run.series.shown if isinstance(run, RenderRun) and run.series is not None else None
+
+
+def _heated(run: JobRun) -> int:
     """How many bodies have another temperature than nominal, faces of prisms not counted."""
     job = run.resolved.job
-    time = None if run.series is None else run.series.shown
+    time = _shown(run)
     fields = run.experiment.thermal.fields(run.experiment.fields(job, time))
     return sum(path in run.experiment.thermal.materials and field != Temperature() for path, field in fields.items())
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from analysis.units import ARCSEC
 from optics.thermal.nodal_deformation import NodalDeformation
 from twin.main_job.job_tables import BENT, WARMED, faces_of, heated_of
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun
 from twin.run.artefact import Cell, SvgFigure, Table, plain
 from twin.run.report import Section
 from twin.run.svg import look, new_figure, signed_map, to_svg
@@ -30,7 +30,7 @@ _FACES = (
 )
 
 
-def deformation_section(run: RenderRun) -> Section | None:
+def deformation_section(run: JobRun) -> Section | None:
     """Numbers, terms and maps of all deformed bodies; None where there are none."""
     faces = faces_of(run)
     if not faces:
@@ -144,7 +144,7 @@ def _maps(figure: Figure, axes: Any, path: str, face: NodalDeformation) -> None:
     axes[0].set_ylabel("y, mm")
 
 
-def heat_section(run: RenderRun) -> Section | None:
+def heat_section(run: JobRun) -> Section | None:
     """Numbers of all bodies that tables of temperatures warm; None where there are none."""
     bodies = heated_of(run)
     if not bodies:

@@ -18,7 +18,7 @@ from scenes.models.job_state import beyond_statement
 from scenes.specs.course import moment
 from twin.main_job.assumptions import NOISE, combination, contradiction, doubted, limits, share_text
 from twin.main_job.monitor_reading import stated
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.systematics import joined, perturbed_unseen, systematics
 from twin.monitor.image_quality import ImageQuality
 from twin.monitor.reading_table import Reading
@@ -63,8 +63,10 @@ def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
     return run.series.readings.rms.of(estimator) if run.series else run.reading.table.of(estimator)
 
 
-def judge(run: RenderRun) -> Judgement:
-    """Judge a run by its readings, sigmas, truth and crosstalk."""
+def judge(run: JobRun) -> Judgement:
+    """Judge a run by its readings, sigmas, truth and crosstalk; without a monitor by the truth and the images."""
+    if not isinstance(run, RenderRun):
+        return Judgement(_changed(run), run.warnings)
     found = readings(run, run.judged)
     off = [r for r in found if r.far]
     if run.series is not None:
@@ -81,6 +83,44 @@ def judge(run: RenderRun) -> Judgement:
     limit = f"; {limited(run)}" if limited(run) else ""
     doubt = "; σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
     return Judgement(f"{verdict}{limit}{_dimmed(run)}{_blurred(run)}{doubt}.", warnings)
+
+
+def _changed(run: JobRun) -> str:
+    """What the perturbation of an instrument without a monitor does."""
+    moved = any(_moves(motion) for motion in run.state.values())
+    cameras = len(run.truth.cameras) > 1
+    parts = [
+        f"{one.symbol} {'of ' + group + ' ' if cameras and group in run.truth.cameras else ''}"
+        f"{significant(value, 3, sign=True)} {one.unit}"
+        for group, one, value in run.true_changes()
+        if group not in (GROUND_GROUP,) and abs(value) > 0.5 * 10.0**-one.decimals
+    ]
+    if not moved:
+        text = "Nothing is perturbed"
+    elif parts:
+        text = f"The perturbation changes the geometry by {', '.join(parts)}"
+    else:
+        text = "The perturbation does not change the geometry"
+    if run.quality is None:
+        return f"{text}."
+    worst: list[str] = []
+    for name, camera in run.quality.cameras.items():
+        before, after = (float(np.max(errors)) for errors in camera.wfe)
+        who = f" of {name}" if cameras else ""
+        if not np.isfinite(before):
+            worst.append(f"the image quality{who} is not known: {camera.reasons[0]}")
+        elif not np.isfinite(after):
+            worst.append(f"the image quality{who} after it is not known: {camera.reasons[1]}")
+        elif moved:
+            worst.append(
+                f"the worst wavefront error{who} goes from {significant(before, 3)} to {significant(after, 3)} "
+                "waves rms"
+            )
+        else:
+            worst.append(f"the worst wavefront error{who} is {significant(before, 3)} waves rms")
+    share, _, change = sharpness_lost(run.quality)
+    told = f", the MTF at Nyquist at worst {change}" if moved and share > 0.0 else ""
+    return f"{text}; {', '.join(worst)}{told}."
 
 
 def _unseen(run: RenderRun) -> tuple[str, ...]:

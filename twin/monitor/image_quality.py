@@ -25,6 +25,7 @@ from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
@@ -33,11 +34,19 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
+from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES
 from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE, line_body
 from scenes.models.instrument_model import Instrument
-from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams, imaging_shadows
+from scenes.models.shadow import (
+    ImagingShadows,
+    Shadows,
+    TracedBeams,
+    edge_outlines,
+    imaging_shadows,
+    no_shadows,
+)
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
@@ -54,6 +63,9 @@ WAVELENGTH = 650e-9
 
 RINGS = 7
 """Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
+
+EDGED, EDGED_RINGS = (DEGREE, 10, 12, 14), 14
+"""Degrees of the polynomials of a pupil that edges of surfaces cut, the first that do, and rings of its quadrature."""
 
 _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
@@ -266,7 +278,10 @@ class _CameraBench:
         stop = instrument.assembly.elements[f"{name}/{spec.stop}"].aperture
         assert isinstance(stop, Circle)
         self.stop = stop
-        self.nodes = quadrature.disk(RINGS)
+        # edges leave rays in the dark, where the wavefront may bend more
+        self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
+        self.degrees = EDGED if self.model.edges else (DEGREE,)
+        self.nodes = quadrature.disk(EDGED_RINGS if self.model.edges else RINGS)
         self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
         self.assembly = instrument.assembly
 
@@ -274,7 +289,7 @@ class _CameraBench:
         """Work out some states; where the light of one is lost, both halves by themselves."""
         try:
             rays, size, shadows = self._trace([states[s] for s in which])
-        except (AimError, BeamMissedError) as error:
+        except (AimError, BeamMissedError, UnphysicalError) as error:
             if len(which) == 1:
                 reasons[which[0]] = str(error)
                 return
@@ -329,10 +344,12 @@ class _CameraBench:
         launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
         heading = -sight.reshape(-1, 3)
         rays = imaging_rays(self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis)
-        if self.shadows is None:
-            return rays, imaging.size, None
         beams = TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
-        return rays, imaging.size, self.shadows.cast(beams)
+        shadows = None if self.shadows is None else self.shadows.cast(beams)
+        if self.model.edges:
+            free = no_shadows(len(every)) if shadows is None else shadows
+            shadows = free.and_edges(edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
+        return rays, imaging.size, shadows
 
     def _numbers(
         self, rays: ImagingRays, size: np.ndarray, shadows: Shadows | None, which: np.ndarray
@@ -358,9 +375,14 @@ class _CameraBench:
             v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
             path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
             taken = None if pieces is None else pieces[lit]
-            pupils = PupilStack.fit(u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, shadows=taken)
+            for degree in self.degrees:
+                pupils = PupilStack.fit(
+                    u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides
+                )
+                smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
+                if np.all(smooth):
+                    break
             lost[lit] = 1.0 - pupils.light
-            smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)

@@ -186,13 +186,13 @@ def spot_noise(
     shown = tuple(c for c in channels if c in groups.values())
     own = path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
     photons = own.expected_photons([{}], margin=_SLOPE, single=single)[0]
-    exposure = spec.monitor.area_ccd.exposure
+    exposure = spec.autocollimator.area_ccd.exposure
     model, dark = detector.noise_model(exposure), float(detector.expected_dn(np.zeros((1, 1)), exposure)[0, 0])
     out, brightest = np.zeros((len(channels), 2, len(channels), 2)), np.zeros(len(channels))
     for k, channel in enumerate(channels):
         like = groups[(channel.camera, channel.aperture) if alike else channel.key]
         image = photons[shown.index(like)] * (channel.photons / like.photons)
         light = detector.expected_dn(image, exposure) - dark
-        out[k, :, k, :] = 2.0 * image_bound(light[None], dark, model, spec.monitor.frames)[0]
+        out[k, :, k, :] = 2.0 * image_bound(light[None], dark, model, spec.autocollimator.frames)[0]
         brightest[k] = light.max() / (detector.saturation_dn - dark)
     return out.reshape(2 * len(channels), -1), brightest

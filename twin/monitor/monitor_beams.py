@@ -155,10 +155,10 @@ class MonitorBeams:
         self.backend = backend
         self.cameras = tuple(name for name in instrument.cameras if cameras is None or name in cameras)
         self.channels: tuple[Channel, ...] = tuple(c for c in instrument.channels if c.camera in self.cameras)
-        ccd = instrument.spec.monitor.area_ccd
+        ccd = instrument.spec.autocollimator.area_ccd
         self.shape = (ccd.rows, ccd.columns)
         self.pitch: float = ccd.pitch
-        self.wavelength: float = instrument.spec.monitor.wavelength
+        self.wavelength: float = instrument.spec.autocollimator.wavelength
         self.face_radius = np.array([0.5 * channel.aperture for channel in self.channels])
         self._nodes: PupilNodes | None = nodes
 

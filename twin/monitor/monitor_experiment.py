@@ -51,6 +51,9 @@ TEMPLATE_MARGIN = 40
 class MonitorExperiment:
     """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
 
+    Of an instrument without a monitor there are states, their truth and the cameras' images; whatever is about spots
+    raises InputError.
+
     Args:
         resolved: the job with everything it names; its perturbation is not used here.
         backend: where to trace.
@@ -64,15 +67,34 @@ class MonitorExperiment:
     def __init__(self, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
         self.backend = backend
         self.resolved = resolved
-        self.exposure: float = resolved.instrument.monitor.area_ccd.exposure
-        self.detector = EmvaDetector.from_sheet(resolved.detector, self.exposure)
         self.instrument: Instrument = build_instrument(resolved.instrument, resolved.cameras, backend, free_beams)
-        self.path = MonitorPath(self.instrument, backend)
-        self._require_sampled()
-        require_memory(resolved, self.size(), self.detector)
+        if self.monitored:
+            self._require_sampled()
+            require_memory(resolved, self.size(), self.detector)
         self._deformed: dict[tuple[str, DeformationSpec], NodalDeformation] = {}
         self._heated: dict[tuple[str, TableTemperatureSpec], HeatedBody] = {}
         self._patterns: dict[int, FixedPattern] = {}
+
+    @property
+    def monitored(self) -> bool:
+        """Whether the instrument has a monitor."""
+        return self.resolved.instrument.monitor is not None
+
+    @cached_property
+    def exposure(self) -> float:
+        """Of a frame of the area CCDs, seconds."""
+        return self.resolved.instrument.autocollimator.area_ccd.exposure
+
+    @cached_property
+    def detector(self) -> EmvaDetector:
+        """The area CCDs."""
+        return EmvaDetector.from_sheet(self.resolved.area_detector, self.exposure)
+
+    @cached_property
+    def path(self) -> MonitorPath:
+        """The way of the monitor's light."""
+        self.resolved.instrument.autocollimator  # noqa: B018 - says so where there is none
+        return MonitorPath(self.instrument, self.backend)
 
     def _require_sampled(self) -> None:
         try:

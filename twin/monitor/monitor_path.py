@@ -147,7 +147,7 @@ class MonitorPath(MonitorBeams):
     def _response(self, wider: int) -> PixelResponse:
         """Likewise for beams wider by some steps of ``WIDEST``."""
         if wider not in self._responses:
-            pinhole = self.instrument.spec.monitor.reticle.pinhole
+            pinhole = self.instrument.spec.autocollimator.reticle.pinhole
             cutoff = 2.0 * self.numerical_aperture * WIDEST**wider / self.wavelength
             self._responses[wider] = PixelResponse.fit(self.pitch, pinhole, cutoff)
         return self._responses[wider]

@@ -184,7 +184,7 @@ class ErrorBudget:
             Glass path before and after, metres (mean over the channels), and the ratio of the rms spot displacements.
         """
         whole = self.experiment
-        monitor = whole.instrument.spec.monitor
+        monitor = whole.instrument.spec.autocollimator
         transfer = [float(np.hypot(*s[:2])) for s in self._transfers()]
         shift = monitor.prism_0.shift + 0.5 * float(np.mean(transfer))
         longer = monitor.model_copy(update={"prism_0": monitor.prism_0.model_copy(update={"shift": shift})})

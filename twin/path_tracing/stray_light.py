@@ -103,7 +103,7 @@ def pinhole(
         cone = CONE_ROOM * 0.5 * model.spec.entrance_pupil / model.line_focal_length
     place = placed.pose(channel.reticle_body).translation
     axis = instrument.toward_optics(placed, channel.camera)[0]
-    radius = 0.5 * instrument.spec.monitor.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
+    radius = 0.5 * instrument.spec.autocollimator.reticle.pinhole * float(placed.size(channel.reticle_body)[0])
     aimed = aimed or _nominal_rays(instrument, backend)
     number = instrument.channels.index(channel)
     return DiskSource.along(place, axis, radius, cone).aimed_at(aimed.direction[number], NARROW_ROOM)
@@ -159,7 +159,7 @@ def trace_stray(
     scenery = build_scenery(instrument, state, finishes, baffles)
     tracer = PathTracer(backend, scenery, monitor_families(scenery, instrument), sampling)
     aimed = _nominal_rays(instrument, backend)
-    ccd = instrument.spec.monitor.area_ccd
+    ccd = instrument.spec.autocollimator.area_ccd
     photons = {f"{c.key}/area_ccd": np.zeros((ccd.rows, ccd.columns)) for c in instrument.channels}
     runs: dict[str, PathResult] = {}
     scale: dict[str, float] = {}

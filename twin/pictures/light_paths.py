@@ -71,13 +71,25 @@ def trace_light_paths(instrument: Instrument, backend: Backend, state: State, re
         backend: where to trace.
         state: what is perturbed.
         reach: how far the imaging beams are drawn beyond the first mirror toward the scene, metres; 0 takes the
-            distance of the farthest 180-deg prism.
+            distance of the farthest 180-deg prism, without a monitor the longest camera's length.
     """
     placed = instrument.assembly.place([state])
     spec = instrument.spec
-    reach = reach or max(one.prism_180.distance for name in spec.cameras for one in spec.channels_of(name).values())
-    beams = _imaging(instrument, backend, state, placed, reach) + _monitor(instrument, backend, state, placed)
+    distances = [one.prism_180.distance for name in spec.cameras for one in spec.channels_of(name).values()]
+    reach = reach or max(distances, default=0.0) or _length(instrument, placed)
+    beams = _imaging(instrument, backend, state, placed, reach)
+    if instrument.channels:
+        beams += _monitor(instrument, backend, state, placed)
     return LightPaths(tuple(beams), placed)
+
+
+def _length(instrument: Instrument, placed: PlacedBodies) -> float:
+    """How far the surfaces of the longest camera lie apart, metres."""
+    lengths = []
+    for name, model in instrument.cameras.items():
+        places = np.array([placed.pose(f"{BASE}/{name}/{surface}").translation for surface in model.mirrors])
+        lengths.append(float(np.max(np.linalg.norm(places[:, None] - places, axis=-1))))
+    return max(lengths) or float(max(model.spec.entrance_pupil for model in instrument.cameras.values()))
 
 
 def _circle(radius: float) -> np.ndarray:

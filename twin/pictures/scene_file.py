@@ -213,7 +213,7 @@ def _baffle_meshes(plates: tuple[Plate, ...]) -> dict[str, tuple[str, trimesh.Tr
 
 
 def _channel_meshes(instrument: Instrument, channel: Channel) -> dict[str, trimesh.Trimesh]:
-    ccd = instrument.spec.monitor.area_ccd
+    ccd = instrument.spec.autocollimator.area_ccd
     face = instrument.assembly.elements[f"{channel.key}/return_face"].aperture
     assert isinstance(face, Circle)
     disc = trimesh.creation.cylinder(radius=face.radius, height=CHIP, sections=48)  # a coating, as thick as can be seen

@@ -161,7 +161,7 @@ def run_recover(
 def _modelled(setup: MeasurementSetup, backend: Backend, experiment: MonitorExperiment | None) -> _Bench:
     assert setup.model is not None
     experiment = MonitorExperiment(setup.model, backend) if experiment is None else experiment
-    ccd = setup.model.instrument.monitor.area_ccd
+    ccd = setup.model.instrument.autocollimator.area_ccd
     experiment.nominal_focus  # noqa: B018 - an instrument without spots is told first
     return _Bench(
         cameras=experiment.cameras,

@@ -473,7 +473,7 @@ def coarse_warnings(setup: Spec) -> tuple[str, ...]:
     instrument, sheet = getattr(setup, "instrument", None), getattr(setup, "detector", None)
     if not isinstance(instrument, InstrumentSpec) or not isinstance(sheet, DetectorSpec):
         return ()
-    exposure = instrument.monitor.area_ccd.exposure
+    exposure = instrument.autocollimator.area_ccd.exposure
     chosen = {sheet.name: sheet, **{one.name: one for one in getattr(setup, "detectors", {}).values()}}
     out: list[str] = []
     for name, one in chosen.items():

@@ -24,12 +24,11 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
-from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
-from scenes.models.shadow import ImagingShadows, TracedBeams
+from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
@@ -242,34 +241,19 @@ class TargetPath:
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        taken = None
-        if self.shadows is not None:
-            owner = np.zeros(len(directions), dtype=int)
-            beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
-            taken = self.shadows.cast(beams).pieces
+        owner = np.zeros(len(directions), dtype=int)
+        beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+        taken = None if self.shadows is None else self.shadows.cast(beams).pieces
         if self.model.edges:
             others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-            taken = self._edges(placed, systems, rays.launched, directions).shadows(len(directions), others)
+            outlines = edge_outlines(beams, self.model, self.name, self.backend)
+            taken = outlines.shadows(len(directions), others)
         turned = turned.in_lengths_of(systems.size)
         *tried, last = DEGREES if self.model.edges else (DEGREE,)
         for degree in tried:
             with suppress(RoughWavefrontError):
                 return fit_pupils(turned, self.nodes, degree, taken)
         return fit_pupils(turned, self.nodes, last, taken)
-
-    def _edges(
-        self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
-    ) -> StopOutlines:
-        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop."""
-        found = StopOutlines()
-        cut = {name: self.model.mirrors.index(name) for name in self.model.edges}
-        sent = make_rays(self.backend, launched, np.broadcast_to(directions[:, None], launched.shape))
-        traced = trace(self.backend, systems, sent, keep=tuple(cut.values()))
-        for name, number in cut.items():
-            size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
-            places = np.asarray(traced.hit(number) / size)[..., :2]
-            found += outlines_on_stop(places, self.model.edges[name], self.nodes)
-        return found
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""

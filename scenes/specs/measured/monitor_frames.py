@@ -225,7 +225,7 @@ def resolve_measurement(path: str | Path) -> MeasurementSetup:
         detector = load_detector(find_named(DETECTORS, spec.detector, spec, ("detector",)))
     else:
         assert model is not None
-        detector = model.detector
+        detector = model.area_detector
     if model is not None:
         model = model.model_copy(update={"detector": detector})
     spec = _located(spec, _channels(spec, model), Path(spec.source.file).parent)
@@ -240,7 +240,7 @@ def _model(spec: MeasurementSpec) -> ResolvedJob | None:
     model = resolve_job(job.with_source(spec.source))
     if spec.exposure is None:
         return model
-    monitor = model.instrument.monitor
+    monitor = model.instrument.autocollimator
     ccd = monitor.area_ccd.model_copy(update={"exposure": spec.exposure})
     instrument = model.instrument.model_copy(update={"monitor": monitor.model_copy(update={"area_ccd": ccd})})
     return model.model_copy(update={"instrument": instrument})

@@ -147,7 +147,7 @@ class MonitorSeries:
         self, experiment: MonitorExperiment, spec: OrbitMonitorSpec, reference: State, pair: tuple[str, str]
     ) -> None:
         self.experiment, self.spec, self.pair = experiment, spec, pair
-        self.frames: int = spec.frames or experiment.instrument.spec.monitor.frames
+        self.frames: int = spec.frames or experiment.instrument.spec.autocollimator.frames
         self.reference = experiment.path.expected_photons([reference])
         self._clean_reference = self._reference_spots(experiment.expected_frames(self.reference))
         names = list(experiment.instrument.cameras)

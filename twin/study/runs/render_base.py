@@ -223,9 +223,9 @@ class RenderBase:
 
     def _experiment(self, resolved: ResolvedJob, backend: Backend) -> tuple[str, MonitorExperiment]:
         """The instrument with its calibration, and what tells it from others."""
-        parts = [resolved.instrument, *resolved.cameras.values(), resolved.detector]
-        parts += [] if resolved.disturbances is None else [resolved.disturbances]
-        name = json.dumps([backend.name, *(part.plain() for part in parts)])
+        parts: list[Spec | None] = [resolved.instrument, *resolved.cameras.values(), resolved.detector]
+        parts.append(resolved.disturbances)
+        name = json.dumps([backend.name, *(part.plain() for part in parts if part is not None)])
         if name not in self._experiments:
             self._experiments[name] = MonitorExperiment(resolved, backend)
             _forget(self._experiments)
@@ -258,14 +258,13 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
     from twin.main_job.render_job import render_job
 
     run = render_job(resolved, backend)
-    out: dict[str, Any] = {
-        "truth": run.truth_dict(),
-        "recovered": run.recovered_dict(),
-        "crosstalk": {name: table.to_dict() for name, table in run.crosstalk.items()},
-    }
-    for name, part in (("course", run.series), ("stray", run.stray), ("mtf", run.targets)):
-        if part is not None:
-            out[name] = part.to_dict()
+    out: dict[str, Any] = {"truth": run.truth_dict()}
+    if isinstance(run, RenderRun):
+        out["recovered"] = run.recovered_dict()
+        out["crosstalk"] = {name: table.to_dict() for name, table in run.crosstalk.items()}
+        out |= {name: part.to_dict() for name, part in (("course", run.series), ("stray", run.stray)) if part}
+    if run.targets is not None:
+        out["mtf"] = run.targets.to_dict()
     if run.quality is not None:
         out["quality"] = quality_dict(run.quality)
     return out

@@ -47,7 +47,7 @@ class Bench:
         self._geometry: dict[str, MonitorGeometry] = {}
         if like is not None:
             self._geometry = {name: like.geometry(name) for name in self.cameras}
-        self.frames = experiment.instrument.spec.monitor.frames
+        self.frames = experiment.instrument.spec.autocollimator.frames
 
     def geometry(self, camera: str) -> MonitorGeometry:
         """What the formulas are given of a camera."""

@@ -76,12 +76,12 @@ def variant(
     of_ccd: dict[str, Any] = {} if pixels is None else {"rows": pixels, "columns": pixels}
     if ccd_offset is not None:
         of_ccd["offset"] = ccd_offset
-    of_monitor: dict[str, Any] = {"area_ccd": spec.monitor.area_ccd.model_copy(update=of_ccd)}
+    of_monitor: dict[str, Any] = {"area_ccd": spec.autocollimator.area_ccd.model_copy(update=of_ccd)}
     if field is not None:
         of_monitor["field"] = field
     changed = {
         "cameras": FrozenMap({camera: site}),
-        "monitor": spec.monitor.model_copy(update=of_monitor),
+        "monitor": spec.autocollimator.model_copy(update=of_monitor),
         "baffles": FrozenMap({}),
     }
     return MonitorExperiment(resolved.model_copy(update={"instrument": spec.model_copy(update=changed)}), backend)
@@ -158,7 +158,7 @@ class Response:
 
 def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Response]:
     """All kinds of return, by rendered images."""
-    camera, pitch = like.cameras[0], resolved.instrument.monitor.area_ccd.pitch
+    camera, pitch = like.cameras[0], resolved.instrument.autocollimator.area_ccd.pitch
     out = []
     for kind in RETURNS:
         built = with_return(variant(resolved, backend, camera, ccd_offset=_OFFSETS[kind]), kind)
@@ -174,7 +174,7 @@ def responses(resolved: ResolvedJob, backend: Backend, like: Bench) -> list[Resp
 def depth_of_focus(resolved: ResolvedJob, camera: str) -> float:
     """2 λ N², where a quarter of a wave of defocus is reached at the monitor's wavelength, metres."""
     spec = resolved.cameras[resolved.instrument.cameras[camera].camera]
-    return 2.0 * resolved.instrument.monitor.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
+    return 2.0 * resolved.instrument.autocollimator.wavelength * (spec.focal_length / spec.entrance_pupil) ** 2
 
 
 def piston(camera: str, amount: float, *, along: tuple[float, float] = (0.0, 0.0), turn: float = 0.0) -> State:
