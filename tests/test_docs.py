@@ -30,7 +30,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.schema import MODELS
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import JobSpec, check_nodes
+from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import load_camera
 from scenes.specs.measured.monitor_frames import read_frame_table
 from scenes.specs.resolved import resolve
@@ -173,7 +173,7 @@ def test_yaml_is_a_file_that_can_be_read(block: Piece, instrument, backend) -> N
     assert models, "no sort of file"
     if models[0] is JobSpec:
         job = validate(JobSpec, parse_yaml(block.text))
-        check_nodes(job, instrument(job.instrument).nodes)
+        checked_nodes(job, instrument(job.instrument).nodes)
     if models[0] is DisturbancesSpec:
         motions_of_spec(validate(DisturbancesSpec, parse_yaml(block.text)), instrument("gf7_pair"))
     if models[0] is InstrumentSpec:
@@ -210,7 +210,7 @@ def test_a_table_is_a_course_that_can_be_read(block: Piece, instrument, tmp_path
     (tmp_path / "table.csv").write_text(block.text, "utf-8")
     (tmp_path / "job.yaml").write_text("instrument: gf7_pair\ncourse: {table: table.csv}\n", "utf-8")
     job = resolve(tmp_path / "job.yaml").job
-    check_nodes(job, instrument("gf7_pair").nodes)
+    checked_nodes(job, instrument("gf7_pair").nodes)
     assert job.course is not None
     assert len(job.course.times) == len(block.text.splitlines()) - 1
 

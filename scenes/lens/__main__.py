@@ -243,7 +243,7 @@ def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backe
     from scenes.models.instrument_builder import build_instrument
     from scenes.models.job_state import job_state
     from scenes.models.thermal_model import ThermalModel
-    from scenes.specs.job import check_nodes
+    from scenes.specs.job import checked_nodes
     from scenes.specs.load import load_camera
     from scenes.specs.resolved import resolve
     from scenes.yaml.errors import names_text, unknown
@@ -260,8 +260,8 @@ def _perturbed(camera: Path, job_file: Path, mounted: str | None, backend: Backe
     if mounted is not None and mounted not in places:
         raise InputError(unknown("no such camera", mounted, places).at(str(job_file)))
     instrument = build_instrument(resolved.instrument, resolved.cameras, backend)
-    check_nodes(resolved.job, instrument.nodes)
-    state = job_state(resolved.job, ThermalModel(instrument))
+    job = checked_nodes(resolved.job, instrument.nodes)
+    state = job_state(job, ThermalModel(instrument))
     try:
         return perturbed_prescription(instrument, mounted or places[0], state)
     except ValueError as error:

@@ -27,7 +27,7 @@ def job_state(
     """The perturbed state that a job describes.
 
     Args:
-        job: its perturbation, checked by ``scenes.specs.job.check_nodes``.
+        job: its perturbation, checked by ``scenes.specs.job.checked_nodes``.
         thermal: of its instrument.
         progress: called with the path of each body whose thermo-elastic solution begins.
         moved: the state without its linear temperatures, where it is known; None for all that the job says.

@@ -34,8 +34,6 @@ from scenes.yaml.spec import (
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, TEMPERATURE, TIME
 
 BASE = "base"
-ALONE = "camera"
-"""Name of a camera that is an instrument by itself."""
 SIDES = ("left", "right")
 PRISM_180, PRISM_0 = "prism_180", "prism_0"
 PRISMS = (PRISM_180, PRISM_0)
@@ -478,11 +476,11 @@ class InstrumentSpec(TitledSpec):
         """A camera by itself as an instrument: on the base, without a look angle and without a monitor.
 
         Args:
-            name: of the instrument.
+            name: of the camera, and of the instrument.
             camera: which camera, by name or path.
         """
         site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
-        return cls.model_construct(name=name, cameras=FrozenMap({ALONE: site}))
+        return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
 
     @property
     def autocollimator(self) -> MonitorSpec:

@@ -15,6 +15,7 @@ from scenes.specs import job_tables
 from scenes.specs.course import DEFAULT_PIVOT, NO_MOTION, CourseSpec, Rotation, ScaleChange, Shift, Term, read_course
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
+from scenes.specs.motion_text import meant, node_named, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
@@ -219,13 +220,20 @@ def _alone(value: Any) -> Any:
     return value["camera"] if isinstance(value, Mapping) and set(value) == {"camera"} else value
 
 
+def _in_words(value: Any) -> Any:
+    """`[M2 shift z 20 um]` is what it says of each node."""
+    words = isinstance(value, list | tuple) and all(isinstance(text, str) for text in value)
+    return perturbation_in_words(value) if words else value
+
+
 class JobSpec(Spec):
     """A job.
 
     Attributes:
         instrument: name of an instrument in scenes/library/instruments, or path of an own file, relative to the job's
             file. A camera, as `{camera: NAME or FILE}` or named like an instrument, is one without a monitor.
-        perturb: node path -> perturbation; empty for the nominal state.
+        perturb: node -> perturbation, by the node's path or the last parts of it; or a list of texts such as
+            `M2 shift z 20 um`. Empty for the nominal state.
         course: temperatures and motions that change with time, None for a single state.
         disturbances: what is expected to move, on which the sigmas rest: a file, or changes of single lines of it; the
             instrument's own by default, `none` for the noise alone.
@@ -234,7 +242,7 @@ class JobSpec(Spec):
     """
 
     instrument: Annotated[Reference, BeforeValidator(_alone)]
-    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+    perturb: Annotated[Paths[PerturbationSpec], BeforeValidator(_in_words)] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
@@ -324,16 +332,20 @@ class NodeInfo:
         return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
 
 
-def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
+def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     """Check that every perturbed node exists, has the named pivot and allows what is done to it.
 
     Args:
         job: as loaded.
         nodes: node path -> what may be done to it, for all bodies of the instrument.
 
+    Returns:
+        The job with the paths of nodes in place of their short names.
+
     Raises:
         InputError: one issue for each fault, with the nearest valid name.
     """
+    job = _full_names(job, nodes)
     issues = [
         issue
         for path, what in job.perturb.items()
@@ -343,6 +355,31 @@ def check_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> None:
         issues += _course_issues(job.course, nodes)
     if issues:
         raise InputError(*issues)
+    return job
+
+
+def _full_names(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
+    """The job with the paths of all nodes that it perturbs; names of no node stay as they are.
+
+    Raises:
+        InputError: a name of several nodes, or two names of one.
+    """
+    issues: list[Issue] = []
+    named: dict[str, str] = {}
+    for name in job.perturb:
+        try:
+            path = node_named(name, nodes) if meant(name, nodes) else name
+            if path in named.values():
+                raise Problem("this node is perturbed twice", shown(name), f"{path} once, under one name")
+            named[name] = path
+        except Problem as problem:
+            issues.append(job.issue(problem, ("perturb", name)))
+    if issues:
+        raise InputError(*issues)
+    if all(name == path for name, path in named.items()):
+        return job
+    perturb = FrozenMap({named[name]: what for name, what in job.perturb.items()})
+    return job.model_copy(update={"perturb": perturb})
 
 
 def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Issue]:

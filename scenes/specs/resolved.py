@@ -71,6 +71,10 @@ class ResolvedJob(Spec):
         targets = self.job.render.targets or TargetsSpec()
         return targets if targets.frames else targets.model_copy(update={"frames": self.frames})
 
+    def with_job(self, job: JobSpec) -> ResolvedJob:
+        """Return the same with another job on the same instrument."""
+        return self.model_copy(update={"job": job})
+
     def with_render(self, frames: int, seed: int) -> ResolvedJob:
         """Return the job with another number of frames and another seed, for values that a command overrides."""
         render = self.job.render.model_copy(update={"frames": frames, "seed": seed})

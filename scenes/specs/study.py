@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from scenes.specs.motion_text import key_below, motion_of
 from scenes.specs.procedures import studied
 from scenes.specs.samplers import GRID, SAMPLERS
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
@@ -100,6 +102,7 @@ class FactorSpec(Spec):
 
     Attributes:
         key: where in the base's resolved config.yaml, keys and list indices.
+        motion: in place of the key of a number below `perturb` of a job, `M2 shift z`.
         keys: several such places that all get the same value.
         scales: values that follow the factor; one without key and keys is itself the ratio, 1 for the base as it is.
         values: a list of values; a design that draws takes each as often as the others.
@@ -112,6 +115,7 @@ class FactorSpec(Spec):
     """
 
     key: Key | None = None
+    motion: Text | None = None
     keys: Annotated[tuple[Key, ...], Field(min_length=1)] | None = None
     scales: tuple[ScaleSpec, ...] = ()
     values: tuple[Scalar, ...] | None = None
@@ -121,6 +125,21 @@ class FactorSpec(Spec):
     normal: NormalSpec | None = None
     truncated: TruncatedSpec | None = None
     table: TableSpec | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _motion_is_a_key(cls, data: Any) -> Any:
+        """`motion: M2 shift z` stands for the key of that number in a job."""
+        if not isinstance(data, Mapping) or not isinstance(data.get("motion"), str):
+            return data
+        if "key" in data:
+            raise Problem("a factor has a key or a motion", "both", "motion: M2 shift z")
+        node, kind, axis, quantity, pivot = motion_of(data["motion"])
+        if quantity or pivot:
+            text = "a factor's motion has no amount and no pivot"
+            raise Problem(text, shown(quantity or pivot), "motion: M2 shift z", within=("motion",))
+        rest = {key: value for key, value in data.items() if key != "motion"}
+        return {**rest, "key": ["job", "perturb", node, *key_below(kind, axis)]}
 
     @model_validator(mode="after")
     def _is_one_thing(self) -> FactorSpec:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenes.models.nodal_bodies import deformed_face
-from scenes.specs.job import JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
 from scenes.specs.job_tables import DeformationSpec
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
@@ -185,7 +185,7 @@ def test_only_what_has_a_figure_is_deformed(tmp_path, nodes, gf7_pair) -> None:
     what = PerturbationSpec(deformation=DeformationSpec(table=str(place)))
     for path in ("base/forward", "base/forward/focal_plane"):
         with pytest.raises(InputError, match="does not allow deformation"):
-            check_nodes(JobSpec(instrument="gf7_pair", perturb={path: what.plain()}), gf7_pair.nodes)
+            checked_nodes(JobSpec(instrument="gf7_pair", perturb={path: what.plain()}), gf7_pair.nodes)
 
 
 def test_the_job_knows_the_table_that_it_was_read_with(tmp_path, nodes) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from scenes.specs.course import noll
-from scenes.specs.job import NodeInfo, check_nodes
+from scenes.specs.job import NodeInfo, checked_nodes
 from scenes.specs.load import EXAMPLES, load_job
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
@@ -35,7 +35,7 @@ def test_the_example() -> None:
     assert job.perturb["base/forward/M2"].shift == (0.0, 0.0, 3e-6)
     assert (job.render.images, job.render.frames, job.render.seed) == (("spots",), 9, 1)
     assert job.analysis.centroid == "ml"
-    check_nodes(job, NODES)
+    checked_nodes(job, NODES)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_nothing_perturbed(text: str, tmp_path: Path) -> None:
     job = load_job(write(tmp_path, text))
     assert job.perturb == {}
     assert job.render.frames is None
-    check_nodes(job, {})
+    checked_nodes(job, {})
 
 
 def test_everything_that_a_node_may_have(tmp_path: Path) -> None:
@@ -195,7 +195,7 @@ def test_nodes(text: str, words: list[str], tmp_path: Path) -> None:
     path = write(tmp_path, HEAD + "  # nothing\n  " + text)
     job = load_job(path)
     with pytest.raises(InputError) as caught:
-        check_nodes(job, NODES)
+        checked_nodes(job, NODES)
     assert str(caught.value).startswith(f"{path}:4: ")
     for word in words:
         assert word in str(caught.value)
@@ -204,7 +204,7 @@ def test_nodes(text: str, words: list[str], tmp_path: Path) -> None:
 def test_all_nodes_are_told_at_once(tmp_path: Path) -> None:
     job = load_job(write(tmp_path, HEAD + "  a: {}\n  base/forward/M1: {pivot: b}\n  c: {}\n"))
     with pytest.raises(InputError) as caught:
-        check_nodes(job, NODES)
+        checked_nodes(job, NODES)
     assert [issue.line for issue in caught.value.issues] == [3, 4, 5]
 
 

@@ -18,7 +18,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TERMS, TemperatureError, ThermalModel
 from scenes.specs.instrument import MaterialsSpec
-from scenes.specs.job import check_nodes
+from scenes.specs.job import checked_nodes
 from scenes.specs.load import LIBRARY, load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve, resolve_job
 from scenes.yaml.errors import InputError
@@ -437,7 +437,7 @@ def test_mistakes_in_temperatures(node: str, words, tmp_path) -> None:
 def test_a_face_of_a_prism_has_no_temperature_of_its_own(face: str, gf7_pair, tmp_path) -> None:
     job = load_job(written(tmp_path, HEAD + f"  {PRISM}/{face}: {{temperature: 1 K}}"))
     with pytest.raises(InputError, match="does not allow temperature") as caught:
-        check_nodes(job, gf7_pair.nodes)
+        checked_nodes(job, gf7_pair.nodes)
     assert caught.value.line == 3
 
 

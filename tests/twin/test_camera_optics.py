@@ -53,7 +53,7 @@ def test_a_defocused_focal_plane_is_the_term_of_defocus(gf7_alone) -> None:
     dz = 50e-6
     f_number = gf7_alone.spot().airy / 1.22 / 650e-9
     # the light comes along the focal plane's +Z
-    downstream = gf7_alone.perturbed({"camera/focal_plane": Motion(shift=(0.0, 0.0, dz))})
+    downstream = gf7_alone.in_state({"camera/focal_plane": Motion(shift=(0.0, 0.0, dz))})
     change = downstream.wavefront().coefficients - gf7_alone.wavefront().coefficients
     size = dz / (2 * f_number) ** 2 / (4 * np.sqrt(3)) / 650e-9
     # positive: an image before the detector has a wavefront that is bent too much, ahead at the edge
@@ -134,7 +134,7 @@ def test_fields_are_shares_of_the_half_field(gf7, gf7_alone) -> None:
 
 def test_views_can_be_drawn_and_put_into_tables(backend) -> None:
     camera = CameraView.alone(load_camera("gf7"), backend)
-    wave, spot, mtf = camera.wavefront(field=(0, 0)), camera.spot(), camera.perturbed({}).mtf((1, 0))
+    wave, spot, mtf = camera.wavefront(field=(0, 0)), camera.spot(), camera.in_state({}).mtf((1, 0))
     for shown in (wave, spot, mtf):
         (axes, *_) = shown.plot().axes
         assert axes.get_xlabel()

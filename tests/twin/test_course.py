@@ -18,7 +18,7 @@ import twin.render as command
 from analysis.units import ARCSEC
 from optics.thermal.heat import Temperature
 from scenes.specs.course import moment
-from scenes.specs.job import check_nodes
+from scenes.specs.job import checked_nodes
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
@@ -336,7 +336,7 @@ def test_a_bad_course_is_explained_and_leaves_nothing(case: str, tmp_path) -> No
 def test_the_cold_of_the_perturbation_is_told_there(prepared, tmp_path) -> None:
     text = COURSE + NODE + "{change: [0 K, 1 K]}\nperturb:\n  base/backward: {temperature: -294 K}"
     job = load_job(written(tmp_path, text))
-    check_nodes(job, prepared.instrument.nodes)
+    checked_nodes(job, prepared.instrument.nodes)
     with pytest.raises(InputError, match=r"base/backward would be at -0\.85 K.* at 0 min") as caught:
         series_states(prepared, job)
     assert caught.value.line == 7

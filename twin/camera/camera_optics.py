@@ -245,7 +245,7 @@ class CameraOptics:
         )
         return cls(path, FrozenMap(state or {}))
 
-    def perturbed(self, state: State) -> Self:
+    def in_state(self, state: State) -> Self:
         """Return the camera in another state."""
         return replace(self, state=FrozenMap(state))
 

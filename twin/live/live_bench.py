@@ -20,7 +20,7 @@ from optics.geometry.tree import PlacedBodies, State
 from scenes.models.clearance import Clearances
 from scenes.models.disturbances import Component, state_of
 from scenes.specs.course import DEFAULT_PIVOT, CourseSpec, moment
-from scenes.specs.job import check_nodes
+from scenes.specs.job import checked_nodes
 from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.assumptions import contradiction, doubted
@@ -49,8 +49,9 @@ class LiveBench:
     """
 
     def __init__(self, twin: InstrumentTwin) -> None:
-        self.twin = twin
-        check_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
+        job = checked_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
+        named = job if job is not twin.resolved.job else None
+        self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)
         self._reader = lru_cache(maxsize=4)(self._new_reader)
         # while a course is played the knobs stand
         self._standing = lru_cache(maxsize=2)(self._new_standing)

@@ -24,6 +24,7 @@ ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
 # fills: red, green, blue and opacity
 _GLASS, _BLOCK, _FRAME = (0.34, 0.71, 0.91, 0.25), (0.0, 0.62, 0.45, 0.22), (0.42, 0.45, 0.50, 0.35)
+_FACE = "#4b91c7"
 _UP, _DOWN = 1 + RIM // 4, 1 + 3 * RIM // 4  # edge rays at +y and -y of the stop: the ones in the plane of symmetry
 
 
@@ -50,14 +51,25 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
                 for name in dict.fromkeys(c.side for c in instrument.channels if c in _seen(instrument, c.camera))
             ),
             Line2D([], [], color=svg.INK, lw=3, label="mirrors, clear apertures"),
-            Line2D([], [], color=svg.GREEN, lw=3, label="focal plane; return faces"),
+            *([Line2D([], [], color=_FACE, lw=1.5, label="faces of lenses")] if _has_lenses(instrument) else []),
+            Line2D(
+                [],
+                [],
+                color=svg.GREEN,
+                lw=3,
+                label="focal plane; return faces" if instrument.channels else "focal plane",
+            ),
             *([Patch(fc=_GLASS, ec=svg.INK, lw=0.8, label="glass prisms")] if _GLASS in kinds else []),
             *(
                 [Patch(fc=_FRAME, ec=svg.INK, lw=0.8, label="mirrors and frames of the monitor")]
                 if _FRAME in kinds
                 else []
             ),
-            Patch(fc=_BLOCK, ec=svg.INK, lw=0.8, label="central prism, common reference"),
+            *(
+                [Patch(fc=_BLOCK, ec=svg.INK, lw=0.8, label="central prism, common reference")]
+                if _BLOCK in kinds
+                else []
+            ),
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=3)
         return svg.to_svg(figure)
@@ -91,7 +103,11 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     middle = np.mean(centres, axis=0)
     for mirror in model.mirrors:
         curve = placed.pose(f"{BASE}/{camera}/{mirror}").apply(_section(model, mirror))
-        axes.plot(curve[:, 0], curve[:, 2], color=svg.INK, lw=3, solid_capstyle="butt", zorder=4)
+        light = model.spec.mirrors[mirror].light
+        if light == "passes":  # nothing stands there but what its edges stop
+            continue
+        colour, width = (svg.INK, 3.0) if light is None else (_FACE, 1.5)
+        axes.plot(curve[:, 0], curve[:, 2], color=colour, lw=width, solid_capstyle="butt", zorder=4)
         centre = curve[len(curve) // 2]
         away = (centre - middle)[[0, 2]]
         away = 15.0 * away / np.linalg.norm(away)
@@ -113,6 +129,11 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     text = f"{camera}, look {look_deg:+.4g}°".replace("-", "\N{MINUS SIGN}")
     first = placed.pose(f"{BASE}/{camera}/{model.mirrors[0]}").apply(_section(model, model.mirrors[0]))
     _label(axes, text, np.array([origin.translation[0], first[:, 2].min()]), (-4, -22), "top", bold=True)
+
+
+def _has_lenses(instrument: Instrument) -> bool:
+    mirrors = (mirror for model in instrument.cameras.values() for mirror in model.spec.mirrors.values())
+    return any(mirror.light == "refracts" for mirror in mirrors)
 
 
 def _fill(solid: Solid) -> tuple[float, float, float, float]:
@@ -139,6 +160,8 @@ def _prisms(axes: Axes, instrument: Instrument, paths: LightPaths) -> None:
     for found in large.values():
         what = "prisms" if {what for _, what in found} == {"prism"} and len(found) > 1 else found[0][1]
         _label(axes, f"180° {what}", max((top for top, _ in found), key=lambda top: float(top[1])), (0, 5), "bottom")
+    if not small:
+        return
     corners = np.concatenate([outline for outline, _ in small])
     among = np.array([np.mean([outline[:, 0].mean() for outline, _ in small]), corners[:, 1].max()])
     names = {"prisms" if what == "prism" else what for _, what in small}
@@ -157,7 +180,8 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
     bar = pose.apply(np.array([[-0.06, 0.0, 0.0], [0.06, 0.0, 0.0]]))
     axes.plot(bar[:, 0], bar[:, 2], color=svg.GREEN, lw=4, solid_capstyle="butt", zorder=5)
     # beside the monitor beams, which go to the central prism
-    prism = paths.placed.pose(CENTRAL_PRISM).translation
+    beside = CENTRAL_PRISM in paths.placed.index
+    prism = paths.placed.pose(CENTRAL_PRISM if beside else BASE).translation
     aside = -17.0 if prism[0] > pose.translation[0] else 10.0
     _label(axes, "focal plane", pose.translation[[0, 2]], (aside, 10.0), "bottom")
 
@@ -208,25 +232,36 @@ def _label(
     )
 
 
+MOST_COLUMNS = 5
+"""Of the drawing of footprints; a camera with more surfaces gets more lines."""
+
+
 def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
-    """Where the beams meet each mirror, millimetres in the mirror's own x, y; a row per camera."""
+    """Where the beams meet each mirror, millimetres in the mirror's own x, y; one row per camera, or several."""
     with svg.look("footprints"):
-        cameras = list(instrument.cameras)
-        columns = max(len(model.mirrors) for model in instrument.cameras.values())
-        figure = svg.new_figure(0.7 + 3.0 * len(cameras))
-        grid = figure.subplots(len(cameras), columns, squeeze=False)
-        for line, camera in enumerate(cameras):
-            model = instrument.cameras[camera]
-            for k, mirror in enumerate(model.mirrors):
-                axes = grid[line, k]
+        shown = [
+            (camera, name)
+            for camera, model in instrument.cameras.items()
+            for name, mirror in model.spec.mirrors.items()
+            if mirror.light != "passes"
+        ]
+        counts = [sum(one == camera for one, _ in shown) for camera in instrument.cameras]
+        columns = min(max(counts), MOST_COLUMNS)
+        lines = [-(-count // columns) for count in counts]
+        figure = svg.new_figure(0.7 + 3.0 * sum(lines))
+        grid = figure.subplots(sum(lines), columns, squeeze=False)
+        for axes in grid.flat:
+            axes.set_axis_off()
+        for first, camera in zip(np.cumsum([0, *lines[:-1]]), instrument.cameras, strict=True):
+            for k, mirror in enumerate(name for one, name in shown if one == camera):
+                axes = grid[first + k // columns, k % columns]
+                axes.set_axis_on()
                 _footprints(axes, instrument, paths, camera, mirror)
-                stop = " (stop)" if mirror == model.spec.stop else ""
+                stop = " (stop)" if mirror == instrument.cameras[camera].spec.stop else ""
                 axes.set_title(f"{camera} {mirror}{stop}")
                 axes.set_xlabel("x, along the line [mm]")
-                if k == 0:
+                if k % columns == 0:
                     axes.set_ylabel("y, in the plane of symmetry [mm]")
-            for k in range(len(model.mirrors), columns):
-                grid[line, k].set_axis_off()
         handles = [Line2D([], [], color=svg.INK, lw=1.3, label="clear aperture")]
         handles += [Line2D([], [], color=c, lw=1.3, label=f"imaging, {f}") for f, c in FIELD_COLOURS.items()]
         ends = {c.side: c.ccd[1] > 0.0 for c in instrument.channels}

@@ -15,7 +15,7 @@ from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.obstruction import find_obstructions
 from scenes.models.scenery import measured_finishes
 from scenes.specs.instrument import PRISM_180, prism_of
-from scenes.specs.job import check_nodes
+from scenes.specs.job import checked_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.main_job.job_tables import deformation_warnings
@@ -104,7 +104,7 @@ def render_job(
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
     times = 0 if resolved.job.course is None else len(resolved.job.course.times)
     require_memory(resolved, experiment.size(count, times, target_pixels(resolved)), experiment.detector)
-    check_nodes(resolved.job, experiment.instrument.nodes)
+    resolved = resolved.with_job(checked_nodes(resolved.job, experiment.instrument.nodes))
     experiment.stated  # noqa: B018 - what is wrong with it is said before the long parts
     stage.begin(1)
     course = resolved.job.course
@@ -208,7 +208,8 @@ def _without_monitor(
     stage = _Stages(advance)
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment
-    check_nodes(job, experiment.instrument.nodes)
+    job = checked_nodes(job, experiment.instrument.nodes)
+    resolved = resolved.with_job(job)
     stage.begin(1)
     state = experiment.state(job)
     stage.begin(2)

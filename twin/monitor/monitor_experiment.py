@@ -138,7 +138,7 @@ class MonitorExperiment:
         """The perturbed state that a job describes.
 
         Args:
-            job: its perturbation, checked by ``scenes.specs.job.check_nodes``.
+            job: its perturbation, checked by ``scenes.specs.job.checked_nodes``.
             progress: called with the path of each body whose thermo-elastic solution begins.
 
         Raises:

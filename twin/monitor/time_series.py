@@ -167,7 +167,7 @@ def series_states(experiment: MonitorExperiment, job: JobSpec) -> list[State]:
 
     Args:
         experiment: the instrument.
-        job: with a course, checked by ``scenes.specs.job.check_nodes``.
+        job: with a course, checked by ``scenes.specs.job.checked_nodes``.
 
     Raises:
         InputError: a temperature at or below 0 K at some time, or one at which a glass's index is not known.

@@ -20,9 +20,10 @@ from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import noll
-from scenes.specs.job import JobSpec, NodeInfo, check_nodes, with_tables
-from scenes.specs.load import INSTRUMENTS, find_disturbances, library_names
+from scenes.specs.job import JobSpec, NodeInfo, checked_nodes, with_tables
+from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
 from scenes.specs.load import load_camera as read_camera
+from scenes.specs.motion_text import AXES, meant, motion_of, node_named, perturbation_in_words
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate
@@ -40,7 +41,7 @@ from twin.scripting.results import shot_of as _shot_of
 from twin.sensors.area_detector import coarse_warnings
 
 if TYPE_CHECKING:
-    from twin.camera.camera_view import CameraView
+    from twin.scripting.camera_twin import CameraTwin
 
 
 class _Bench:
@@ -138,20 +139,34 @@ class InstrumentTwin:
         """
         return self._bench.experiment.state(self.resolved.job)
 
-    def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> InstrumentTwin:
+    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> InstrumentTwin:
         """The same instrument with these bodies perturbed.
 
         Args:
-            perturb: node -> keys and unit strings of `perturb:` in a job's YAML, such as ``{"shift": "0 0 3 um"}``.
-                A node that is perturbed already gets this in place of what it had; others keep theirs.
+            perturb: motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in
+                a job's YAML, such as ``{"base/forward/M2": {"shift": "0 0 3 um"}}``. The last parts of a node's path
+                are enough where only one node ends so. A node that is perturbed already gets this in place of what it
+                had; others keep theirs.
 
         Raises:
             InputError: no such node, or nothing that can be done to it.
         """
-        plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **perturb}}
+        plain = {**self._plain, "perturb": {**self._plain.get("perturb", {}), **self._given(perturb)}}
         twin = self._with_job(plain)
-        check_nodes(twin.resolved.job, self._nodes)
-        return twin
+        job = checked_nodes(twin.resolved.job, self._nodes)
+        return InstrumentTwin(twin.resolved.with_job(job), twin._bench)
+
+    def _given(self, perturb: Sequence[Mapping[str, Mapping[str, Any]] | str]) -> dict[str, Any]:
+        """What is asked for, by the nodes' paths; a name of no node stays, to be told with the others."""
+        try:
+            said: dict[str, Any] = perturbation_in_words(one for one in perturb if isinstance(one, str))
+            for one in perturb:
+                if not isinstance(one, str):
+                    said |= dict(one)
+            nodes = self._nodes
+            return {node_named(name, nodes) if meant(name, nodes) else name: what for name, what in said.items()}
+        except Problem as problem:
+            raise InputError(problem.at("", key=("perturb",))) from None
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
         """The same instrument with other motions stated, on which `posterior` and all total sigmas rest.
@@ -277,26 +292,26 @@ class InstrumentTwin:
             attrs={"reference_frames": frames_text("crosstalk")},
         )
 
-    def camera(self, name: str, obstruction: bool = True) -> CameraView:
+    def camera(self, name: str = "", obstruction: bool = True) -> CameraTwin:
         """One of its cameras as optical designers look at it, in this state.
 
         Args:
-            name: of the camera.
+            name: of the camera; may be left out where there is one.
             obstruction: whether what prisms and other bodies take of its beam is missing.
 
         Raises:
             InputError: no camera of that name.
         """
         # it draws
-        from twin.camera.camera_view import CameraView
+        from twin.scripting.camera_twin import CameraTwin
 
+        name = name or (self.cameras[0] if len(self.cameras) == 1 else "")
         if name not in self.cameras:
             known = names_text(self.cameras)
             raise InputError(
                 Issue("no such camera", found=repr(name), allowed=known, suggestion=nearest(name, self.cameras))
             )
-        experiment = self._bench.experiment
-        return CameraView.within(experiment.instrument, name, self._bench.backend, self.state, obstruction)
+        return CameraTwin.of(self, name, obstruction)
 
     def to_yaml(self) -> str:
         """A job file that stands for this instrument and needs no other file; `load` and the commands read it."""
@@ -314,7 +329,7 @@ class InstrumentTwin:
         job = with_tables(job)
         if job.render.target_images and self.resolved.line_detectors is None:
             return InstrumentTwin(resolve_job(job), self._bench)
-        return InstrumentTwin(self.resolved.model_copy(update={"job": job}), self._bench)
+        return InstrumentTwin(self.resolved.with_job(job), self._bench)
 
     def __repr__(self) -> str:
         moved = ", ".join(self.resolved.job.perturb) or "nothing"
@@ -360,8 +375,8 @@ def _load(what: str | Path, backend: str) -> InstrumentTwin:
     return InstrumentTwin.of(resolved, backend)
 
 
-def load_camera(what: str | Path, backend: str = "llvm") -> CameraView:
-    """A camera by itself, as optical designers look at it.
+def load_camera(what: str | Path, backend: str = "llvm") -> CameraTwin:
+    """A camera by itself, as optical designers look at it; its ``perturbed`` moves and warms its parts.
 
     Args:
         what: name of a camera in the library (``gf7``), or path of a camera's file.
@@ -371,12 +386,12 @@ def load_camera(what: str | Path, backend: str = "llvm") -> CameraView:
         InputError: no such name, a file that cannot be read or is not valid, or a prescription that brings no light
             through the stop to the image.
     """
-    from twin.camera.camera_view import CameraView
+    camera = read_camera(what)  # what is no camera is told as that
+    return _load(Path(what) if is_path(what) else str(what), backend).camera(camera.name)
 
-    return CameraView.alone(read_camera(what), load_backend(backend))
 
-
-_AXES = {"x": 0, "y": 1, "z": 2}
+RIGID = ("shift", "rotate", "scale", "figure")
+"""Kinds of motions by which there are derivatives."""
 _FORMS = "NODE shift x|y|z, NODE rotate x|y|z, NODE scale, NODE figure Z5; 'about PIVOT' may follow a turn or a scale"
 
 
@@ -393,37 +408,22 @@ def _motion_named(text: str, nodes: Mapping[str, NodeInfo]) -> ElementaryMotion:
     Raises:
         InputError: not of this form, no such node or pivot, or a motion that the node does not have.
     """
-    words = text.split()
-    pivot = ORIGIN
-    if len(words) > 2 and words[-2] == "about":
-        pivot, words = words[-1], words[:-2]
-    if len(words) < 2:
+    try:
+        name, kind, axis, amount, pivot = motion_of(text)
+        node = node_named(name, nodes)
+    except Problem as problem:
+        raise InputError(problem.at("", key=("motions",))) from None
+    if amount:
         raise _wrong("not a motion of a node", text, _FORMS)
-    node, kind, *rest = words
-    if node not in nodes:
-        raise _wrong("no such node", node, names_text(sorted(nodes)), nearest(node, nodes))
-    info = nodes[node]
-    rigid = tuple(name for name in ("shift", "rotate", "scale", "figure") if name in info.allows)
+    info, pivot = nodes[node], pivot or ORIGIN
+    rigid = tuple(kind for kind in RIGID if kind in info.allows)
     if kind not in rigid:
         raise _wrong(f"{node} cannot be differentiated by this", kind, names_text(rigid), nearest(kind, rigid))
     known = tuple(dict.fromkeys((ORIGIN, *info.pivots)))
     if pivot not in known:
         raise _wrong(f"{node} has no such pivot", pivot, names_text(known), nearest(pivot, known))
-    return ElementaryMotion(node, kind, _axis(text, kind, rest), pivot, text)
-
-
-def _axis(text: str, kind: str, rest: list[str]) -> int:
-    if kind == "scale" and not rest:
-        return 0
-    if len(rest) == 1:
-        if kind == "figure":
-            try:
-                return noll(rest[0])
-            except Problem as problem:
-                raise InputError(Issue(problem.problem, found=problem.found, allowed=problem.allowed)) from None
-        if kind in ("shift", "rotate") and rest[0].lower() in _AXES:
-            return _AXES[rest[0].lower()]
-    raise _wrong("not a motion of a node", text, _FORMS)
+    number = noll(axis) if kind == "figure" else AXES.get(axis, 0)
+    return ElementaryMotion(node, kind, number, pivot, text)
 
 
 def _wrong(problem: str, found: str, allowed: str, suggestion: str | None = None) -> InputError:

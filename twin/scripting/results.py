@@ -21,7 +21,7 @@ from optics.numerics.backend import Backend
 from twin.main_job.assumptions import contradicted
 from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import judge
 from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
@@ -34,8 +34,9 @@ class Shot:
     """An exposure of the nominal and of the perturbed instrument.
 
     Attributes:
-        before, after: frames, uint16 grey values, (channel, frame, row, column).
-        expected: expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc.
+        before, after: frames, uint16 grey values, (channel, frame, row, column); without a monitor there is no channel.
+        expected: expected photons per pixel and frame, (state, channel, row, column), as in irradiance.nc; empty
+            without a monitor.
         truth: true changes of every camera, by exact tracing: parameters of each ``camera``; of two cameras
             ``angle_change_arcsec``, and ``ground_along_m``, ``ground_across_m``, ``ground_height_m``, errors of points
             on the ground that are located as if nothing had changed.
@@ -50,7 +51,7 @@ class Shot:
     truth: xr.Dataset
     verdict: str
     warnings: tuple[str, ...]
-    run: RenderRun = field(repr=False)
+    run: JobRun = field(repr=False)
     _backend: Backend = field(repr=False)
     _started: float = field(repr=False)
     _seconds: float = field(repr=False)
@@ -88,6 +89,31 @@ class Shot:
         table = pd.DataFrame.from_dict(rows, orient="index")
         if rows:
             table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "place", "direction"])
+        return table
+
+    @property
+    def quality(self) -> pd.DataFrame:
+        """Image quality before and after: wavefront errors (waves rms), best focus less line CCD (um), MTF at Nyquist
+        and light lost; a row for every camera, state and field. Empty unless ``quality=True`` was asked for, or the
+        instrument has no monitor.
+        """
+        found = self.run.quality
+        rows = {
+            (name, when, field): {
+                "wfe_rms_waves": camera.wfe[s, k],
+                "wfe_rms_waves_focus_removed": camera.wfe_refocused[s, k],
+                "defocus_um": 1e6 * camera.defocus[s, k],
+                "mtf_along_line": camera.mtf_along_line[s, k],
+                "mtf_along_track": camera.mtf_along_track[s, k],
+                "light_lost": camera.light_lost[s, k],
+            }
+            for name, camera in ({} if found is None else found.cameras).items()
+            for s, when in enumerate(("before", "after"))
+            for k, field in enumerate(() if found is None else found.fields)
+        }
+        table = pd.DataFrame.from_dict(rows, orient="index")
+        if rows:
+            table.index = pd.MultiIndex.from_tuples(rows, names=["camera", "state", "field"])
         return table
 
     def _repr_html_(self) -> str:
@@ -216,17 +242,15 @@ def _truth_frame(truth: xr.Dataset) -> pd.DataFrame:
     return truth[[one.key for one in parameters.CAMERA_PARAMETERS]].to_dataframe()
 
 
-def shot_of(run: RenderRun, backend: Backend, started: float) -> Shot:
+def shot_of(run: JobRun, backend: Backend, started: float) -> Shot:
     """What a script sees of a run that was traced there and begun then, seconds since the epoch."""
-    path = run.experiment.path
-    keys = [channel.key for channel in path.channels]
-    about = {
-        "units": "DN",
-        "instrument": run.resolved.instrument.name,
-        "exposure_s": run.experiment.exposure,
-        "pitch_m": path.pitch,
-        "seed": run.seed,
-    }
+    keys = [channel.key for channel in run.experiment.instrument.channels]
+    about: dict[str, Any] = {"units": "DN", "instrument": run.resolved.instrument.name}
+    before = after = np.zeros((0, run.frames, 0, 0), np.uint16)
+    expected = xr.Dataset()
+    if isinstance(run, RenderRun):
+        before, after, expected = run.before, run.after, irradiance(run)
+        about |= {"exposure_s": run.experiment.exposure, "pitch_m": run.experiment.path.pitch, "seed": run.seed}
 
     def frames(name: str, values: np.ndarray) -> xr.DataArray:
         dims = ("channel", "frame", "row", "column")
@@ -234,9 +258,9 @@ def shot_of(run: RenderRun, backend: Backend, started: float) -> Shot:
 
     told = judge(run)
     return Shot(
-        before=frames("before", run.before),
-        after=frames("after", run.after),
-        expected=irradiance(run),
+        before=frames("before", before),
+        after=frames("after", after),
+        expected=expected,
         truth=_truth(run),
         verdict=told.verdict,
         warnings=tuple(told.warnings),
@@ -247,7 +271,7 @@ def shot_of(run: RenderRun, backend: Backend, started: float) -> Shot:
     )
 
 
-def _truth(run: RenderRun) -> xr.Dataset:
+def _truth(run: JobRun) -> xr.Dataset:
     true = run.truth_dict()
     cameras = true["cameras"]
     keys = list(next(iter(cameras.values())))

@@ -14,9 +14,10 @@ from typing import Any, Protocol
 import xarray as xr
 
 from analysis.monitor import parameters
+from scenes.specs.motion_text import motion_of, node_named, put
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import NOISE, TOTAL, StudySpec
-from scenes.yaml.errors import InputError, Issue, KeyPath, shown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.run.owned_files import scratch
@@ -62,7 +63,7 @@ class Spread:
 
 def study(
     instrument: Perturbed,
-    vary: Mapping[str, Mapping[str, Any]],
+    vary: Mapping[str, Mapping[str, Any] | str],
     n: int = 100,
     *,
     seed: int = 0,
@@ -76,8 +77,9 @@ def study(
 
     Args:
         instrument: as it is at the beginning; its other perturbations stay.
-        vary: node -> keys of a perturbation with ranges in place of numbers, ``{"shift": "0 0 (-5 .. 5) um"}``: an even
-            spread from -5 to 5; ``(0 +- 2)`` is a normal one with sigma 2.
+        vary: motion in words -> a range in place of its number, ``{"M2 shift z": "(-5 .. 5) um"}``: an even spread from
+            -5 to 5; ``(0 +- 2)`` is a normal one with sigma 2. Or node -> keys of a perturbation with ranges,
+            ``{"M2": {"shift": "0 0 (-5 .. 5) um"}}``.
         n: number of runs.
         seed: of the design; the noise of each run has a stream of its own.
         design: ``latin_hypercube``, ``sobol`` or ``monte_carlo``.
@@ -112,7 +114,7 @@ def study(
 
 def config_text(
     instrument: Perturbed,
-    vary: Mapping[str, Mapping[str, Any]],
+    vary: Mapping[str, Mapping[str, Any] | str],
     n: int,
     seed: int,
     design: str,
@@ -121,13 +123,13 @@ def config_text(
     """The config.yaml of the study; arguments and errors as `study`."""
     spreads: list[Spread] = []
     middle: dict[str, Any] = {}
-    for node, what in vary.items():
-        if not isinstance(what, Mapping):
-            raise _wrong("not a perturbation", (node,), shown(what))
+    for node, what in _by_node(vary).items():
         middle[node] = {key: _taken(value, (node, key), spreads) for key, value in what.items()}
     if not spreads:
         raise InputError(Issue("nothing varies", key=("vary",), allowed=_FORMS))
     resolved = instrument.perturbed(middle).resolved
+    paths = {node: node_named(node, resolved.job.perturb) for node in middle}
+    spreads = [Spread((paths[str(s.key[0])], *s.key[1:]), s.factor) for s in spreads]
     named = {"factors": {s.name: {"key": ["job", "perturb", *s.key], **s.factor} for s in spreads}}
     about = {
         "name": resolved.instrument.name,
@@ -140,9 +142,51 @@ def config_text(
     return dump_yaml({"study": spec.plain(), "base": resolved.plain()})
 
 
+def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str, Any]]:
+    """Node -> keys of its perturbation, of motions in words, too."""
+    out: dict[str, dict[str, Any]] = {}
+    for name, what in vary.items():
+        if isinstance(what, Mapping):
+            out.setdefault(name, {}).update(what)
+            continue
+        if not isinstance(what, str):
+            raise _wrong("not a perturbation", (name,), shown(what))
+        try:
+            node, kind, axis, quantity, pivot = motion_of(name)
+        except Problem as problem:
+            raise InputError(problem.at("", key=("vary", name))) from None
+        if quantity or (match := _RANGE.search(what)) is None:
+            raise _wrong("not a range", (name,), shown(quantity or what))
+        nothing = f"0 {what[match.end() :].strip()}"
+        put(out.setdefault(node, {}), kind, axis, what, nothing)
+        if pivot:
+            out[node]["pivot"] = pivot
+    return out
+
+
+QUALITY = {
+    "wfe": ("wfe_rms_waves",),
+    "wfe_worst": ("wfe_worst_waves",),
+    "defocus": ("defocus_um", "centre"),
+    "mtf_line": ("mtf_along_line", "centre"),
+    "mtf_track": ("mtf_along_track", "centre"),
+}
+"""Responses about the images of a camera without a monitor, and where quality.json has them."""
+
+
 def _responses(resolved: ResolvedJob) -> Tree:
-    """Readings of every camera with their sigmas, and true values, by the estimator that a run is judged by."""
+    """Readings of every camera with their sigmas, and true values, by the estimator that a run is judged by; without a
+    monitor true values and image quality.
+    """
     out: Tree = {}
+    if resolved.instrument.monitor is None:
+        for camera in resolved.instrument.cameras:
+            for one in parameters.ESTIMATED:
+                out[f"{camera}_{one.key.rpartition('_')[0]}"] = {"key": ["truth", "cameras", camera, one.key]}
+            out |= {f"{camera}_{name}": {"key": ["quality", "cameras", camera, *key]} for name, key in QUALITY.items()}
+        if len(resolved.instrument.cameras) == 2:
+            out["angle_change"] = {"key": ["truth", "intersection_angle", "change_arcsec"]}
+        return out
     own = "model" if resolved.disturbances is None else "posterior"
     for camera in resolved.instrument.cameras:
         for key in (one.key for one in parameters.CAMERA_PARAMETERS):

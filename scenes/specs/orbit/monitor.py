@@ -19,7 +19,7 @@ from scenes.specs.job import (
     PerturbationSpec,
     PlainPerturbationSpec,
     RenderSpec,
-    check_nodes,
+    checked_nodes,
     perturbation_issues,
 )
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
@@ -263,7 +263,7 @@ class OrbitMonitorSpec(TitledSpec):
 
     def check_nodes(self, nodes: Mapping[str, NodeInfo]) -> None:
         """InputError unless every node exists and allows what is done to it."""
-        check_nodes(self.job, nodes)
+        checked_nodes(self.job, nodes)
         issues = [
             issue
             for path, motion in self.motion.items()

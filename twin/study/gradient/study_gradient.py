@@ -19,7 +19,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError
 from optics.raytrace.trace import BeamMissedError
-from scenes.specs.job import check_nodes
+from scenes.specs.job import checked_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.specs.study import FactorSpec, ResponseSpec
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
@@ -314,7 +314,7 @@ class _Traced:
         """AD and differences of all factors."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
-            check_nodes(self.maker.base.job, chain.experiment.instrument.nodes)
+            checked_nodes(self.maker.base.job, chain.experiment.instrument.nodes)
             about = chain.experiment.state(self.maker.base.job)
             chain.spots([about])
         except (AimError, BeamMissedError) as error:

@@ -21,14 +21,14 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.instrument_model import Instrument
-from scenes.specs.job import JobSpec, PerturbationSpec, check_nodes
+from scenes.specs.job import JobSpec, PerturbationSpec, checked_nodes
 from scenes.specs.job_tables import TableTemperatureSpec
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Spec, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.main_job.render_results import RenderRun, quality_dict
+from twin.main_job.render_results import JobRun, RenderRun, quality_dict
 from twin.monitor.image_quality import quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe
@@ -129,6 +129,32 @@ def _run_together(
     return out
 
 
+def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) -> list[Outcome]:
+    """Truth of runs of one instrument without a monitor, as truth.json holds it; when one run's light is lost, all are
+    tried alone.
+    """
+    try:
+        truth = experiment.sight.truth([run.state for run in runs])
+    except PHYSICS as error:
+        if len(runs) == 1:
+            return [Failure(one_line(error))]
+        return [found for run in runs for found in _traced_together(experiment, [run])]
+    return [
+        {
+            "truth": JobRun(
+                resolved=run.resolved,
+                experiment=experiment,
+                state=run.state,
+                frames=run.frames,
+                seed=run.seed,
+                truth=truth.at(slice(k, k + 1)),
+                warnings=(),
+            ).truth_dict()
+        }
+        for k, run in enumerate(runs)
+    ]
+
+
 BLOCK = 25
 """A run's last digits depend on those that it is traced with, its block; and not on the number of workers, the size
 of the chunks or where a study was interrupted.
@@ -163,8 +189,9 @@ class RenderBase:
         """Whether the perturbed nodes are there and allow what is done to them. Raises InputError."""
         resolved = read_job(tree)
         experiment = self._experiment(resolved, backend)[1]
-        check_nodes(resolved.job, experiment.instrument.nodes)
-        experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
+        checked_nodes(resolved.job, experiment.instrument.nodes)
+        if experiment.monitored:
+            experiment.stated  # noqa: B018 - raises where the instrument does not have what is stated
 
     def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
         """Outcome of every run: ``truth`` and ``recovered``; if asked for, also ``quality``, and with a course, stray
@@ -185,7 +212,8 @@ class RenderBase:
                     out[k] = _alone(resolved, backend)
                     continue
                 name, experiment = shared or self._experiment(resolved, backend)
-                check_nodes(resolved.job, experiment.instrument.nodes)
+                job = checked_nodes(resolved.job, experiment.instrument.nodes)
+                resolved = resolved.with_job(job)
                 state = experiment.state(resolved.job)
             except PHYSICS as error:
                 out[k] = Failure(one_line(error))
@@ -199,19 +227,20 @@ class RenderBase:
             def before(frames: int, seed: int, name: str = name, one: MonitorExperiment = experiment) -> np.ndarray:
                 return self._frames_before(name, one, frames, seed)
 
-            for (k, _), outcome in zip(
-                members, _run_together(experiment, [w for _, w in members], before), strict=True
-            ):
+            own = [work for _, work in members]
+            done = _run_together(experiment, own, before) if experiment.monitored else _traced_together(experiment, own)
+            for (k, _), outcome in zip(members, done, strict=True):
                 out[k] = outcome
-            renders = [(k, work.state, work.resolved.job.render) for k, work in members]
-            asked = [(k, state, render.obstructed) for k, state, render in renders if render.quality]
+            asked = [
+                (k, work.state, work.resolved.job.render.obstructed) for k, work in members if work.resolved.quality
+            ]
             for obstructed in (True, False):
-                part = [(k, state) for k, state, own in asked if own == obstructed]
+                part = [(k, state) for k, state, traced in asked if traced == obstructed]
                 found = _qualities(experiment.instrument, backend, [state for _, state in part], obstructed)
                 for (k, _), quality in zip(part, found, strict=True):
-                    done = out[k]
-                    if not isinstance(done, Failure):
-                        out[k] = quality if isinstance(quality, Failure) else {**(done or {}), "quality": quality}
+                    so_far = out[k]
+                    if not isinstance(so_far, Failure):
+                        out[k] = quality if isinstance(quality, Failure) else {**(so_far or {}), "quality": quality}
         return [outcome if outcome is not None else Failure("not done") for outcome in out]
 
     def _maker(self, tree: Tree) -> JobMaker:

@@ -1,0 +1,150 @@
+"""Perturbations in words, ``M2 shift z 20 um``, and the short names of bodies.
+
+Jobs, studies, the command line and scripts share this grammar. The live page calls its knobs by the same names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from scenes.specs.course import noll
+from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
+from scenes.yaml.units import split_quantity
+
+__all__ = ["FORMS", "key_below", "meant", "motion_of", "node_named", "perturbation_in_words", "put"]
+
+AXES = {"x": 0, "y": 1, "z": 2}
+KINDS = {
+    "shift": "x|y|z LENGTH",
+    "rotate": "x|y|z ANGLE",
+    "scale": "SHARE",
+    "figure": "Z5 LENGTH",
+    "temperature": "DIFFERENCE",
+    "gradient": "x|y|z DIFFERENCE/LENGTH",
+}
+"""Kind of a perturbation -> what follows it."""
+NOTHING = {"shift": "0 um", "rotate": "0 arcsec", "gradient": "0 K/m"}
+"""Kind of a vector -> what its components are that nothing says."""
+FORMS = (
+    '"M2 shift z 20 um", "M2 rotate x 3 arcsec about centre", "M2 figure Z5 10 nm", "forward scale 20 ppm", '
+    '"base temperature 2 K", "base gradient z 50 mK/m"'
+)
+"""What perturbations in words look like, for messages and help."""
+_ABOUT = "about"
+
+
+def meant(name: str, nodes: Iterable[str]) -> list[str]:
+    """The bodies that a name may mean: the one with this path, else all whose paths end with it.
+
+    Args:
+        name: ``base/forward/M2``, ``forward/M2`` or ``M2``.
+        nodes: paths of all bodies.
+    """
+    paths = tuple(nodes)
+    return [name] if name in paths else [path for path in paths if path.endswith(f"/{name}")]
+
+
+def node_named(name: str, nodes: Iterable[str]) -> str:
+    """The body that a name means: its path, or the last parts of the path where only one body ends so.
+
+    Args:
+        name: ``base/forward/M2``, ``forward/M2``, or ``M2`` in an instrument with one.
+        nodes: paths of all bodies.
+
+    Raises:
+        Problem: no body is called so, or several are.
+    """
+    found = meant(name, nodes)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise Problem("several nodes are called so", shown(name), names_text(found))
+    raise unknown("no such node", name, sorted(nodes))
+
+
+def motion_of(text: str) -> tuple[str, str, str, str, str]:
+    """The parts of a motion in words: node, kind, axis or term, quantity, and pivot.
+
+    Args:
+        text: ``NODE KIND [AXIS] [QUANTITY] [about PIVOT]``; parts that are not there are empty.
+
+    Raises:
+        Problem: the text is not of this form.
+    """
+    words = text.split()
+    pivot = ""
+    if len(words) > 2 and words[-2] == _ABOUT:
+        pivot, words = words[-1], words[:-2]
+    if len(words) < 2:
+        raise Problem("not a motion of a node", shown(text), FORMS)
+    node, kind, *rest = words
+    if kind not in KINDS:
+        raise Problem("no such kind of perturbation", shown(kind), names_text(KINDS), nearest(kind, KINDS))
+    axis = ""
+    if kind in ("shift", "rotate", "gradient"):
+        axis = rest.pop(0).lower() if rest else ""
+        if axis not in AXES:
+            raise Problem(f"{kind} needs an axis", shown(axis or text), "x, y or z, as in " + FORMS)
+    elif kind == "figure":
+        axis = rest.pop(0) if rest else ""
+        noll(axis)
+    if pivot and kind not in ("rotate", "scale"):
+        raise Problem(f"a {kind} has no pivot", shown(f"{_ABOUT} {pivot}"), "about after rotate or scale alone")
+    return node, kind, axis, " ".join(rest), pivot
+
+
+def key_below(kind: str, axis: str) -> tuple[str | int, ...]:
+    """Where a component stands in a node's perturbation: ``("shift", 2)``, ``("temperature", "gradient", 0)``.
+
+    Args:
+        kind: of ``KINDS``.
+        axis: ``x``, ``y`` or ``z``, a figure's term, or empty.
+    """
+    heat = {"temperature": ("temperature", "change"), "gradient": ("temperature", "gradient")}
+    place: tuple[str | int, ...] = heat.get(kind, (kind,))
+    return (*place, AXES.get(axis, axis)) if axis else place
+
+
+def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) -> None:
+    """Put a component where a node's perturbation has it.
+
+    Args:
+        keys: of the perturbation, which are added to.
+        kind: as of ``key_below``.
+        axis: as of ``key_below``.
+        value: of the component.
+        nothing: of the other components of a vector, where they are not said.
+    """
+    *above, last = key_below(kind, axis)
+    inner: Any = keys
+    for k, key in enumerate(above):
+        vector = isinstance(last, int) and k == len(above) - 1
+        inner = inner.setdefault(key, [nothing] * len(AXES) if vector else {})
+    inner[last] = value
+
+
+def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """What texts come to: ``perturb`` of a job's file. Nodes are called as in the texts.
+
+    Args:
+        texts: such as ``M2 shift z 20 um``; several of one body add to its perturbation.
+
+    Raises:
+        Problem: a text is not of this form, or two say the same component.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    said: set[tuple[str, str, str]] = set()
+    for text in texts:
+        node, kind, axis, quantity, pivot = motion_of(text)
+        if split_quantity(quantity) is None:
+            raise Problem("no amount with a unit", shown(quantity or text), FORMS)
+        if (node, kind, axis) in said:
+            raise Problem("said twice", shown(text), f"one {kind} {axis}".rstrip() + f" of {node}")
+        said.add((node, kind, axis))
+        what = out.setdefault(node, {})
+        put(what, kind, axis, quantity, NOTHING.get(kind))
+        if pivot:
+            if what.setdefault("pivot", pivot) != pivot:
+                raise Problem(f"{node} has one pivot for all its turns", shown(pivot), what["pivot"])
+    return out
