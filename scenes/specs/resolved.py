@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Generic, Self, TypeVar, cast
 
@@ -15,7 +15,7 @@ from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, Measure
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
-from scenes.specs.job import JobSpec, TargetsSpec, with_tables
+from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, unknown
 from scenes.yaml.input_file import is_file
@@ -426,12 +426,42 @@ class CameraSetup(Spec):
         mounted: its name in the instrument.
         instrument: that holds it; None for a camera by itself.
         cameras: what the instrument's cameras are called -> prescription.
+        perturb: what happens to bodies of the instrument, as in a job; of a camera by itself to its parts.
     """
 
     camera: CameraSpec
     mounted: Name | None = None
     instrument: InstrumentSpec | None = None
     cameras: Paths[CameraSpec] = Field(default_factory=FrozenMap)
+    perturb: Paths[PerturbationSpec] = Field(default_factory=FrozenMap)
+
+    @property
+    def standing(self) -> tuple[InstrumentSpec, Mapping[str, CameraSpec], str]:
+        """The instrument, its cameras and the name of this one in it; a camera by itself is its own instrument."""
+        if self.instrument is not None and self.mounted is not None:
+            return self.instrument, self.cameras, self.mounted
+        name = self.camera.name
+        return InstrumentSpec.of_camera(name, name), {name: self.camera}, name
+
+    @property
+    def job(self) -> JobSpec:
+        """The job that perturbs its instrument so."""
+        job = JobSpec.model_construct(instrument=self.standing[0].name, perturb=self.perturb)
+        return job.with_source(self._source)
+
+    def perturbed(self, words: Sequence[str]) -> CameraSetup:
+        """The same with further perturbations.
+
+        Args:
+            words: such as ``M2 shift z 20 um``; they replace what was said of the same node.
+
+        Raises:
+            InputError: a text that says no perturbation.
+        """
+        if not words:
+            return self
+        job = validate(JobSpec, YamlFile("--perturb", {"instrument": self.standing[0].name, "perturb": [*words]}, {}))
+        return self.model_copy(update={"perturb": FrozenMap({**self.perturb, **job.perturb})})
 
     @property
     def title(self) -> str:
@@ -452,7 +482,8 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
     """Read a camera and all it refers to.
 
     Args:
-        file: name of a camera or instrument of the library, path of such a file, or a run's config.yaml.
+        file: name of a camera or instrument of the library, path of such a file, of a job, or a run's config.yaml; a
+            job's perturbations come with it.
         name: which camera, where there are several.
 
     Raises:
@@ -465,9 +496,28 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
         return _alone(load.load_camera(Path(text)), text, name)
-    if "cameras" in data and "monitor" in data:
+    if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
+        return _of_job(resolve(file), text, name)
+    if "cameras" in data and not {"job", "detector"} & set(data):
         return _mounted(load.load_instrument(Path(text)), text, name)
     return _of_run(yaml, name)
+
+
+def _of_job(resolved: ResolvedJob, file: str, name: str | None) -> CameraSetup:
+    """A camera of a job's instrument, perturbed as the job says."""
+    job = resolved.job
+    if job.course is not None:
+        allowed = "a job without a course; python -m twin.render follows the course"
+        raise job.error("a camera is looked at in one state, and this job has a course", ("course",), allowed=allowed)
+    chosen = _chosen(tuple(resolved.instrument.cameras), file, name)
+    camera = resolved.cameras[resolved.instrument.cameras[chosen].camera]
+    return CameraSetup.model_construct(
+        camera=camera,
+        mounted=chosen,
+        instrument=resolved.instrument,
+        cameras=resolved.cameras,
+        perturb=job.perturb,
+    ).with_source(job.source)
 
 
 def _of_library(text: str, name: str | None) -> CameraSetup:

@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from scenes.specs.instrument import BASE
 from scenes.specs.resolved import CameraSetup, resolve_camera
 from twin.run.cli import AsJson, BackendName, Force, InputErrorText, Options, Out, Quiet
 from twin.run.command import Result, finished, run_command
@@ -28,7 +29,7 @@ def main(
         Path,
         typer.Argument(
             readable=False,
-            help="Camera or instrument: a name of the library (gf7), a YAML file, or the config.yaml of a run.",
+            help="Camera, instrument or job: a name of the library (gf7), a YAML file, or the config.yaml of a run.",
         ),
     ],
     what: Annotated[str | None, typer.Argument(metavar="[tilt]", help="With --refocus: turn the image, too.")] = None,
@@ -36,6 +37,13 @@ def main(
     refocus: Annotated[
         bool, typer.Option("--refocus", help="Find the best image plane first; writes the camera's file with it.")
     ] = False,
+    perturb: Annotated[
+        list[str] | None,
+        typer.Option("--perturb", metavar="TEXT", help='Perturb it, "M2 shift z 20 um"; may be said several times.'),
+    ] = None,
+    temperature: Annotated[
+        str | None, typer.Option("--temperature", metavar="TEXT", help='Warm all of it, "+2 K".')
+    ] = None,
     out: Out = None,
     backend: BackendName = "llvm",
     force: Force = False,
@@ -52,9 +60,14 @@ def main(
 
         python -m twin.camera my_camera.yaml --refocus
 
+        python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec"
+
     With --refocus the image plane is moved to the least mean square wavefront error over the field, with
     `--refocus tilt` turned about the line as well. The camera's file with that plane, comments kept, is in artefacts/
     and can be used as it is.
+
+    With --perturb and --temperature, and of a job, the camera is looked at in that state, and the first paragraph says
+    what it did. Bodies are called by their path or its last parts, as in a job's file.
 
     The run folder gets report.html, optics.json (numbers), optics.nc (maps, spots, curves), config.yaml, and figures
     and tables in artefacts/.
@@ -65,7 +78,8 @@ def main(
     def resolve() -> CameraSetup:
         if what is not None and (what != TILT or not refocus):
             raise InputErrorText(f"{what!r} has no meaning here; there is --refocus {TILT}")
-        return resolve_camera(file, camera)
+        warmed = [] if temperature is None else [f"{BASE} temperature {temperature}"]
+        return resolve_camera(file, camera).perturbed([*(perturb or ()), *warmed])
 
     def work(setup: CameraSetup, session: Session) -> Result:
         from scenes.models.camera_sharpness import blur_warnings

@@ -58,6 +58,9 @@ SPOT_RINGS = 8
 WORST_LIGHT = 5e-3
 """Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
 
+MOST_RAYS = 500_000
+"""Traced at once, to bound memory."""
+
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
@@ -388,6 +391,42 @@ class CameraOptics:
     def spot(self, field: Field = (0.0, 0.0), defocus: float = 0.0) -> Spot:
         """Spot at one field, as ``spots``."""
         return self.spots([field], defocus)[0]
+
+    @one_blas_thread()
+    def errors(
+        self, fields: Sequence[Field] | np.ndarray, defocus: Sequence[float] | np.ndarray = (0.0,)
+    ) -> np.ndarray:
+        """Rms wavefront errors alone, piston and tilt taken out, waves, (F, Z).
+
+        Args:
+            fields: (F, 2).
+            defocus: Z shifts of the line CCD downstream, metres.
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+        """
+        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
+        stop = np.concatenate([[[0.0, 0.0]], np.stack([nodes.x, nodes.y], axis=-1)])
+        level = zernike.basis(3, nodes.x, nodes.y)
+        radius = float(self.model.first_order.exit_pupil_distance[0])
+        every, step = np.asarray(fields, dtype=np.float64), max(1, MOST_RAYS // len(stop))
+        out = []
+        for start in range(0, len(every), step):
+            rays = self.rays(every[start : start + step], stop)
+            along = rays.direction[..., 2]
+            lit = rays.valid[:, 1:] * nodes.share
+            share = lit / np.sum(lit, axis=-1, keepdims=True)
+            weighted = np.swapaxes(level * share[..., None], 1, 2)
+            rows = []
+            for dz in defocus:
+                way = dz * np.sign(along) / along
+                place = rays.position + way[..., None] * rays.direction
+                path = path_to_sphere(place, rays.direction, rays.path + way, place[:, :1], radius)
+                error = (path[:, 1:] - path[:, :1]) / self.model.spec.wavelength
+                tilt = np.linalg.solve(weighted @ level, weighted @ error[..., None])
+                rows.append(np.sqrt(np.sum(share * (error - np.squeeze(level @ tilt, -1)) ** 2, axis=-1)))
+            out.append(np.stack(rows, axis=-1))
+        return np.concatenate(out)
 
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Exit pupils as the images of fields (F, 2) see them, axes along the line and along the track.

@@ -12,7 +12,7 @@ from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
-from twin.camera.camera_run import CameraRun, refocus_text, verdict
+from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verdict
 from twin.camera.first_order_data import FIRST_ORDER
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
@@ -29,13 +29,13 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
         run: the camera.
         warnings: what is wrong with it, to be told before all else.
     """
-    moved = refocus_text(run)
+    moved, done = refocus_text(run), perturbed_text(run)
     sections = [_layout(run), *([_refocus(run)] if moved else []), _wavefronts(run), _spots(run), _mtf(run)]
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
         one_sentence(*verdict(run).split(". "), "see the wavefronts and the layout"),
-        (*((moved,) if moved else ()), _first_order_text(run)),
+        (*(text for text in (moved, done) if text), _first_order_text(run)),
         _facts(run),
         first_order_table(run),
         tuple(sections),

@@ -9,19 +9,27 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from analysis.monitor import parameters
 from optics.geometry import zernike
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
+from optics.raytrace.line_of_sight import LineChange
 from optics.waves.pupil_stack import RoughWavefrontError
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
+from scenes.models.job_state import job_state
+from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
+from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.resolved import CameraSetup
+from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.monitor.image_quality import CameraQuality, image_quality
+from twin.monitor.truth import trace_truth
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.reference_frames import frames_text
@@ -65,6 +73,45 @@ class Refocus:
     tilt: bool
 
 
+CHANGES = ("d_alpha", "d_beta", "d_gamma", "d_f")
+"""Of a camera's geometry, as ``LineChange`` calls them, in the order of `analysis.monitor.parameters.ESTIMATED`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbed:
+    """What a perturbation does to a camera.
+
+    Attributes:
+        job: that says it, with the paths of the bodies.
+        change: of the camera's geometry, of one state.
+        errors: rms wavefront error as designed at the fields of the run's map, waves, (A, B).
+        mtf: at Nyquist as designed at MTF_FIELDS, along the line and along the track, (F, 2); empty where there is
+            none.
+    """
+
+    job: JobSpec
+    change: LineChange
+    errors: np.ndarray
+    mtf: np.ndarray
+
+    @property
+    def words(self) -> str:
+        """What was done: ``base/gf7/M2 shift (0, 0, 20) um``."""
+        parts = []
+        for path, what in self.job.plain()["perturb"].items():
+            own = [f"{key} {_short(what[key])}" for key in self.job.perturb[path].uses()]
+            parts.append(f"{path} {', '.join(own)}")
+        return "; ".join(parts) or "nothing"
+
+
+def _short(value: Any) -> str:
+    """A quantity, or several, as a reader sees them."""
+    if isinstance(value, dict):
+        known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
+        return ", ".join(f"{key} {_short(part)}" for key, part in known.items())
+    return f"({', '.join(map(str, value))})" if isinstance(value, list) else str(value)
+
+
 @dataclass(frozen=True, eq=False)
 class CameraRun:
     """A judged camera.
@@ -84,6 +131,7 @@ class CameraRun:
         curves: along the line.
         focus: through focus at MTF_FIELDS.
         refocus: what refocusing did, None where nobody asked.
+        perturbed: what was done to it, None for a camera as designed.
         quality: of a camera in an instrument: what its bodies take of the beam.
     """
 
@@ -101,6 +149,7 @@ class CameraRun:
     curves: field_maps.FieldCurves
     focus: field_maps.ThroughFocus
     refocus: Refocus | None = None
+    perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
 
     @cached_property
@@ -146,20 +195,34 @@ def run_camera(
     """
     advance("focus", 0, 1)
     camera, moved = setup.camera, None
+    if refocus and setup.perturb:
+        text = "the best image plane is that of a camera as designed, and this one is perturbed"
+        raise InputError(Issue(text, found="--refocus", allowed="one of the two"))
     if refocus:
         moved = find_focus(camera, backend, tilt)
         camera = with_plane(camera, moved.after)
     advance("focus", 1, 1)
     optics = CameraOptics.alone(camera, backend)
-    quality = None
-    if setup.instrument is not None and setup.mounted is not None:
-        cameras = {name: camera if one == setup.camera else one for name, one in setup.cameras.items()}
-        instrument = build_instrument(setup.instrument, cameras, backend)
-        optics = CameraOptics.within(instrument, setup.mounted, backend)
-        quality = image_quality(instrument, backend, [{}], QUALITY_FIELDS).cameras[setup.mounted]
+    quality, done = None, None
+    state: State = {}
+    if setup.instrument is not None or setup.perturb:
+        instrument_spec, cameras, mounted = setup.standing
+        cameras = {name: camera if one == setup.camera else one for name, one in cameras.items()}
+        instrument = build_instrument(instrument_spec, cameras, backend)
+        optics = CameraOptics.within(instrument, mounted, backend)
+        if setup.perturb:
+            job = checked_nodes(setup.job, instrument.nodes)
+            state = job_state(job, ThermalModel(instrument))
+        if setup.instrument is not None:
+            quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
     field = field_maps.field_grid(ERROR_GRID)
-    errors = FieldBeams.field_errors(optics.model, backend, tuple(map(tuple, field.reshape(-1, 2))), 5, optics.cut)
-    errors = errors.reshape(field.shape[:2])
+    where = tuple(map(tuple, field.reshape(-1, 2)))
+    errors = FieldBeams.field_errors(optics.model, backend, where, 5, optics.cut).reshape(field.shape[:2])
+    if setup.perturb:
+        change = trace_truth(instrument, backend, [state]).cameras[mounted]
+        done = Perturbed(job, change, errors, _nyquist(optics) if errors.max() < MOST_WAVES else np.empty((0, 2)))
+        optics = optics.in_state(state)
+        errors = optics.errors(where).reshape(field.shape[:2])
     sharp, why = (
         float(errors.max()) < MOST_WAVES,
         f"of wavefront errors beyond {MOST_WAVES:g} waves: it is next to nothing",
@@ -192,8 +255,17 @@ def run_camera(
         curves=curves,
         focus=focus,
         refocus=moved,
+        perturbed=done,
         quality=quality,
     )
+
+
+def _nyquist(optics: CameraOptics) -> np.ndarray:
+    """MTF at Nyquist at MTF_FIELDS, (F, 2); empty where the pupil has none."""
+    try:
+        return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
+    except (UnphysicalError, RoughWavefrontError):
+        return np.empty((0, 2))
 
 
 def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
@@ -230,6 +302,24 @@ def verdict(run: CameraRun) -> str:
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
         text += f" The MTF of the optics at Nyquist goes down to {low:.2g}; diffraction would allow {limit:.2f}."
     return text
+
+
+def perturbed_text(run: CameraRun) -> str:
+    """What the perturbation did, empty for a camera as designed."""
+    done = run.perturbed
+    if done is None:
+        return ""
+    values = [float(getattr(done.change, key)[0]) for key in CHANGES]
+    told = zip(parameters.ESTIMATED, values, strict=True)
+    moved = ", ".join(f"{one.symbol} {one.per_si * value + 0.0:+.{one.decimals}f} {one.unit}" for one, value in told)
+    text = (
+        f"Perturbed: {done.words}. The geometry changes by {moved}; the worst wavefront error goes from "
+        f"{done.errors.max():.3g} to {run.worst[0]:.3g} waves rms"
+    )
+    if len(done.mtf) and run.mtfs:
+        after = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
+        text += f", the least MTF at Nyquist from {float(np.min(done.mtf)):.3f} to {after:.3f}"
+    return f"{text}. First-order data and layout are those of the camera as designed."
 
 
 def refocus_text(run: CameraRun) -> str:
@@ -294,6 +384,22 @@ _REFOCUS: Record[Refocus] = Record(
 )
 
 
+_PERTURBED: Record[Perturbed] = Record(
+    "What a perturbation does: changes of the camera's geometry by exact chief rays, and what it had as designed.",
+    Quantity("perturb", lambda p: p.job.plain()["perturb"], "as in a job's file"),
+    *(
+        Quantity(
+            one.key,
+            lambda p, k=k: getattr(p.change, CHANGES[k])[0],  # type: ignore[misc]
+            one.meaning,
+        )
+        for k, one in enumerate(parameters.ESTIMATED)
+    ),
+    Quantity("worst_as_designed_waves", lambda p: p.errors.max(), "of the worst field"),
+    Quantity("mtf_as_designed", lambda p: p.mtf, "at Nyquist, along the line and along the track, field by field"),
+)
+
+
 def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
     """Wavefront, spot and Zernike terms without piston and tilts of every field of ``GRID``."""
     return [
@@ -326,6 +432,7 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
+    Quantity("perturbed", lambda run: run.perturbed, record=_PERTURBED),
     Quantity(
         "bodies_in_the_beam",
         lambda run: None if run.quality is None else {body: own[0] for body, own in run.quality.bodies.items()},

@@ -104,7 +104,7 @@ def distortion(optics: CameraOptics) -> Distortion:
     spec = optics.model.spec
     half = 0.5 * spec.line.pixels * spec.line.pitch
     position = np.linspace(-half, half, LINE_POINTS)
-    sight = optics.path.directions(np.stack([position, np.zeros(LINE_POINTS)], axis=-1))
+    sight = optics.path.directions(np.stack([position, np.zeros(LINE_POINTS)], axis=-1), optics.state)
     axes = optics.assembly.nominal_pose(optics.path.root).rotation
     own = sight @ axes
     # from the line of sight, which is the middle one; the image of light that goes toward +Y lies at +Y'
@@ -208,6 +208,8 @@ def through_focus(optics: CameraOptics, backend: Backend, fields: tuple[Field, .
     """Move the detector through focus."""
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
+    if optics.state:
+        return _moved_through_focus(optics, fields, sharp, FOCUS_DEPTHS * 2.0 * spec.wavelength * f_number**2)
     beams = FieldBeams.trace(optics.model, backend, fields, 6, optics.cut)
     own, best = FocalPlane.of(spec), beams.best_plane()
     downstream = float(np.sign(np.mean(beams.direction[..., 2])))
@@ -217,10 +219,28 @@ def through_focus(optics: CameraOptics, backend: Backend, fields: tuple[Field, .
     reach = max(FOCUS_DEPTHS * depth, 1.3 * abs(away)) if beams.reaches(best) else FOCUS_DEPTHS * depth
     defocus = np.linspace(-reach, reach, FOCUS_STEPS)
     error = np.stack([beams.errors(FocalPlane(own.z + downstream * dz, own.tilt)) for dz in defocus], axis=-1)
-    mtf = np.full((len(fields), 2, FOCUS_STEPS), np.nan)
+    mtf = _mtf_through_focus(optics, fields, defocus, sharp)
+    return ThroughFocus(fields, defocus, error, mtf, away if beams.reaches(best) else np.nan)
+
+
+def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus: np.ndarray, sharp: bool) -> np.ndarray:
+    """MTF at Nyquist, (F, 2, Z); NaN for a camera that is not sharp."""
+    mtf = np.full((len(fields), 2, len(defocus)), np.nan)
     if sharp:
-        wavelength = np.array([spec.wavelength])
+        wavelength = np.array([optics.model.spec.wavelength])
         for k, pupil in enumerate(optics.pupils(fields)):
             values = polychromatic_transfer(pupil, optics.nyquist * np.eye(2), wavelength, np.ones(1), defocus)
             mtf[k] = np.abs(values).T
-    return ThroughFocus(fields, defocus, error, mtf, away if beams.reaches(best) else np.nan)
+    return mtf
+
+
+def _moved_through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool, reach: float) -> ThroughFocus:
+    """Through focus of a perturbed camera: its line CCD moves in its state."""
+    # the mean square error is a parabola of the defocus, so that three places tell its lowest
+    three = reach * np.array([-1.0, 0.0, 1.0])
+    a, b, _ = np.polyfit(three, np.mean(optics.errors(fields, three) ** 2, axis=0), 2)
+    best = float(-0.5 * b / a) if a > 0.0 else np.nan
+    defocus = np.linspace(-1.0, 1.0, FOCUS_STEPS) * (max(reach, 1.3 * abs(best)) if np.isfinite(best) else reach)
+    return ThroughFocus(
+        fields, defocus, optics.errors(fields, defocus), _mtf_through_focus(optics, fields, defocus, sharp), best
+    )

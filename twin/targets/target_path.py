@@ -133,18 +133,19 @@ class TargetPath:
         """
         return self.model.line_focal_length if self.collimator is None else self.collimator.focal_length
 
-    def directions(self, places: np.ndarray) -> np.ndarray:
-        """Directions of the light, world, (F, 3), that the unperturbed camera images at places (F, 2), (along, across),
-        metres, of its line CCD.
+    def directions(self, places: np.ndarray, state: State | None = None) -> np.ndarray:
+        """Directions of the light, world, (F, 3), that the camera images at places (F, 2), (along, across), metres, of
+        its line CCD; as designed unless a ``state`` is given.
         """
-        placed = self.assembly.place()
+        states = [state or {}]
+        placed = self.assembly.place(states)
         body = line_body(self.root)
         local = np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         guess = self.model.toward_optics(placed.rotation[:, placed.index[body]].real)
         _, sight = chief_rays(
             self.backend,
-            assemble(self.assembly, [f"{self.name}/image_to_stop"], placed=placed),
-            assemble(self.assembly, [f"{self.name}/image_to_object"], placed=placed),
+            assemble(self.assembly, [f"{self.name}/image_to_stop"], states, placed=placed),
+            assemble(self.assembly, [f"{self.name}/image_to_object"], states, placed=placed),
             points_to_world(placed, body, local).real,
             guess[:, None],
             self._axes[:, 1],
