@@ -205,7 +205,8 @@ def _detector(source: Path, manifest: Manifest) -> list[Card]:
     config = source / "config.yaml"
     if manifest.program != "twin.render" or "config.yaml" not in manifest.sha256:
         return []
-    return detector_cards(resolve(config))
+    job = resolve(config)
+    return [] if job.instrument.monitor is None else detector_cards(job)
 
 
 def export_report(done: Exported) -> Report:

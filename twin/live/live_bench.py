@@ -25,9 +25,10 @@ from twin.live.knobs import Knob, knobs_of, perturbation
 from twin.live.messages import LARGEST_SEED, MOST_FRAMES, AskedState, BlindState
 from twin.main_job.assumptions import contradiction, doubted
 from twin.main_job.monitor_reading import stated
-from twin.main_job.render_job import MIN_LIGHT
-from twin.main_job.render_results import RenderRun
+from twin.main_job.render_job import MIN_LIGHT, require_one_state
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.crosstalk import crosstalk
+from twin.monitor.image_quality import image_quality
 from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
@@ -41,6 +42,16 @@ LOST = (*PHYSICS, ArithmeticError, ValueError)
 """What says that a state cannot be."""
 
 
+IMAGES: Mapping[str, tuple[list[str], str]] = {
+    "wavefront error": (["wfe_rms_waves"], "waves"),
+    "worst wavefront error": (["wfe_worst_waves"], "waves"),
+    "best focus − line CCD": (["defocus_um", "centre"], "µm"),
+    "MTF at Nyquist along the line": (["mtf_along_line", "centre"], ""),
+    "MTF at Nyquist along the track": (["mtf_along_track", "centre"], ""),
+}
+"""What the page tells of the images of a camera without a monitor -> where quality.json has it, and its unit."""
+
+
 class LiveBench:
     """An instrument on which knobs are turned. It keeps what was worked out, and no state of the knobs.
 
@@ -49,6 +60,8 @@ class LiveBench:
     """
 
     def __init__(self, twin: InstrumentTwin) -> None:
+        if not twin.experiment.monitored:
+            require_one_state(twin.resolved)
         job = checked_nodes(twin.resolved.job, twin.experiment.instrument.nodes)
         named = job if job is not twin.resolved.job else None
         self.twin = twin if named is None else InstrumentTwin.of(twin.resolved.with_job(named), like=twin)
@@ -84,6 +97,11 @@ class LiveBench:
             time=None if job.course is None else job.course.shown,
         )
 
+    @property
+    def monitored(self) -> bool:
+        """Whether there are spots to be shown; without a monitor the page shows the trace and the cameras' images."""
+        return self.twin.experiment.monitored
+
     def warm(self, advance: Callable[[str], None] = lambda part: None) -> None:
         """Work out everything that does not depend on the knobs, and compile every kernel.
 
@@ -92,6 +110,11 @@ class LiveBench:
         """
         experiment = self.twin.experiment
         advance("trace the unperturbed instrument")
+        if not self.monitored:
+            self._designed  # noqa: B018
+            self.clearances  # noqa: B018
+            self.state(self.at_rest)
+            return
         experiment.nominal_focus  # noqa: B018
         advance("calibrate its spots")
         experiment.calibration  # noqa: B018
@@ -113,29 +136,52 @@ class LiveBench:
             }
             for path, info in experiment.instrument.nodes.items()
         }
+        common = {
+            "instrument": twin.name,
+            "cameras": list(twin.cameras),
+            "nodes": nodes,
+            "knobs": [knob.plain() for knob in self.knobs.values()],
+            "frames": twin.resolved.frames,
+            "seed": self.at_rest.seed,
+            "parameters": [_label(p) for p in self._parameters],
+            "angle": _label(parameters.ANGLE) if len(twin.cameras) == 2 else None,
+            "ground": [_label(p) for p in parameters.GROUND] if experiment.ground is not None else [],
+        }
+        if not self.monitored:
+            images = [{"path": path, "symbol": name, "unit": unit} for name, (path, unit) in IMAGES.items()]
+            none: dict[str, Any] = {"channels": [], "rows": 0, "columns": 0, "pixel_um": 0.0, "white": 1, "offset": 0.0}
+            asked_nothing: dict[str, Any] = {"estimators": [], "judged": "", "disturbances": "", "course": None}
+            return {**common, **none, **asked_nothing, "images": images, "designed": self._designed}
         run = self._run(self.at_rest, {})[0]
         stated_motion = experiment.disturbances
         return {
-            "instrument": twin.name,
-            "cameras": list(twin.cameras),
+            **common,
             "channels": [{"key": c.key, "camera": c.camera, "side": c.side} for c in experiment.path.channels],
             "rows": experiment.path.shape[0],
             "columns": experiment.path.shape[1],
             "pixel_um": 1e6 * experiment.path.pitch,
             "white": experiment.detector.max_dn,
             "offset": float(experiment.expected_frames(np.zeros((1, 1)))[0, 0]),
-            "nodes": nodes,
-            "knobs": [knob.plain() for knob in self.knobs.values()],
-            "frames": twin.resolved.frames,
-            "seed": self.at_rest.seed,
             "estimators": list(run.estimators),
             "judged": run.judged,
-            "parameters": [_label(p) for p in parameters.CAMERA_PARAMETERS],
-            "angle": _label(parameters.ANGLE) if len(twin.cameras) == 2 else None,
-            "ground": [_label(p) for p in parameters.GROUND] if experiment.ground is not None else [],
             "disturbances": "" if stated_motion is None else stated_motion.name,
             "course": None if job.course is None else _played(job.course),
         }
+
+    @property
+    def _parameters(self) -> Sequence[parameters.Parameter]:
+        return parameters.CAMERA_PARAMETERS if self.monitored else parameters.ESTIMATED
+
+    @cached_property
+    def _designed(self) -> dict[str, Any]:
+        """Image quality as designed."""
+        return self._quality({})
+
+    def _quality(self, state: State) -> dict[str, Any]:
+        """Contents of quality.json of a state."""
+        job, experiment = self.twin.resolved.job, self.twin.experiment
+        obstructed = job.render.obstructed
+        return image_quality(experiment.instrument, experiment.backend, [state], obstruction=obstructed).to_dicts()[0]
 
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
         """The instrument as the knobs stand.
@@ -167,6 +213,8 @@ class LiveBench:
         began = time.perf_counter()
         told: dict[str, Any] = {"type": "state", "n": asked.n, "t": asked.t}
         try:
+            if not self.monitored:
+                return {**told, **self._traced(asked), "ms": _ms(began)}, None
             run, after, placed = self._run(asked, self._hidden(asked))
         except LOST as error:
             return {**told, **self._lost(asked, error), "ms": _ms(began)}, None
@@ -174,8 +222,34 @@ class LiveBench:
         told["ms"] = _ms(began)
         return told, after
 
+    def _traced(self, asked: AskedState) -> dict[str, Any]:
+        """What is told of a state of an instrument without a monitor: truth, image quality, motions."""
+        experiment, state = self.twin.experiment, self.states(asked)
+        placed = experiment.instrument.assembly.place([state])
+        quality = self._quality(state)
+        cameras = quality["cameras"].items()
+        run = JobRun(
+            resolved=self.twin.resolved,
+            experiment=experiment,
+            state=state,
+            frames=asked.frames,
+            seed=self.seed_of(asked.seed),
+            truth=experiment.sight.truth([state], placed),
+            warnings=tuple(f"image quality of {name}: {own['reason']}" for name, own in cameras if "reason" in own),
+        )
+        overlaps = self.clearances.overlaps(placed)
+        return {
+            "truth": run.truth_dict(),
+            "quality": quality,
+            "motions": motions(experiment.instrument, state, placed),
+            "warnings": list(run.warnings),
+            "collisions": [f"{o.first} reaches {1e3 * o.depth:.3g} mm into {o.second}" for o in overlaps],
+        }
+
     def before(self, asked: AskedState) -> np.ndarray:
-        """Images before the perturbation, uint16 (C, H, W)."""
+        """Images before the perturbation, uint16 (C, H, W); none without a monitor."""
+        if not self.monitored:
+            return np.zeros((0, 0, 0), np.uint16)
         frames = self._reader(asked.frames, asked.seed).before if asked.noise else None
         return self._shown(frames, self.twin.experiment.nominal_photons)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from scenes.kinds.file_kinds import kind_of, read_for
 from scenes.specs.job import JobSpec
-from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.load import CAMERAS, INSTRUMENTS, library_names
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
 from scenes.specs.procedures import FileKind
@@ -30,7 +30,7 @@ from twin.study.runs.setup import StudySetup, resolve_study
 PROGRAM = "twin.live"
 CONFIG, REPORT = "config.yaml", "report.html"
 OPENED = (
-    "an instrument with a monitor, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
+    "an instrument, a camera, a job or a measurement of one, a study of jobs, or a run folder of twin.render, "
     "twin.recover, twin.uncertainty, twin.orbit monitor or such a study"
 )
 """What may be given."""
@@ -89,14 +89,14 @@ def read_source(what: str, run: int | None = None) -> Source:
     """Read what the live twin is opened with.
 
     Args:
-        what: name of an instrument in the library, or path of an instrument's file, of a job, a measurement or a study,
-            of a run folder or of its config.yaml.
+        what: name of an instrument or a camera in the library, or path of such a file, of a job, of a measurement, of a
+            study, of a run folder or of its config.yaml.
         run: number of one of a study's runs, from 0; None for its base.
 
     Raises:
         InputError: it cannot be read, is not valid, or is nothing that can be opened.
     """
-    if what in library_names(INSTRUMENTS):
+    if what in (*library_names(INSTRUMENTS), *library_names(CAMERAS)):
         _no_runs(what, run)
         return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": what}, {}))), about=what)
     path = Path(what)
@@ -152,7 +152,7 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
         return _of_measurement(file)
     if name == "orbit_monitor":
         return _of_orbit(file)
-    if name == "instrument":
+    if name in ("instrument", "camera"):
         path = str(file.resolve())
         return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))), about=file.stem)
     if manifest is not None and manifest.program != "twin.render":

@@ -188,13 +188,14 @@ def render_job(
     )
 
 
-def _without_monitor(
-    resolved: ResolvedJob, backend: Backend, advance: Advance, experiment: MonitorExperiment | None
-) -> JobRun:
-    """The job of an instrument without a monitor: its state, the truth about it, and the cameras' images.
+def require_one_state(resolved: ResolvedJob) -> None:
+    """Refuse what only a monitor gives in a job of an instrument without one.
+
+    Args:
+        resolved: the job.
 
     Raises:
-        InputError: as `render_job`; or the job asks for what only a monitor gives.
+        InputError: a course, stray light or disturbances.
     """
     job = resolved.job
     for asked, key, what in (
@@ -205,6 +206,18 @@ def _without_monitor(
         if asked:
             allowed = "without it: the job's one state, with image quality and targets; or an instrument with a monitor"
             raise job.error(f"{what}, and {resolved.instrument.name} has none", key, allowed=allowed)
+
+
+def _without_monitor(
+    resolved: ResolvedJob, backend: Backend, advance: Advance, experiment: MonitorExperiment | None
+) -> JobRun:
+    """The job of an instrument without a monitor: its state, the truth about it, and the cameras' images.
+
+    Raises:
+        InputError: as `render_job`; or the job asks for what only a monitor gives.
+    """
+    require_one_state(resolved)
+    job = resolved.job
     stage = _Stages(advance)
     stage.begin(0)
     experiment = MonitorExperiment(resolved, backend) if experiment is None else experiment

@@ -226,6 +226,7 @@ class Live {
     byId('name').textContent = hello.instrument;
     byId('opened').textContent = hello.opened;
     byId('opened').title = hello.about;
+    document.body.classList.toggle('no-monitor', !hello.channels.length);
     document.title = `${hello.opened || hello.instrument} · live twin`;
     if (first) {
       byId('frames').value = Math.min(64, hello.frames);

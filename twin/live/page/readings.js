@@ -33,8 +33,17 @@ export class Readings {
     if (hello.ground.length) {
       this.groups.push({ title: 'ground', rows: hello.ground.map((p) => ({ ...p, truth: (t) => t.ground[p.key], reading: (r, e) => r.ground[e] })) });
     }
+    this.monitored = hello.estimators.length > 0;
+    for (const camera of this.monitored ? [] : hello.cameras) {
+      const at = (quality, path) => path.reduce((part, key) => part?.[key], quality?.cameras[camera]);
+      this.groups.push({
+        title: `${camera}, images`,
+        rows: hello.images.map((one) => ({ ...one, key: one.path[0], meaning: '', designed: at(hello.designed, one.path), now: (told) => at(told.quality, one.path) })),
+      });
+    }
     const head = document.createElement('tr');
-    for (const name of ['', 'true', ...hello.estimators.map((name) => name.replaceAll('_', ' ')), 'σ', 'error', 'in σ']) {
+    const heads = this.monitored ? ['true', ...hello.estimators.map((name) => name.replaceAll('_', ' ')), 'σ', 'error', 'in σ'] : ['now', 'as designed'];
+    for (const name of ['', ...heads]) {
       const cell = Object.assign(document.createElement('th'), { textContent: name, scope: 'col' });
       if (name === hello.judged) cell.className = 'judged';
       head.append(cell);
@@ -49,12 +58,12 @@ export class Readings {
       for (const row of group.rows) {
         row.line = body.insertRow();
         const name = row.line.insertCell();
-        name.textContent = `${row.symbol} [${row.unit}]`;
+        name.textContent = row.unit ? `${row.symbol} [${row.unit}]` : row.symbol;
         name.title = row.meaning;
-        row.cells = Array.from({ length: hello.estimators.length + 4 }, () => row.line.insertCell());
-        row.cells[1 + hello.estimators.indexOf(hello.judged)].className = 'judged';
+        row.cells = Array.from({ length: heads.length }, () => row.line.insertCell());
+        if (this.monitored) row.cells[1 + hello.estimators.indexOf(hello.judged)].className = 'judged';
         row.texts = [];
-        row.name = `${group.title} ${row.symbol} [${row.unit}]`;
+        row.name = `${group.title} ${name.textContent}`;
       }
     }
     this.rows = this.groups.flatMap((group) => group.rows);
@@ -69,6 +78,7 @@ export class Readings {
     this.told = told;
     const judged = this.hello.judged;
     const values = this.rows.map((row) => {
+      if (!this.monitored) return [NaN, this.traced(row), 0];
       const reading = row.reading(told.readings, judged);
       return [told.truth ? row.truth(told.truth) : NaN, reading[row.key], reading[`${row.key}_sigma`]];
     });
@@ -76,9 +86,25 @@ export class Readings {
     if (this.points.length > MOST) this.points.splice(0, this.points.length - MOST);
   }
 
+  // what a row of an instrument without a monitor is now
+  traced(row) {
+    return (row.now ? row.now(this.told) : row.truth(this.told.truth)) ?? NaN;
+  }
+
+  drawTraced() {
+    for (const row of this.rows) {
+      const texts = [fixed(this.traced(row), 4), fixed(row.now ? row.designed : 0, 4)];
+      texts.forEach((text, k) => { if (row.texts[k] !== text) row.cells[k].textContent = text; });
+      row.texts = texts;
+    }
+    byId('consistency').textContent = 'Changes of the geometry by exact chief rays; images at the middle of the line, worst over the whole of it. The instrument has no monitor.';
+    this.strip();
+  }
+
   draw() {
     const told = this.told;
     if (!told) return;
+    if (!this.monitored) { this.drawTraced(); return; }
     const { estimators, judged } = this.hello;
     for (const row of this.rows) {
       const own = row.reading(told.readings, judged);
@@ -175,7 +201,7 @@ export class Readings {
     }
     pen.textAlign = 'left';
     pen.fillStyle = colour('--after');
-    pen.fillText(`${this.hello.judged} ± σ`, left + 6, 18);
-    if (!this.blind) { pen.fillStyle = colour('--before'); pen.fillText('truth', left + 90, 18); }
+    pen.fillText(this.monitored ? `${this.hello.judged} ± σ` : 'traced', left + 6, 18);
+    if (!this.blind && this.monitored) { pen.fillStyle = colour('--before'); pen.fillText('truth', left + 90, 18); }
   }
 }

@@ -41,7 +41,7 @@ export class Spots {
 
   draw() {
     const { after, before, guess } = this.images;
-    if (!before || !this.told) return;
+    if (!before || !this.told || !this.figures.length) return;
     const show = byId('show').value;
     const first = show === 'before' || !after ? before : show === 'guess' && guess ? guess : after;
     const second = show === 'difference' ? (this.blind && guess ? guess : before) : null;
