@@ -147,7 +147,10 @@ class PupilShadow:
         normal, limit = (a.reshape(*self.pieces.shape[:2], *a.shape[1:]) for a in (normal, limit))
         normal, limit, move = normal[pair[0], pair[3]], limit[pair[0], pair[3]], moves[pair[0], pair[1]]
         limit = limit + np.einsum("fwx,fx->fw", normal, move)
-        shared_points, shared_weights = quadrature(intersect(self.pieces[pair[0], pair[2]], normal, limit), count)
+        shared = intersect(self.pieces[pair[0], pair[2]], normal, limit)
+        shared_points, shared_weights = quadrature(shared, count)
+        if not np.all(np.abs(np.sum(shared_weights, axis=-1) - np.abs(area(shared))) < _ROOM):
+            raise ArithmeticError("what two shadows share came out of another size than it has")
         return ShadowParts(
             pupil=np.concatenate([full_at[0], b, pair[0]]),
             step=np.concatenate([full_at[1], s, pair[1]]),
