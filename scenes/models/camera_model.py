@@ -27,6 +27,7 @@ from optics.raytrace.first_order import FirstOrder, first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
+from scenes.models.stated_focal_length import check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
@@ -268,32 +269,62 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
     return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
 
 
-def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
+def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> CameraModel:
     """Trace a prescription and work out frames, stop, apertures and first-order numbers.
 
+    Args:
+        spec: the prescription.
+        backend: where to trace.
+        stated: whether its focal length is held against the traced one; it is not while a file is made, whose focal
+            length follows from the trace.
+
     Raises:
-        InputError: the prescription does not bring the light of its field through the stop to the image.
+        InputError: the prescription does not bring the light of its field through the stop to the image, or has
+            another focal length than it states.
     """
     try:
-        return _derived(spec, backend)
+        model = _derived(spec, backend)
     except (AimError, BeamMissedError) as error:
         reason = str(error).partition(";")[0]
         problem = f"no light of the whole field comes through the stop to the image: {reason}"
         allowed = "mirrors, image, field and stop that belong together"
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
+    if stated:
+        check_focal_length(spec, _focal_lengths(model.first_order), lambda other: _traced_focal_lengths(other, backend))
+    return model
+
+
+def _focal_lengths(chief: FirstOrder) -> np.ndarray:
+    """Along the line and across it, (2,), metres."""
+    return np.abs(np.diagonal(chief.scale[0]))
+
+
+def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> np.ndarray:
+    """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError."""
+    bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
+    return _focal_lengths(_chief(spec, backend, bare)[2])
+
+
+def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, FirstOrder]:
+    """Launch point (1, 3) of the centre's chief ray, the way to the image, and first-order numbers about that ray."""
+    names = tuple(spec.mirrors)
+    stop = names.index(spec.stop)
+    centre = field_direction(spec, 0.0, 0.0)
+    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
+    imaging = assemble(bare, [(*names, IMAGE)])
+    axes = transverse_axes(centre[None], LINE_AXIS[None])
+    return launch, imaging, first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
 
 
 def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     """What `derive_camera` says. Raises AimError, BeamMissedError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
-    stop = names.index(spec.stop)
     bare = _bare(spec, surfaces, {})
-    to_stop = assemble(bare, [names[: stop + 1]])
-    imaging = assemble(bare, [(*names, IMAGE)])
+    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
+    launch, imaging, chief = _chief(spec, backend, bare)
 
     centre = field_direction(spec, 0.0, 0.0)
-    launch = collimated(backend, to_stop, centre[None], np.zeros((1, 2)))[0]
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
     position, direction, _, valid = traced.numpy(traced.world)
@@ -309,8 +340,6 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
-    axes = transverse_axes(centre[None], LINE_AXIS[None])
-    chief = first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
     stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it
