@@ -34,9 +34,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("old", "new", "traced", "cause", "line"), WRONG)
-def test_wrong_number_is_named(
-    tmp_path: Path, backend, old: str, new: str, traced: str, cause: str, line: str
-) -> None:
+def test_wrong_number_is_named(tmp_path: Path, backend, old: str, new: str, traced: str, cause: str, line: str) -> None:
     path = changed(tmp_path, old, new)
     with pytest.raises(InputError) as error:
         derive_camera(load_camera(str(path)), backend)
@@ -62,7 +60,9 @@ def test_tilt_of_the_wrong_sign_is_named(tmp_path: Path, backend) -> None:
 
 def test_a_nominal_focal_length_may_differ_by_some_percent(tmp_path: Path, backend) -> None:
     for length in ("5.1 m", "6.0 m"):
-        model = derive_camera(load_camera(str(changed(tmp_path, "focal_length: 5.52 m", f"focal_length: {length}"))), backend)
+        model = derive_camera(
+            load_camera(str(changed(tmp_path, "focal_length: 5.52 m", f"focal_length: {length}"))), backend
+        )
         assert model.line_focal_length == pytest.approx(5.5104, abs=1e-4)
 
 
