@@ -200,10 +200,15 @@ def foreign_minus(text: str) -> Problem:
     return Problem(f"a number with the sign U+{ord(sign):04X} ({unicodedata.name(sign).lower()})", shown(text), remedy)
 
 
-def format_quantity(value: float, kind: Kind) -> str:
+def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
     """Text for an SI value that `parse_quantity` reads back to exactly the same float.
 
     A unit that makes the number lie between 1 and 1000 is preferred, then one with few digits, then the earlier one.
+
+    Args:
+        value: SI.
+        kind: what it measures.
+        within: by how much the text may differ, SI: of a computed value what its rounding has left in the last digits.
 
     Raises:
         ValueError: not finite.
@@ -212,7 +217,7 @@ def format_quantity(value: float, kind: Kind) -> str:
         raise ValueError(f"{value} has no text")
     choices = []
     for unit in kind.writes or (kind.si,):
-        number = _shortest_number(value, unit, kind)
+        number = _shortest_number(value, unit, kind, within)
         if number is not None:
             handy = number == "0" or 1.0 <= abs(float(number)) < 1000.0
             choices.append((not handy, len(number.strip("-").replace(".", "")), f"{number} {unit}"))
@@ -268,8 +273,10 @@ def unit_ratio(unit: str, other: str) -> float:
         return float(one[0] / two[0])
 
 
-def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
-    """The shortest number that, in this unit, reads back to `value`; None if there is none of 17 digits."""
+def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str | None:
+    """The shortest number that, in this unit, reads back to `value`, or to within so much; None if there is none of 17
+    digits.
+    """
     with localcontext(prec=50):
         if value == 0.0 and unit not in _CELSIUS:
             return "-0" if math.copysign(1.0, value) < 0.0 else "0"
@@ -279,7 +286,7 @@ def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
             number = Decimal(f"{exact:.{digits}g}")
             plain = -5 <= number.adjusted() <= 6
             text = format(number, "f") if plain else format(number.normalize(), "e")
-            if _to_si(text, unit, kind) == value:
+            if abs(_to_si(text, unit, kind) - value) <= within:
                 return text
     return None
 
