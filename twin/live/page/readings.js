@@ -53,6 +53,7 @@ export class Readings {
         name.title = row.meaning;
         row.cells = Array.from({ length: hello.estimators.length + 4 }, () => row.line.insertCell());
         row.cells[1 + hello.estimators.indexOf(hello.judged)].className = 'judged';
+        for (const cell of row.cells) cell.textContent = '…';
         row.texts = [];
         row.name = `${group.title} ${row.symbol} [${row.unit}]`;
       }
