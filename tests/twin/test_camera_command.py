@@ -68,7 +68,7 @@ def test_first_order_data_by_hand(gf7, gf7_alone) -> None:
     exit_pupil = abs(data.exit_pupil_distance) / told["working_f_number"]
     assert told["exit_pupil_m"] == pytest.approx(exit_pupil, rel=1e-9)
     assert data.chief_ray_angle[0] < data.chief_ray_angle[1] < 1e-3  # nearly telecentric
-    assert dict(data.obscuration) == {}
+    assert dict(data.obscuration.shares) == dict(data.obscuration.holes) == {}
 
 
 def test_the_entrance_pupil_is_where_chief_rays_cross(backend, gf7, gf7_alone) -> None:
@@ -89,7 +89,7 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     file = tmp_path / "low.yaml"
     file.write_text(GF7.replace("field_bias: 6 deg", "field_bias: 1.5 deg"), "utf-8")
     model = derive_camera(load_camera(file), backend)
-    shares = obscuration(model, backend)
+    shares = obscuration(model, backend).shares
     # M2 as a flat disk at its vertex, its sag is some millimetres; worst at the field whose image is nearest to it
     nodes = quadrature.disk(20)
     points = ray_paths(model, backend, [(0.0, -1.0)], np.stack([nodes.x, nodes.y], axis=-1), 6.0).points[:, 0]
@@ -103,6 +103,48 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     taken = float(met @ nodes.share)
     assert 0.1 < taken < 0.9
     assert shares["M2"] == pytest.approx(taken, abs=0.05)  # 144 rays tell shares to some percent
+
+
+CASSEGRAIN = """
+name: cassegrain
+focal_length: 4 m
+entrance_pupil: 500 mm
+field_bias: 0 deg
+field: {x: 0.2 deg, y: 0.2 deg}
+wavelength: 650 nm
+stop: M1
+mirrors:
+  M1: {z: 0 m, radius: -2 m, conic: -1}
+  M2: {z: -0.7 m, radius: -0.8 m, conic: -2.77777777777778}
+image: {z: 0.5 m}
+line: {pixels: 2000, pitch: 7 um}
+"""
+
+
+def test_a_mirror_that_light_goes_through_has_a_hole_there(backend, tmp_path) -> None:
+    """The first mirror of a telescope about its axis does not take all of its light."""
+    file = tmp_path / "cassegrain.yaml"
+    file.write_text(CASSEGRAIN, "utf-8")
+    data = first_order_data(CameraOptics.alone(derive_camera(load_camera(file), backend), backend))
+    # by similar triangles: 0.5 m before the image at F/8, and chief rays that come from M2's vertex 0.7 m before M1
+    slope, half = 0.25 / 4.0, 4.0 * np.tan(np.hypot(1.0, 1.0) * np.deg2rad(0.2))
+    assert dict(data.obscuration.holes) == {"M1": pytest.approx(0.5 * slope + half * 0.7 / 1.2, rel=0.1)}
+    told = FIRST_ORDER(data)
+    # M2 is 77 mm and its edge in radius: some 9 % of the beam, and the line's edge nothing more
+    assert list(told["obscuration"]) == ["M2"]
+    assert 0.07 < told["obscuration"]["M2"] < 0.15
+    assert told["hole_radius_mm"]["M1"] == pytest.approx(1e3 * data.obscuration.holes["M1"])
+    # with a hole of that size stated there is nothing to be told
+    stated = CASSEGRAIN.replace("conic: -1}", "conic: -1, edges: [{blocks: circle, radius: 60 mm}]}")
+    file.write_text(stated, "utf-8")
+    holed = obscuration(derive_camera(load_camera(file), backend), backend)
+    assert dict(holed.holes) == {}
+    assert list(holed.shares) == ["M2"]
+    # light that goes through where the mirror is used is lost, hole or not
+    file.write_text(CASSEGRAIN.replace("y: 0.2 deg", "y: 2.5 deg"))
+    wide = obscuration(derive_camera(load_camera(file), backend), backend)
+    assert wide.shares["M1"] > 0.9
+    assert dict(wide.holes) == {}
 
 
 def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:

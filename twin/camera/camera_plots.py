@@ -104,16 +104,23 @@ def error_figure(run: CameraRun) -> Figure:
     count = run.field.shape[1]
     for k, colour in zip((0, count // 2, count - 1), (SKY, INK, VERMILION), strict=True):
         text = plain(float(y[0, k]), 3)
-        right.plot(x[:, k], run.errors[:, k], color=colour, lw=1.3, label=f"{text}\N{DEGREE SIGN} along the track")
+        right.plot(x[:, k], run.errors[:, k], color=colour, lw=1.3, label=f"{text}\N{DEGREE SIGN}")
     most = float(run.errors.max())
     for limit, name in ((SHARP, "diffraction limited"), (BLURRED, "blurred")):
         if limit < 4.0 * most and most < 4.0 * limit:
             right.axhline(limit, color=GREY, lw=0.8, ls=":")
-            right.annotate(name, (float(x[0, 0]), limit), (2, -2), textcoords="offset points", va="top", fontsize=7.5)
+            # beside the frame, where no curve comes
+            right.annotate(
+                name.replace(" ", "\n"), (1.0, limit), (4, 0), xycoords=("axes fraction", "data"),
+                textcoords="offset points", va="center", fontsize=7.5, annotation_clip=False,
+            )  # fmt: skip
     right.set_ylim(0.0, None)
     right.set_xlabel("field along the line, degrees")
     right.set_ylabel("waves rms")
-    right.legend(fontsize=7.5)
+    right.legend(
+        fontsize=7.5, ncols=3, title="along the track", title_fontsize=7.5, loc="lower right",
+        bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, columnspacing=1.2, handlelength=1.4,
+    )  # fmt: skip
     plain_axes(right)
     return figure
 

@@ -111,6 +111,9 @@ def first_order_table(run: CameraRun) -> Table:
         ("obscuration by its own parts",
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
+    if n["hole_radius_mm"]:
+        holes = ", ".join(f"{b} a hole of {r:.1f} mm radius or more" for b, r in n["hole_radius_mm"].items())
+        rows.append(("light goes through", f"{holes} (the file states none: edges: [{{blocks: circle, radius: ...}}])"))
     caption = f"In the middle of the field, at {1e9 * run.camera.wavelength:.0f} nm, unless it says otherwise."
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
