@@ -15,7 +15,7 @@ from scenes.models.camera_sharpness import FocalPlane, sharpness
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import LIBRARY, load_camera
 from scenes.specs.resolved import resolve_camera
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
@@ -328,8 +328,9 @@ def test_files_that_it_takes(tmp_path) -> None:
         (("gf7_pair",), "gf7_pair: which of its cameras is meant is not said; allowed: --camera forward"),
         (("gf7_pair", "--camera", "foreward"), "no such camera; did you mean 'forward'\\? Found 'foreward'"),
         (("gf7", "--camera", "backward"), "gf7: --camera backward: the file holds one camera, gf7"),
-        (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus tilt"),
-        (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus tilt"),
+        (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus --tilt"),
+        (("gf7", "--tilt"), "--tilt goes with --refocus"),
+        (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus --tilt"),
         (("scenes/examples/perturb.yaml",), "perturb.yaml:1: there is no camera's prescription in this file"),
         (("nowhere.yaml",), "nowhere.yaml: no such file"),
     ],
@@ -349,3 +350,29 @@ def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="no focus after M3"):
         run_camera(resolve_camera(Path(file)), backend, refocus=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "turned", "noted"),
+    [
+        (("--refocus",), False, False),
+        (("--refocus", "--tilt"), True, False),
+        (("--refocus", "tilt"), True, True),
+    ],
+)
+def test_tilt_is_an_option(tmp_path, monkeypatch, words, turned, noted) -> None:
+    """The word of earlier versions is read, and told how it is written."""
+    asked = []
+
+    def run(setup, backend, refocus, tilt, advance):
+        asked.append((refocus, tilt))
+        raise InputError(Issue("enough"))
+
+    monkeypatch.setattr("twin.camera.camera_run.run_camera", run)
+    done = invoke(app, "gf7", *words, "--out", str(tmp_path / "run"))
+    assert asked == [(True, turned)]
+    assert ("is written --refocus --tilt" in done.stderr) == noted
+    shown = invoke(app, "--help").stdout
+    assert "--tilt" in shown
+    assert "[tilt]" not in shown
+    assert "[what]" not in shown
