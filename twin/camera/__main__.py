@@ -62,7 +62,6 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-
     turned = tilt or what is not None  # what stood there in earlier versions
 
     def resolve() -> CameraSetup:
