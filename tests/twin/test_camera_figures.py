@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -37,5 +38,5 @@ def test_limits_are_named_beside_curves_and_legend(level: float) -> None:
         assert not box.overlaps(legend)
         assert not any(box.contains(*point) for curve in curves for point in curve)
         assert box.x1 <= figure.bbox.x1 + 1.0
-    for one, other in zip(names, names[1:], strict=False):
+    for one, other in pairwise(names):
         assert not one.get_window_extent().overlaps(other.get_window_extent())

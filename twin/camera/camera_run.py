@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
@@ -48,6 +49,7 @@ QUALITY_FIELDS = (-1.0, 0.0, 1.0)
 """Shares of half the line at which bodies of an instrument are looked for in the beam."""
 
 
+@shows("errors_before [waves]", "errors_after [waves]", "tilt")
 @dataclass(frozen=True, eq=False)
 class Refocus:
     """A focal plane found anew.
@@ -65,6 +67,7 @@ class Refocus:
     tilt: bool
 
 
+@shows("camera.name", "errors [waves]", "worst")
 @dataclass(frozen=True, eq=False)
 class CameraRun:
     """A judged camera.

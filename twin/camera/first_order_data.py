@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.short_repr import shows
 from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
@@ -29,6 +30,7 @@ _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 _RINGS = 6
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class RayPaths:
     """Rays in the prescription frame.
@@ -205,6 +207,7 @@ _RIM = 48
 """Rays on the edge of the stop."""
 
 
+@shows("focal_length [m]", "aperture", "image [mm]", "obscuration.shares", "obscuration.holes")
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
     """What was traced in the middle of the field for `FIRST_ORDER`; lengths in metres, angles in radians.

@@ -12,6 +12,7 @@ import numpy as np
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.recovery import Recovery
+from analysis.short_repr import shows
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
 from scenes.models.scenery import MeasuredFinishes
@@ -46,6 +47,7 @@ class StrayPair:
         return out if self.measured is None else {**out, "finishes": self.measured.to_dict()}
 
 
+@shows("experiment", "seed", "before [DN]", "after [DN]")
 @dataclass(frozen=True, eq=False)
 class RenderRun:
     """One job's outcome.
