@@ -23,11 +23,11 @@ from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.first_order import FirstOrder, first_order, ray_matrix
+from optics.raytrace.first_order import FirstOrder, RayMatrix, first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
-from scenes.models.stated_focal_length import check_focal_length
+from scenes.models.stated_focal_length import TracedFocalLengths, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
@@ -283,46 +283,48 @@ def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> Ca
             another focal length than it states.
     """
     try:
-        model = _derived(spec, backend)
+        return _derived(spec, backend, stated)
     except (AimError, BeamMissedError) as error:
         reason = str(error).partition(";")[0]
         problem = f"no light of the whole field comes through the stop to the image: {reason}"
         allowed = "mirrors, image, field and stop that belong together"
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
-    if stated:
-        check_focal_length(spec, _focal_lengths(model.first_order), lambda other: _traced_focal_lengths(other, backend))
-    return model
 
 
-def _focal_lengths(chief: FirstOrder) -> np.ndarray:
-    """Along the line and across it, (2,), metres."""
-    return np.abs(np.diagonal(chief.scale[0]))
+def _focal_lengths(chief: RayMatrix) -> TracedFocalLengths:
+    """About a chief ray."""
+    power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
+    with np.errstate(divide="ignore"):
+        return TracedFocalLengths(np.abs(np.diagonal(first_order(chief).scale[0])), 1.0 / power)
 
 
-def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> np.ndarray:
+def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
     """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError."""
     bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
     return _focal_lengths(_chief(spec, backend, bare)[2])
 
 
-def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, FirstOrder]:
-    """Launch point (1, 3) of the centre's chief ray, the way to the image, and first-order numbers about that ray."""
+def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, RayMatrix]:
+    """Launch point (1, 3) of the centre's chief ray, the way to the image, and what steps about that ray do."""
     names = tuple(spec.mirrors)
     stop = names.index(spec.stop)
     centre = field_direction(spec, 0.0, 0.0)
     launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
     imaging = assemble(bare, [(*names, IMAGE)])
     axes = transverse_axes(centre[None], LINE_AXIS[None])
-    return launch, imaging, first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
+    return launch, imaging, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
 
 
-def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
+def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     """What `derive_camera` says. Raises AimError, BeamMissedError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
     bare = _bare(spec, surfaces, {})
     to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
-    launch, imaging, chief = _chief(spec, backend, bare)
+    launch, imaging, matrix = _chief(spec, backend, bare)
+    chief = first_order(matrix)
+    if stated:
+        check_focal_length(spec, _focal_lengths(matrix), lambda other: _traced_focal_lengths(other, backend))
 
     centre = field_direction(spec, 0.0, 0.0)
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)

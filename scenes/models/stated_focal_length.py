@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,24 @@ from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 
 LARGEST_DIFFERENCE = 0.1
 """Share by which the traced focal length may differ from the stated one. The library's cameras need 0.5 % along the
-line and 8 % across it; a wrong sign or unit is seldom below a third."""
+line and 8 % across it; a wrong sign or unit is seldom below a third.
+"""
 
-FocalLengths = Callable[[CameraSpec], np.ndarray]
-"""Focal lengths of a camera along its line and across it, (2,), metres."""
+
+class TracedFocalLengths(NamedTuple):
+    """Focal lengths of a camera about the chief ray of its field's middle, metres.
+
+    Attributes:
+        image: change of the image's place per angle, along the line and across it, (2,): on the plane that the file
+            states, in focus or not.
+        light: of parallel light, wherever its focus is, in the two principal directions, (2,); infinite without power.
+    """
+
+    image: np.ndarray
+    light: np.ndarray
+
+
+FocalLengths = Callable[[CameraSpec], TracedFocalLengths]
 
 _MOST_NAMED = 3  # causes in a message
 
@@ -29,26 +43,29 @@ _UNITS = ((1000.0, "m in place of mm"), (0.001, "mm in place of m"))
 _NO_LIGHT = (AimError, BeamMissedError, ArithmeticError, np.linalg.LinAlgError, ValueError)
 
 
-def check_focal_length(spec: CameraSpec, traced: np.ndarray, focal_lengths: FocalLengths) -> None:
+def check_focal_length(spec: CameraSpec, traced: TracedFocalLengths, focal_lengths: FocalLengths) -> None:
     """Check the stated focal length against the traced one.
 
-    Either of the two directions will do, since cameras with surfaces off the axis differ in them.
+    Either of the two directions will do, since cameras with surfaces off the axis differ in them. A camera that is only
+    out of focus is none of another focal length, unless a single number explains it: it can be refocused.
 
     Args:
         spec: the camera.
-        traced: its focal lengths along the line and across it, (2,), metres.
+        traced: its focal lengths.
         focal_lengths: how those of a changed camera are traced; asked only to find out what is wrong.
 
     Raises:
         InputError: they differ by more than ``LARGEST_DIFFERENCE``; with the number whose other sign or unit brings
             the focal length to the stated one, where there is one.
     """
-    if _difference(traced, spec.focal_length) <= LARGEST_DIFFERENCE:
+    if _difference(traced.image, spec.focal_length) <= LARGEST_DIFFERENCE:
         return
-    stated, found = (f"{length:.4g} m" for length in (spec.focal_length, float(traced[0])))
+    cause, suggestion = _cause(spec, float(traced.image[0]), focal_lengths)
+    if suggestion is None and _difference(traced.light, spec.focal_length) <= LARGEST_DIFFERENCE:
+        return
+    stated, found = (f"{length:.4g} m" for length in (spec.focal_length, float(traced.image[0])))
     problem = f"the focal length is stated as {stated}, but light through the surfaces has one of {found}"
-    allowed = f"the traced focal length within {LARGEST_DIFFERENCE:.0%}, or surfaces that have the stated one"
-    cause, suggestion = _cause(spec, float(traced[0]), focal_lengths)
+    allowed = f"the traced focal length within {100 * LARGEST_DIFFERENCE:.0f} %, or surfaces that have the stated one"
     raise spec.error(problem + cause, ("focal_length",), allowed=allowed, suggestion=suggestion)
 
 
@@ -67,7 +84,7 @@ def _cause(spec: CameraSpec, traced: float, focal_lengths: FocalLengths) -> tupl
         fits = []
         for words, line, changed in among:
             try:
-                off = _difference(focal_lengths(changed), spec.focal_length)
+                off = max(_difference(one, spec.focal_length) for one in focal_lengths(changed))
             except _NO_LIGHT:
                 continue
             if off <= LARGEST_DIFFERENCE:

@@ -66,6 +66,34 @@ def test_a_nominal_focal_length_may_differ_by_some_percent(tmp_path: Path, backe
         assert model.line_focal_length == pytest.approx(5.5104, abs=1e-4)
 
 
+CASSEGRAIN = """
+name: mine
+focal_length: 4 m
+entrance_pupil: 500 mm
+field_bias: 0 deg
+field: {x: 0.2 deg, y: 0.2 deg}
+wavelength: 650 nm
+stop: M1
+mirrors:
+  M1: {z: 0 m, radius: -2 m, conic: -1}
+  M2: {z: -0.7 m, radius: -0.8 m, conic: -2.77777777777778}
+image: {z: 0.5 m}
+line: {pixels: 2000, pitch: 7 um}
+"""
+
+
+def test_a_misplaced_image_plane_is_no_other_focal_length(tmp_path: Path, backend) -> None:
+    """Chief rays that are not parallel there meet it 30 % farther out; that is what refocusing is for."""
+    path = tmp_path / "mine.yaml"
+    path.write_text(CASSEGRAIN.replace("image: {z: 0.5 m}", "image: {z: 0.85 m}"), "utf-8")
+    model = derive_camera(load_camera(str(path)), backend)
+    assert model.line_focal_length > 4.0 * 1.15
+    # the sign of a mirror's radius is another thing
+    path.write_text(CASSEGRAIN.replace("radius: -0.8 m", "radius: 0.8 m"), "utf-8")
+    with pytest.raises(InputError, match="sign of the radius of M2"):
+        derive_camera(load_camera(str(path)), backend)
+
+
 def test_no_single_number_is_wrong(tmp_path: Path, backend) -> None:
     with pytest.raises(InputError, match="stated as 9 m") as error:
         derive_camera(load_camera(str(changed(tmp_path, "focal_length: 5.52 m", "focal_length: 9 m"))), backend)

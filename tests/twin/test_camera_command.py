@@ -343,7 +343,7 @@ def test_what_it_refuses(tmp_path, words: tuple[str, ...], message: str) -> None
 
 
 def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None:
-    file = gf7_with(tmp_path, "-2.70 m")
+    file = gf7_with(tmp_path, "-2.70 m", focal_length="12.3 m")
     result = invoke(app, file, "--refocus", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert re.search(r"gf7_moved.yaml:\d+: mirrors: refocusing cannot help", "".join(result.stderr.split("\n")))

@@ -14,6 +14,7 @@ from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.camera_run import CameraRun, refocus_text, verdict
 from twin.camera.first_order_data import FIRST_ORDER
+from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import look, to_svg
@@ -129,7 +130,7 @@ def _layout(run: CameraRun) -> Section:
     caption = (
         "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
     )
-    figure = _figure("layout", "Layout with rays", caption, plots.layout_figure, model, backend)
+    figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
     return Section("Layout", (), (figure,))
 
 

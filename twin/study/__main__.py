@@ -13,10 +13,11 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli
-from twin.study.progress_bar import Told, bar_of, tell_through
+from twin.study.progress_bar import Told, tell_through
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
@@ -139,7 +140,18 @@ class _Display:
 
     def __init__(self, console: Console, silent: bool, told: Told = lambda done, total: None) -> None:
         self.console, self.silent, self._told = console, silent, told
-        self.bar = bar_of(console, silent)
+        self.bar = Progress(
+            TextColumn("runs"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(elapsed_when_finished=False),
+            console=console,
+            disable=silent or not console.is_terminal,
+            transient=True,
+        )
         self._task = self.bar.add_task("runs", total=None, rate="")
         self._began: tuple[float, int] | None = None
         self._standing = cli.Standing("start the workers and a pilot")

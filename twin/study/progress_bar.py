@@ -1,63 +1,42 @@
-"""How far a study is: the bar of the command and of a script, and the line by which a study in a process of its own
-tells it.
+"""How far a study is that a script started: the pipe by which its process tells it, and a line that shows it.
+
+The command itself has a bar of its own; this one draws with nothing that a script does not have.
 """
 
 from __future__ import annotations
 
 import os
+import sys
+import time
 from collections.abc import Callable, Iterable
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from rich.console import Console
-    from rich.progress import Progress
+from contextlib import suppress
 
 Told = Callable[[int, int], None]
 """What is told that so many runs of so many are there."""
 
 
-def bar_of(console: Console, silent: bool = False) -> Progress:
-    """The bar of a study, drawn where the console is a terminal or a notebook, and gone at its end.
-
-    Args:
-        console: where it is drawn.
-        silent: whether none is drawn.
+def shown_bar() -> Told:
+    """A line on stderr that says how far a study is, drawn over the one before: on a terminal and in a notebook's cell.
+    Elsewhere, in a file, nothing is written.
     """
-    # it is not needed to run a study
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    stream = sys.stderr
+    if not (stream.isatty() or "ipykernel" in sys.modules):
+        return lambda done, total: None
+    begun = time.monotonic()
 
-    return Progress(
-        TextColumn("runs"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(elapsed_when_finished=False),
-        console=console,
-        disable=silent or not (console.is_terminal or console.is_jupyter),
-        transient=True,
-    )
+    def told(done: int, total: int) -> None:
+        full = _WIDTH * done // max(total, 1)
+        spent = time.monotonic() - begun
+        left = f", about {spent * (total - done) / done:.0f} s left" if 0 < done < total else ""
+        bar = f"runs {'#' * full}{'.' * (_WIDTH - full)} {done} of {total}, {spent:.0f} s{left}"
+        # the line before may have been longer
+        stream.write(f"\r{bar:<79}" + ("\n" if done == total else ""))
+        stream.flush()
+
+    return told
 
 
-@contextmanager
-def shown_bar() -> Iterator[Told]:
-    """A bar on stderr, or in the notebook's cell, while the block lasts."""
-    from rich.console import Console
-
-    with bar_of(Console(stderr=True)) as bar:
-        task = bar.add_task("runs", total=None, rate="")
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+_WIDTH = 30  # of the bar, characters
 
 
 def tell_through(descriptor: int) -> Told:

@@ -122,7 +122,7 @@ def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, s
     """Run a study's command to its end; its exit code, and what it said where nobody is shown that."""
     with ExitStack() as stack:
         kept = stack.enter_context(tempfile.TemporaryFile("w+")) if quiet else None
-        told = progress if callable(progress) else stack.enter_context(shown_bar()) if progress and not quiet else None
+        told = progress if callable(progress) else shown_bar() if progress and not quiet else None
         with _telling(command, kept, told is not None) as (done, lines):
             if told is not None:
                 tell_all(lines, told)
