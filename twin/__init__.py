@@ -7,7 +7,22 @@
     shot = bent.render(frames=9, seed=1)
     pair.recover(shot.before, shot.after).compare(shot.truth)
 
-Names below are imported when they are first used, so that a command starts no library that it does not need.
+What is called, each with its own help, as help(twin.load):
+
+    load(what)          an instrument: InstrumentTwin, with perturbed, render, recover, camera, jacobian, to_yaml
+    load_camera(what)   a camera by itself, with wavefront, spot, mtf, each of which has plot()
+    study(pair, vary)   an instrument many times, with what varies: a table of all runs
+    perform(name, file) a test of the laboratory or of the orbit: TestResult
+
+What comes back:
+
+    Shot                of render: frames before and after, truth, verdict; save writes the run folder
+    Found               of recover: readings with their sigmas; compare sets them beside the truth
+    TestResult          of perform: numbers, summary, report
+    InputError          raised where an input cannot be used: file, line, key, what is allowed
+
+All of them show themselves in a few words, and in a notebook with their figure or table. Names below are imported when
+they are first used, so that a command starts no library that it does not need.
 """
 
 from __future__ import annotations

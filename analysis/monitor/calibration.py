@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
+from analysis.short_repr import shows
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_template import SpotTemplate
 
@@ -22,6 +23,7 @@ PAIR = ("left", "right")
 """Names of the channels at the +Y and at the -Y end of a line, which paper 001 numbers 1 and 2."""
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
     """Calibration of one camera's monitor.
@@ -52,6 +54,7 @@ class CameraCalibration:
         return left, right
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class MonitorCalibration:
     """Calibration of an instrument's monitor.

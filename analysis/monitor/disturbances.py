@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.chi_square import chance_beyond, density, limit_of
+from analysis.short_repr import shows
 
 __all__ = ["FALSE_ALARM", "Consistency", "Disturbances", "Suspect", "TimeLaw", "consistency"]
 
@@ -53,6 +54,7 @@ class TimeLaw:
         return out
 
 
+@shows("name", "labels", "spots [px]")
 @dataclass(frozen=True, eq=False)
 class Disturbances:
     """Stated disturbances of K cameras with D spot coordinates together.
@@ -183,6 +185,7 @@ class Suspect:
     gain: float
 
 
+@shows()
 @dataclass(frozen=True)
 class Consistency:
     """Do the measured shifts agree with disturbances and noise?

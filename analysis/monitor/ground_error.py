@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.measurement_error import UndeterminedError
+from analysis.short_repr import shows
 from analysis.states import OfStates
 
 __all__ = ["EARTH_RADIUS_M", "GroundError", "GroundGeometry"]
@@ -31,6 +32,7 @@ _PLACES = 9
 AXES = ("along", "across", "height")
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class GroundError(OfStates):
     """Errors of points on the ground for S states.

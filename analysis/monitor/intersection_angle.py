@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.monitoring import CameraParameters
+from analysis.short_repr import shows
 from analysis.states import OfStates
 
 __all__ = ["IntersectionAngleChange", "exact"]
@@ -26,6 +27,7 @@ __all__ = ["IntersectionAngleChange", "exact"]
 Array = NDArray[np.float64]
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class IntersectionAngleChange(OfStates):
     """change_rad: (...) new angle minus nominal angle, rad; sigma_rad: (...) standard deviation of its error;

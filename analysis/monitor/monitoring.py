@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from analysis.short_repr import shows
 from analysis.states import OfStates
 from analysis.units import ARCSEC, UM_PER_M
 
@@ -54,6 +55,7 @@ PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
 """How many of these units make one SI unit (rad, m)."""
 
 
+@shows("focal_length_m [m]", "separation_m [mm]", "pixel_m [um]", "field_alpha_rad [deg]", "field_beta_rad [deg]")
 @dataclass(frozen=True)
 class MonitorGeometry:
     """What the formulas need to know of one camera's monitor. Raises ValueError, naming the field.
@@ -91,6 +93,7 @@ class MonitorGeometry:
                 raise ValueError(f"monitor geometry: {field.name} must be {allowed}, found {value!r}")
 
 
+@shows("d_alpha_rad [arcsec]", "d_beta_rad [arcsec]", "d_gamma_rad [arcsec]", "d_f_m [um]")
 @dataclass(frozen=True, eq=False)
 class CameraParameters(OfStates):
     """Changes of one camera, scalars or arrays of one shape (...).

@@ -19,6 +19,7 @@ from analysis.monitor.intersection_angle import IntersectionAngleChange
 from analysis.monitor.limits import quantities
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.spot_evidence import SpotEvidence
+from analysis.short_repr import shows
 from analysis.spots.centroid import CENTROIDS, mean_frames
 from analysis.spots.fit_state import FitStates, fit_states, require_rest, widened
 from analysis.spots.spot_positions import NoiseParts, SpotPositions, difference_covariance, noise_parts
@@ -42,6 +43,7 @@ MeasuredSpots: TypeAlias = tuple[SpotPositions, FitStates]
 """Spots with how good their fits are."""
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class Estimates:
     """What all estimators make of spot positions, for S states.
@@ -58,6 +60,7 @@ class Estimates:
     curvature: Mapping[str, Curvature] = field(default_factory=dict)
 
 
+@shows("parameters", "before [px]", "after [px]", "sigma_after [px]")
 @dataclass(frozen=True, eq=False)
 class Recovery(OfStates):
     """What the images say, for S states.

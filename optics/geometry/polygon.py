@@ -215,8 +215,8 @@ def from_boundary(
     rows = len(place)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     half = np.where(half > 0.0, half, 1.0)
-    # Nodes lie in the box but for rounding. Of a sliver, a box of no height to speak of, this rounding is many times the
-    # box, and polynomials make any weight of it.
+    # Nodes lie in the box but for rounding. Of a sliver, whose box has no height to speak of, this rounding is many
+    # times the box, and polynomials make any weight of it.
     at = np.clip((place - middle[:, None]) / half[:, None], -1.0, 1.0)
     rise = rise / half[:, 1:]
     step = max(1, _AT_ONCE // max(place.shape[1], 1))

@@ -14,7 +14,7 @@ frequencies and one focus, where code for one pupil spends its time on calls and
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -399,12 +399,12 @@ class PupilFunction:
 
     centre: np.ndarray
     axes: np.ndarray
-    edge: PupilEdge
-    eikonal_terms: np.ndarray
-    amplitude_terms: np.ndarray
+    edge: PupilEdge = field(repr=False)
+    eikonal_terms: np.ndarray = field(repr=False)
+    amplitude_terms: np.ndarray = field(repr=False)
     eikonal_residual: float = 0.0
     amplitude_residual: float = 0.0
-    shadow: PupilShadow | None = None
+    shadow: PupilShadow | None = field(default=None, repr=False)
 
     def normalised(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Normalised shift, complex, of shifts (x, y) of the direction cosines, any equal shapes."""

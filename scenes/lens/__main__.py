@@ -167,7 +167,7 @@ def read(
         from scenes.lens.camera_reader import Width, camera_of, camera_text
 
         if half is not None:
-            lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), field_kind="angles")
+            lens = replace(lens, fields=((0.0, 0.0), (0.0, half)), field_kind="angles", round_field=True)
         name = re.sub(r"[^A-Za-z0-9_-]", "_", out.stem)[:64]
         name = name if re.match(r"[A-Za-z]", name) else f"camera_{name}"[:64]
         assert step is not None

@@ -19,7 +19,16 @@ from optics.raytrace.assembly import Interaction
 from optics.raytrace.first_order import ray_matrix
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, Rays, make_rays, trace
-from scenes.lens.prescription import SEQUENCE, LensSurface, Note, Prescription, edge_entries, facing, without_rim
+from scenes.lens.prescription import (
+    SEQUENCE,
+    LensSurface,
+    Note,
+    Prescription,
+    edge_entries,
+    facing,
+    without_rim,
+    written,
+)
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
@@ -98,20 +107,31 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
         InputError: the prescription has what a camera's file cannot hold, or light does not come through.
     """
     _check(lens)
+    if _one_axis(lens) and not lens.round_field:
+        try:
+            return _camera_of(lens, name, backend, width)
+        except InputError:
+            # its corners are farther out than anything the file asks for
+            return _camera_of(replace(lens, round_field=True), name, backend, width)
+    return _camera_of(lens, name, backend, width)
+
+
+def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) -> ReadCamera:
+    """What `camera_of` says, with the field as the prescription has it."""
     notes = list(lens.notes)
     surfaces, stop, origin, taken = _surfaces(lens, notes)
     bias, half_x, half_y = _field(lens, surfaces, notes)
-    where = {"z": format_quantity(_image(lens)[0], LENGTH)}
+    where = {"z": written(_image(lens)[0], LENGTH)}
     if _image(lens)[1]:
-        where["tilt"] = format_quantity(_image(lens)[1], ANGLE)
+        where["tilt"] = written(_image(lens)[1], ANGLE)
     plain: dict[str, Any] = {
         "name": name,
         "description": f"Read from {re.sub(r'[^ -~]', '?', lens.name)[:200]}.",
         "focal_length": "1 m",
         "entrance_pupil": "0.1 mm",
-        "field_bias": format_quantity(bias, ANGLE),
-        "field": {"x": format_quantity(half_x, ANGLE), "y": format_quantity(half_y, ANGLE)},
-        "wavelength": format_quantity(lens.wavelength, LENGTH),
+        "field_bias": written(bias, ANGLE),
+        "field": {"x": written(half_x, ANGLE), "y": written(half_y, ANGLE)},
+        "wavelength": written(lens.wavelength, LENGTH),
         "stop": stop,
         "mirrors": surfaces,
         "image": where,
@@ -127,7 +147,7 @@ def camera_of(lens: Prescription, name: str, backend: Backend, width: Width = AS
             problem, None, f"{pixels:.4g} of {format_quantity(width.pitch, LENGTH)}", "2 to 1000000: --pitch"
         )
     plain["focal_length"] = format_quantity(float(f"{focal:.6g}"), LENGTH)
-    plain["entrance_pupil"] = format_quantity(pupil, LENGTH)
+    plain["entrance_pupil"] = written(pupil, LENGTH)
     plain["line"]["pixels"] = math.ceil(pixels)
     plain["edge_margin"] = format_quantity(float(f"{min(0.005, 0.05 * pupil):.3g}"), LENGTH)
     text = f"{plain['line']['pixels']} pixels of {format_quantity(width.pitch, LENGTH)} put in, which cover the field"
@@ -151,11 +171,12 @@ def _round_field(lens: Prescription) -> Prescription:
         InputError: its field is round already.
     """
     x, y = np.array(lens.fields).T
-    if np.all(x == 0.0) or np.all(y == 0.0):
+    if lens.round_field:
         raise lens.error("edges leave no light at the end of the field", allowed="a smaller field, or other edges")
     largest = float(np.max(np.hypot(x, y)))
     note = Note(0, "field", "edges leave no light between the ends of its axes: taken to be round")
-    return replace(lens, fields=((0.0, -largest), (0.0, 0.0), (0.0, largest))).with_notes(note)
+    fields = ((0.0, -largest), (0.0, 0.0), (0.0, largest))
+    return replace(lens, fields=fields, round_field=True).with_notes(note)
 
 
 def _check(lens: Prescription) -> None:
@@ -223,16 +244,16 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     """A surface as a camera's file has it."""
     shape = surface.surface
     x, y, z = (float(v) for v in surface.pose.translation)
-    out: dict[str, Any] = {"z": format_quantity(z, LENGTH)}
+    out: dict[str, Any] = {"z": written(z, LENGTH)}
     if x or y:
-        out["decentre"] = [format_quantity(v, LENGTH) for v in (x, y)]
+        out["decentre"] = [written(v, LENGTH) for v in (x, y)]
     turn = rotation_vector(surface.pose.rotation)
     if np.any(np.abs(turn) > 0.0):
-        out["rotate"] = [format_quantity(float(v), ANGLE) for v in turn]
-    out["radius"] = format_quantity(1.0 / shape.curvature, LENGTH) if shape.curvature else "flat"
+        out["rotate"] = [written(float(v), ANGLE) for v in turn]
+    out["radius"] = written(1.0 / shape.curvature, LENGTH) if shape.curvature else "flat"
     if shape.conic:
         out["conic"] = shape.conic
-    powers = {f"A{4 + 2 * n}": format_quantity(a, power_of_length(-3 - 2 * n)) for n, a in enumerate(shape.even) if a}
+    powers = {f"A{4 + 2 * n}": written(a, power_of_length(-3 - 2 * n)) for n, a in enumerate(shape.even) if a}
     if powers:
         out["aspheric"] = powers
     terms = _terms(lens, surface, shape)
@@ -264,7 +285,7 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
     kinds = {kind: name for name, kind in SAG_TERMS.items()}
     return {
         kinds[type(term)]: {
-            key: format_quantity(float(value), power_of_length(power)) if power else float(value)
+            key: written(float(value), power_of_length(power)) if power else float(value)
             for key, power in term.POWERS.items()
             if (value := getattr(term, key)) != 0.0
         }
@@ -272,15 +293,31 @@ def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str
     }
 
 
+def _one_axis(lens: Prescription) -> bool:
+    """Whether the fields stand on one axis, from the middle outward."""
+    x, y = np.array(lens.fields).T
+    out = np.hypot(x, y)
+    return bool((np.all(x == 0.0) or np.all(y == 0.0)) and np.max(out) > 0.0 and np.min(out) == 0.0)
+
+
 def _field(lens: Prescription, surfaces: dict[str, Any], notes: list[Note]) -> tuple[float, float, float]:
     """Field bias and half angles along x and y, radians."""
     x, y = np.array(lens.fields).T
     upright = not any({"decentre", "rotate", "sag"} & set(s) for s in surfaces.values()) and not _image(lens)[1]
     largest = float(np.max(np.hypot(x, y)))
-    if upright and largest > 0.0 and (np.all(x == 0.0) or np.all(y == 0.0)) and 0.0 in (*np.hypot(x, y),):
-        text = f"a circle of {math.degrees(largest):.6g} deg about the axis; the square in it is taken"
+    if upright and _one_axis(lens):
+        wide = math.degrees(largest)
+        if lens.round_field:
+            text = f"a circle of {wide:.6g} deg about the axis; the square in it is taken"
+            notes.append(Note(0, "field", text))
+            return 0.0, largest / math.sqrt(2.0), largest / math.sqrt(2.0)
+        text = (
+            f"angles along one axis alone, to {wide:.6g} deg; the camera's field is a square of {wide:.6g} deg to each "
+            f"side, whose corners are {math.sqrt(2.0) * wide:.4g} deg out. --field '{wide:.6g} deg' takes the square "
+            "in the circle"
+        )
         notes.append(Note(0, "field", text))
-        return 0.0, largest / math.sqrt(2.0), largest / math.sqrt(2.0)
+        return 0.0, largest, largest
     bias = 0.5 * float(y.max() + y.min())
     half_x, half_y = float(np.max(np.abs(x))), 0.5 * float(y.max() - y.min())
     if half_x == 0.0 and half_y == 0.0:
@@ -301,7 +338,7 @@ def _derived(lens: Prescription, plain: dict[str, Any], backend: Backend) -> Cam
         problem = error.problem if isinstance(error, Problem) else reason.splitlines()[0]
         raise lens.error(f"a camera's file cannot hold this: {problem}") from error
     try:
-        return derive_camera(spec, backend)
+        return derive_camera(spec, backend, stated=False)
     except InputError as error:
         raise lens.error(error.issues[0].problem, allowed="a system that light comes through") from error
     except (np.linalg.LinAlgError, FloatingPointError) as error:

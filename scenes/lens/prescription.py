@@ -18,7 +18,7 @@ from optics.geometry.tree import Body, RigidTree
 from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity
+from scenes.yaml.units import ANGLE, LENGTH, Kind, format_quantity
 
 LARGEST_ORDER = 10
 """Largest order of polynomials and Zernike terms; beyond it monomials lose digits."""
@@ -215,6 +215,20 @@ def without_rim(surface: LensSurface) -> LensSurface:
     return replace(surface, aperture=None, edges=(*(() if hole is None else (hole,)), *surface.edges))
 
 
+def written(value: float, kind: Kind) -> str:
+    """A number of another program's file as a camera's file has it, without the tail that conversions leave: 540 arcsec
+    and not 539.9999999999999 arcsec.
+
+    Args:
+        value: SI.
+        kind: what it measures.
+    """
+    return format_quantity(value, kind, _ROUNDING.get(kind.si, 0.0) + 2e-15 * abs(value))
+
+
+_ROUNDING = {ANGLE.si: 1e-14, LENGTH.si: 1e-15}
+"""SI unit -> what sums and differences of such numbers leave in them; the ray's wavelength is 1e8 times as much."""
+
 _LARGEST_EDGE = 100.0
 """Metres; beyond that an edge is none."""
 
@@ -245,8 +259,8 @@ def _entry(edge: Edge) -> dict[str, Any]:
     kind = {Circle: "circle", Rectangle: "rectangle", Ellipse: "ellipse", Ray: "ray", Polygon: "polygon"}[type(shape)]
 
     def metres(*values: float) -> Any:
-        written = [format_quantity(float(value), LENGTH) for value in values]
-        return written if len(written) > 1 else written[0]
+        texts = [written(float(value), LENGTH) for value in values]
+        return texts if len(texts) > 1 else texts[0]
 
     out: dict[str, Any] = {"blocks" if edge.blocks else "clear": kind}
     if any(shape.centre):
@@ -263,7 +277,7 @@ def _entry(edge: Edge) -> dict[str, Any]:
         case _:
             out["half"] = metres(shape.half_x, shape.half_y)
     if edge.turn and not isinstance(shape, Circle | Polygon):
-        out["turn"] = format_quantity(remainder(edge.turn, 2.0 * pi), ANGLE)
+        out["turn"] = written(remainder(edge.turn, 2.0 * pi), ANGLE)
     return out
 
 
@@ -357,6 +371,7 @@ class Prescription:
         pupil: how wide the beam is; None where the file does not say.
         object_distance: from the object to the frame's origin, metres; infinite for a scene.
         notes: what did not come along.
+        round_field: the fields say how wide a round field about the axis is, of which a camera has the square in it.
     """
 
     name: str
@@ -370,6 +385,7 @@ class Prescription:
     pupil: Pupil | None = None
     object_distance: float = float("inf")
     notes: tuple[Note, ...] = ()
+    round_field: bool = False
 
     @property
     def image(self) -> LensSurface:

@@ -23,10 +23,11 @@ from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
-from optics.raytrace.first_order import FirstOrder, first_order, ray_matrix
+from optics.raytrace.first_order import FirstOrder, RayMatrix, first_order, ray_matrix
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.imaging import aim_collimated
+from scenes.models.stated_focal_length import TracedFocalLengths, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.course import noll
@@ -268,14 +269,21 @@ def collimated(backend: Backend, to_stop: SystemBatch, directions: np.ndarray, t
     return aim_collimated(backend, every, directions, -LAUNCH_DISTANCE * directions, targets)[0]
 
 
-def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
+def derive_camera(spec: CameraSpec, backend: Backend, stated: bool = True) -> CameraModel:
     """Trace a prescription and work out frames, stop, apertures and first-order numbers.
 
+    Args:
+        spec: the prescription.
+        backend: where to trace.
+        stated: whether its focal length is held against the traced one; it is not while a file is made, whose focal
+            length follows from the trace.
+
     Raises:
-        InputError: the prescription does not bring the light of its field through the stop to the image.
+        InputError: the prescription does not bring the light of its field through the stop to the image, or has
+            another focal length than it states.
     """
     try:
-        return _derived(spec, backend)
+        return _derived(spec, backend, stated)
     except (AimError, BeamMissedError) as error:
         reason = str(error).partition(";")[0]
         problem = f"no light of the whole field comes through the stop to the image: {reason}"
@@ -283,17 +291,42 @@ def derive_camera(spec: CameraSpec, backend: Backend) -> CameraModel:
         raise spec.error(problem, ("mirrors",), allowed=allowed) from error
 
 
-def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
+def _focal_lengths(chief: RayMatrix) -> TracedFocalLengths:
+    """About a chief ray."""
+    power = np.linalg.svd(chief.direction_by_position[0], compute_uv=False)
+    with np.errstate(divide="ignore"):
+        return TracedFocalLengths(np.abs(np.diagonal(first_order(chief).scale[0])), 1.0 / power)
+
+
+def _traced_focal_lengths(spec: CameraSpec, backend: Backend) -> TracedFocalLengths:
+    """`_focal_lengths` of a prescription. Raises AimError, BeamMissedError."""
+    bare = _bare(spec, {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}, {})
+    return _focal_lengths(_chief(spec, backend, bare)[2])
+
+
+def _chief(spec: CameraSpec, backend: Backend, bare: Assembly) -> tuple[np.ndarray, SystemBatch, RayMatrix]:
+    """Launch point (1, 3) of the centre's chief ray, the way to the image, and what steps about that ray do."""
+    names = tuple(spec.mirrors)
+    stop = names.index(spec.stop)
+    centre = field_direction(spec, 0.0, 0.0)
+    launch = collimated(backend, assemble(bare, [names[: stop + 1]]), centre[None], np.zeros((1, 2)))[0]
+    imaging = assemble(bare, [(*names, IMAGE)])
+    axes = transverse_axes(centre[None], LINE_AXIS[None])
+    return launch, imaging, ray_matrix(backend, imaging, stop, launch, centre[None], axes)
+
+
+def _derived(spec: CameraSpec, backend: Backend, stated: bool) -> CameraModel:
     """What `derive_camera` says. Raises AimError, BeamMissedError."""
     surfaces = {name: surface_of(mirror) for name, mirror in spec.mirrors.items()}
     names = tuple(spec.mirrors)
-    stop = names.index(spec.stop)
     bare = _bare(spec, surfaces, {})
-    to_stop = assemble(bare, [names[: stop + 1]])
-    imaging = assemble(bare, [(*names, IMAGE)])
+    to_stop = assemble(bare, [names[: names.index(spec.stop) + 1]])
+    launch, imaging, matrix = _chief(spec, backend, bare)
+    chief = first_order(matrix)
+    if stated:
+        check_focal_length(spec, _focal_lengths(matrix), lambda other: _traced_focal_lengths(other, backend))
 
     centre = field_direction(spec, 0.0, 0.0)
-    launch = collimated(backend, to_stop, centre[None], np.zeros((1, 2)))[0]
     traced = trace(backend, imaging, make_rays(backend, launch, centre), keep=range(len(names)), world=True)
     assert traced.world is not None
     position, direction, _, valid = traced.numpy(traced.world)
@@ -309,8 +342,6 @@ def _derived(spec: CameraSpec, backend: Backend) -> CameraModel:
     normal = np.sign(sight[2]) * image_pose(spec).rotation[:, 2]
     focal_plane = Pose(np.stack([np.cross(LINE_AXIS, normal), LINE_AXIS, normal], axis=-1), image_centre)
 
-    axes = transverse_axes(centre[None], LINE_AXIS[None])
-    chief = first_order(ray_matrix(backend, imaging, stop, launch, centre[None], axes))
     stop_radius = 0.5 * spec.entrance_pupil * float(np.sqrt(abs(determinant(chief.entrance_magnification[0]))))
     apertures = _apertures(spec, backend, to_stop, imaging, stop_radius)
     focal_length = float(abs(chief.scale[0, 0, 0]))  # along the line, as the papers use it

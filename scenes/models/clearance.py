@@ -38,11 +38,14 @@ class Overlap:
     Attributes:
         first, second: their paths.
         depth: how far one of them has to move for them to touch only; negative for a gap below ``LEAST_GAP``; metres.
+        way: along which axis of the base, 0 to 2, and how far, metres with its sign, the second one is moved to leave
+            ``LEAST_GAP``: of the three axes the shortest way. None where nobody asked.
     """
 
     first: str
     second: str
     depth: float
+    way: tuple[int, float] | None = None
 
 
 def separation(first: np.ndarray, second: np.ndarray) -> float:
@@ -59,6 +62,28 @@ def separation(first: np.ndarray, second: np.ndarray) -> float:
     faces = difference.points[difference.simplices]
     nearest = trimesh.triangles.closest_point(faces, np.zeros((len(faces), 3)))
     return float(np.min(np.linalg.norm(nearest, axis=-1)))
+
+
+def way_apart(first: np.ndarray, second: np.ndarray, room: float = LEAST_GAP) -> tuple[int, float]:
+    """Shortest way along an axis that takes the convex hull of one set of points away from that of another.
+
+    Args:
+        first: (P, 3), metres.
+        second: of the body that is moved, (Q, 3), metres.
+        room: that is left at the end, metres.
+
+    Returns:
+        The axis, 0 to 2, and how far the second is moved along it, metres with its sign.
+    """
+    faces = ConvexHull((first[:, None] - second[None]).reshape(-1, 3)).equations
+    ways = []
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            slope = sign * faces[:, axis]
+            ahead = slope > PARALLEL
+            ways.append((float(np.min((room - faces[ahead, 3]) / slope[ahead])), axis, sign))
+    least, axis, sign = min(ways)
+    return axis, sign * least
 
 
 def convex_bodies(instrument: Instrument, placed: PlacedBodies | None = None) -> Mapping[str, np.ndarray]:
@@ -90,7 +115,11 @@ def find_overlaps(instrument: Instrument) -> tuple[Overlap, ...]:
     """All pairs of bodies that stand in each other or nearer than ``LEAST_GAP``, as designed; deepest first."""
     known = Clearances.of(instrument)
     found = [(*pair, gap) for pair, gap in zip(known.pairs, known.gaps, strict=True) if gap < LEAST_GAP]
-    return tuple(Overlap(known.paths[i], known.paths[j], -gap) for i, j, gap in sorted(found, key=lambda one: one[2]))
+    out = []
+    for i, j, gap in sorted(found, key=lambda one: one[2]):
+        first, second = (known.poses[k].apply(known.corners[k]) for k in (i, j))
+        out.append(Overlap(known.paths[i], known.paths[j], -gap, way_apart(first, second)))
+    return tuple(out)
 
 
 def _pairs(instrument: Instrument, bodies: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -182,7 +211,16 @@ def _issue(instrument: Instrument, overlap: Overlap) -> Issue:
     how = f"reaches {mm:.3g} mm into" if mm > 0.0 else f"is only {-1e3 * mm:.2g} um from"
     problem = f"{overlap.first} {how} {overlap.second}"
     allowed = f"{allowed} that leaves at least {1e6 * LEAST_GAP:.3g} um of room"
+    if overlap.way is not None:
+        axis, way = overlap.way
+        allowed += f": move it by {_move_text(axis, way if path == overlap.second else -way)} of the base"
     return instrument.spec.issue(problem, key, allowed=allowed)
+
+
+def _move_text(axis: int, way: float) -> str:
+    """A way in words, ``+x 135 mm``, rounded up so that it is far enough."""
+    digits = 10.0 ** (np.floor(np.log10(abs(1e3 * way))) - 2)
+    return f"{'+' if way > 0.0 else '-'}{'xyz'[axis]} {np.ceil(abs(1e3 * way) / digits) * digits:.3g} mm"
 
 
 def remedy(instrument: Instrument, path: str) -> tuple[KeyPath, str]:

@@ -130,6 +130,8 @@ class Vector:
             if row is None and self.alike:
                 self.of.parse(value)  # what is wrong with it is said once
                 row = [value] * self.length
+            if row is None and (comma := units.decimal_comma(value)) is not None:
+                raise comma
             value = row or value
         if isinstance(value, list | tuple) and len(value) == self.length:
             return value

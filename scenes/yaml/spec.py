@@ -31,8 +31,10 @@ from pydantic_core import CoreSchema, ErrorDetails, PydanticUndefined, core_sche
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
+from scenes.yaml.examples import allowed_at, written
 from scenes.yaml.input_file import file_beside, is_file, unusable
 from scenes.yaml.quantity import Terms
+from scenes.yaml.units import decimal_comma
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 
 Value = TypeVar("Value")
@@ -356,12 +358,15 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
     kind = detail["type"]
     if kind == "value_error" and isinstance(context.get("error"), Problem):
         cause: Problem = context["error"]
-        problem, found, allowed, suggestion = cause.problem, cause.found, cause.allowed, cause.suggestion
+        problem, found, suggestion = cause.problem, cause.found, cause.suggestion
+        named = _named(key)
+        allowed = allowed_at(_field_metadata(model, named), named, cause.allowed)
         key = (*key, *cause.within)
     elif kind == "missing":
         names = _fields(model, key[:-1])
         problem, found = f"{key[-1]!r} is missing", None
-        allowed = f"{key[-1]}: {_example(model, key)}" if _example(model, key) else names_text(names)
+        example = written(_field_metadata(model, key), key)
+        allowed = f"{key[-1]}: {example}" if example else names_text(names)
     elif kind == "extra_forbidden":
         names = _fields(model, key[:-1])
         problem, found, allowed = "unknown key", shown(key[-1]), names_text(names)
@@ -380,6 +385,8 @@ def _issue(model: type[Spec], detail: ErrorDetails, source: Source) -> Issue:
         problem, allowed = "outside the limits", f"{text} {context[name]:g}"
     elif kind in _SAID:
         problem, allowed = _SAID[kind]
+        if isinstance(value, str) and (comma := decimal_comma(value)) is not None:
+            problem, allowed = comma.problem, comma.allowed
     elif kind in ("too_short", "too_long"):
         problem, found = problem[0].lower() + problem[1:], None
     return Issue(problem, source.file, source.line(key), (*source.prefix, *key), found, allowed, suggestion)
@@ -393,11 +400,9 @@ def _fields(model: type[Spec], key: KeyPath) -> list[str]:
     return [name for item in _field_metadata(model, key) if isinstance(item, Terms) for name in item.of]
 
 
-def _example(model: type[Spec], key: KeyPath) -> str | None:
-    """How the value at `key` may be written, if it is a quantity."""
-    metadata = _field_metadata(model, key)
-    kinds = [item.kind for item in metadata if hasattr(item, "kind")]
-    return kinds[0].example if kinds else None
+def _named(key: KeyPath) -> KeyPath:
+    """The key up to its last name: without the place in a row."""
+    return _named(key[:-1]) if key and isinstance(key[-1], int) else key
 
 
 def _field_metadata(model: type[Spec], key: KeyPath) -> list[Any]:

@@ -23,6 +23,7 @@ _UNIT = rf"(?:1/)?{_NAME}(?:[*/]{_NAME}){{0,3}}"
 # 1/m^3.
 _QUANTITY = re.compile(rf"({_NUMBER})(?:\s+({_UNIT})|({_NAME}(?:[*/]{_NAME}){{0,3}}))")
 _BARE = re.compile(_NUMBER)
+_COMMA = re.compile(r"(?<![0-9.,])([-+]?[0-9]{1,30}),([0-9]{1,30})(?![0-9]*[.,])")
 _NOT_FINITE = re.compile(r"[-+]?\.?(nan|inf|infinity)\b.*", re.IGNORECASE | re.DOTALL)
 LONGEST_TEXT = 100
 OTHER_MINUS = tuple("\u2212\u2010\u2011\u2012\u2013\u2014\ufe63\uff0d")
@@ -50,7 +51,11 @@ class Kind:
     @property
     def allowed(self) -> str:
         """What may be written for it, for messages."""
-        return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{self.example}'"
+        return self.asked(self.example)
+
+    def asked(self, example: str) -> str:
+        """What may be written for it, with an example of one's own."""
+        return f"{self.name} with its unit ({names_text(self.units)}), e.g. '{example}'"
 
 
 ANGLE = Kind(
@@ -168,11 +173,24 @@ def parse_quantity(text: object, kind: Kind) -> float:
         raise foreign_minus(stripped)
     match = _QUANTITY.fullmatch(stripped) if len(stripped) <= LONGEST_TEXT else None
     if match is None:
+        if (comma := decimal_comma(stripped)) is not None:
+            raise comma
         raise Problem("not a number with a unit", shown(text), kind.allowed)
     value = _to_si(match[1], match[2] or match[3], kind)
     if not math.isfinite(value):
         raise Problem("not a finite number", shown(text), kind.allowed)
     return value
+
+
+def decimal_comma(text: str) -> Problem | None:
+    """What is wrong with a text whose numbers have a decimal comma, and how it is written; None for any other text."""
+    if len(text) > LONGEST_TEXT or not (found := _COMMA.findall(text)):
+        return None
+    point, without = _COMMA.sub(r"\1.\2", text), _COMMA.sub(r"\1\2", text)
+    if not all(_QUANTITY.fullmatch(one) or _BARE.fullmatch(one.split()[0]) for one in (point, without) if one):
+        return None
+    thousands = f", or {without} if thousands are meant" if all(len(digits) == 3 for _, digits in found) else ""
+    return Problem("a number with a decimal comma", shown(text), f"write {point}{thousands}")
 
 
 def foreign_minus(text: str) -> Problem:
@@ -182,10 +200,15 @@ def foreign_minus(text: str) -> Problem:
     return Problem(f"a number with the sign U+{ord(sign):04X} ({unicodedata.name(sign).lower()})", shown(text), remedy)
 
 
-def format_quantity(value: float, kind: Kind) -> str:
+def format_quantity(value: float, kind: Kind, within: float = 0.0) -> str:
     """Text for an SI value that `parse_quantity` reads back to exactly the same float.
 
     A unit that makes the number lie between 1 and 1000 is preferred, then one with few digits, then the earlier one.
+
+    Args:
+        value: SI.
+        kind: what it measures.
+        within: by how much the text may differ, SI: of a computed value what its rounding has left in the last digits.
 
     Raises:
         ValueError: not finite.
@@ -194,7 +217,7 @@ def format_quantity(value: float, kind: Kind) -> str:
         raise ValueError(f"{value} has no text")
     choices = []
     for unit in kind.writes or (kind.si,):
-        number = _shortest_number(value, unit, kind)
+        number = _shortest_number(value, unit, kind, within)
         if number is not None:
             handy = number == "0" or 1.0 <= abs(float(number)) < 1000.0
             choices.append((not handy, len(number.strip("-").replace(".", "")), f"{number} {unit}"))
@@ -250,8 +273,10 @@ def unit_ratio(unit: str, other: str) -> float:
         return float(one[0] / two[0])
 
 
-def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
-    """The shortest number that, in this unit, reads back to `value`; None if there is none of 17 digits."""
+def _shortest_number(value: float, unit: str, kind: Kind, within: float) -> str | None:
+    """The shortest number that, in this unit, reads back to `value`, or to within so much; None if there is none of 17
+    digits.
+    """
     with localcontext(prec=50):
         if value == 0.0 and unit not in _CELSIUS:
             return "-0" if math.copysign(1.0, value) < 0.0 else "0"
@@ -261,7 +286,7 @@ def _shortest_number(value: float, unit: str, kind: Kind) -> str | None:
             number = Decimal(f"{exact:.{digits}g}")
             plain = -5 <= number.adjusted() <= 6
             text = format(number, "f") if plain else format(number.normalize(), "e")
-            if _to_si(text, unit, kind) == value:
+            if abs(_to_si(text, unit, kind) - value) <= within:
                 return text
     return None
 

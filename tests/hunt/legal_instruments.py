@@ -7,8 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from optics.numerics.backend import load_backend
+from scenes.models.camera_model import derive_camera
+from scenes.specs.camera import CameraSpec
 from scenes.specs.load import DETECTORS, LIBRARY
-from scenes.yaml.yaml_file import dump_yaml, parse_yaml
+from scenes.yaml.errors import InputError
+from scenes.yaml.spec import validate
+from scenes.yaml.units import LENGTH, format_quantity
+from scenes.yaml.yaml_file import YamlFile, dump_yaml, parse_yaml
 from tests.robustness.tree_edits import editable, scaled, trees
 
 LARGEST = 0.5
@@ -30,7 +36,15 @@ class LegalInstrument:
     text: str
 
     def write(self, folder: Path) -> None:
-        """Its files, for jobs beside them."""
+        """Its files, for jobs beside them; the camera states the focal length that its surfaces have, or it would be
+        refused for that alone.
+        """
+        try:
+            spec = validate(CameraSpec, YamlFile("", self.camera, {}))
+            focal_length = derive_camera(spec, load_backend("llvm"), stated=False).line_focal_length
+            self.camera["focal_length"] = format_quantity(float(f"{focal_length:.3g}"), LENGTH)
+        except InputError:
+            pass  # that is told by whoever reads it
         for name in ("camera", "instrument", "detector"):
             (folder / f"{name}.yaml").write_text(dump_yaml(getattr(self, name)), "utf-8")
 

@@ -62,11 +62,15 @@ def _monitor(key: str, value: str) -> Extreme:
     return Extreme(((rf"\b{key}: [-\d.e+]+( \w+)?", f"{key}: {value}"),))
 
 
-def _mirror(mirror: str, key: str, factor: float) -> Extreme:
+def _mirror(mirror: str, key: str, factor: float, focal_length: str = "5.52 m") -> Extreme:
+    """A number of a mirror; ``focal_length``: that the file states, that of its surfaces where it is not to be refused
+    for another one.
+    """
     text = (LIBRARY / CAMERAS / "gf7.yaml").read_text("utf-8")
     found = re.search(rf"  {mirror}:\n(.*\n)*?    {key}: (-?[\d.]+)", text)
     assert found is not None
-    return Extreme(camera=((re.escape(f"{key}: {found[2]}"), f"{key}: {factor * float(found[2])!r}"),))
+    edits = ((re.escape(f"{key}: {found[2]}"), f"{key}: {factor * float(found[2])!r}"),)
+    return Extreme(camera=(*edits, (r"focal_length: 5\.52 m", f"focal_length: {focal_length}")))
 
 
 def _scaled(factor: float) -> Extreme:
@@ -101,8 +105,8 @@ INSTRUMENTS_BEYOND: Mapping[str, Extreme] = {
     "camera a thousand times as large": _scaled(1e3),
     "radius of M1 a thousandth": _mirror("M1", "radius", 1e-3),
     "radius of M1 a thousand times": _mirror("M1", "radius", 1e3),
-    "radius of M3 40 percent less": _mirror("M3", "radius", 0.6),
-    "conic of M1 a thousand times": _mirror("M1", "conic", 1e3),
+    "radius of M3 40 percent less": _mirror("M3", "radius", 0.6, "1.84 m"),
+    "conic of M1 a thousand times": _mirror("M1", "conic", 1e3, "3.12 m"),
     "conic of M2 a thousand times, turned": _mirror("M2", "conic", -1e3),
     "field of 1 arcsec": _monitor("field", "1 arcsec"),
     "field of 44 deg": _monitor("field", "44 deg"),

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import twin.render as command
 from optics.geometry.pose import rotation_matrix
 from scenes.models import obstruction
-from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, separation
+from scenes.models.clearance import LEAST_GAP, check_clearance, convex_bodies, find_overlaps, remedy, separation
 from scenes.models.instrument_builder import build_instrument
 from scenes.models.obstruction import RAYS, find_obstructions
 from scenes.specs.load import INSTRUMENTS, LIBRARY, load_camera, load_instrument
@@ -148,6 +148,31 @@ def test_depth_of_an_overlap(bare, tmp_path) -> None:
     """The rhomboid's half height is 33 mm, its exit face square to the beam, as the facet: 30 mm leave 3 mm."""
     found = find_overlaps(bare(tmp_path, ("distance: 0.5 m", "distance: 30 mm")))
     assert [o.depth for o in found] == pytest.approx([3e-3] * 4, abs=1e-7)  # the facet leans some 10 urad
+
+
+MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
+
+
+def test_what_is_told_takes_bodies_apart(bare, tmp_path) -> None:
+    """A message says how far and along which axis the body that its key moves goes; moved so, it is free."""
+    for change, _, _ in OVERLAPS:
+        model = bare(tmp_path, change)
+        bodies = convex_bodies(model)
+        with pytest.raises(InputError) as caught:
+            check_clearance(model)
+        for overlap, issue in zip(find_overlaps(model), caught.value.issues, strict=True):
+            told = MOVE.search(issue.allowed)
+            assert told is not None, issue.allowed
+            way = np.zeros(3)
+            way["xyz".index(told[2])] = float(f"{told[1]}{told[3]}e-3")
+            # the issue's body is the one whose key is told
+            keys = {path: remedy(model, path)[0] for path in (overlap.first, overlap.second)}
+            moved = overlap.second if keys[overlap.second] == issue.key else overlap.first
+            other = overlap.first if moved == overlap.second else overlap.second
+            gap = separation(bodies[moved] + way, bodies[other])
+            assert gap >= LEAST_GAP * (1.0 - 1e-6)
+            # 2 % less and they still touch: it is no further than it has to be
+            assert separation(bodies[moved] + 0.98 * way, bodies[other]) < LEAST_GAP
 
 
 def test_a_gap_below_the_least(bare, tmp_path) -> None:

@@ -167,3 +167,26 @@ def test_a_minus_that_is_none_is_named(sign: str) -> None:
         parse_quantity(f"{sign} 3 um", LENGTH)
     assert caught.value.allowed is not None
     assert caught.value.allowed.endswith(": -3 um")
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "write"),
+    [
+        ("3,5 um", LENGTH, "write 3.5 um"),
+        ("-0,25um", LENGTH, "write -0.25um"),
+        ("1,5e-3 1/m^3", PER_LENGTH3, "write 1.5e-3 1/m^3"),
+        ("1,500 m", LENGTH, "write 1.500 m, or 1500 m if thousands are meant"),
+        ("3,5", LENGTH, "write 3.5"),
+    ],
+)
+def test_a_decimal_comma_is_told(text: str, kind: Kind, write: str) -> None:
+    with pytest.raises(Problem, match="a number with a decimal comma") as caught:
+        parse_quantity(text, kind)
+    assert caught.value.allowed == write
+
+
+@pytest.mark.parametrize("text", ["1,2,3 um", "M1,2", "a,b", "," + "1" * 200])
+def test_no_decimal_comma_is_seen_elsewhere(text: str) -> None:
+    with pytest.raises(Problem) as caught:
+        parse_quantity(text, LENGTH)
+    assert "decimal comma" not in str(caught.value)

@@ -140,7 +140,7 @@ class Page:
 
     def number(self, knob: str) -> Any:
         """The number beside it."""
-        return self.page.locator(f'#tree .knob[data-knob="{knob}"] > input[type=number]')
+        return self.page.locator(f'#tree .knob[data-knob="{knob}"] > input.number')
 
     def drag(self, knob: str, by: float, steps: int = 12) -> None:
         """Drag a slider's handle by pixels, as a hand does."""

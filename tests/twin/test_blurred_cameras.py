@@ -36,11 +36,12 @@ M2 = "z: -2.01593047747168 m"
 EXAMPLES = {"lab focus": "focus", "lab distortion": "distortion", "orbit monitor": "monitor"}
 
 
-def gf7_with(tmp_path: Path, z: str, name: str = "gf7_moved") -> Path:
-    """A copy of gf7 with M2 elsewhere."""
+def gf7_with(tmp_path: Path, z: str, name: str = "gf7_moved", focal_length: str = "5.52 m") -> Path:
+    """A copy of gf7 with M2 elsewhere; ``focal_length``: that it states."""
     assert M2 in GF7
     file = tmp_path / f"{name}.yaml"
-    file.write_text(GF7.replace(M2, f"z: {z}"), "utf-8")
+    stated = GF7.replace("focal_length: 5.52 m", f"focal_length: {focal_length}")
+    file.write_text(stated.replace(M2, f"z: {z}"), "utf-8")
     return file
 
 
@@ -93,7 +94,7 @@ def test_a_blurred_camera(backend, tmp_path, z: str, waves: float, left: float, 
 
 def test_a_camera_without_a_focus(backend, tmp_path) -> None:
     """M2 0.7 m too far: the light diverges after M3, and no place of the image helps."""
-    (text,) = blur_warnings(with_camera(load_camera(gf7_with(tmp_path, "-2.70 m"))), backend)
+    (text,) = blur_warnings(with_camera(load_camera(gf7_with(tmp_path, "-2.70 m", focal_length="12.3 m"))), backend)
     assert re.search(r"blurred as designed: 478 waves rms .* refocusing cannot help: its light has no focus", text)
 
 

@@ -15,7 +15,7 @@ from scenes.models.camera_sharpness import FocalPlane, sharpness
 from scenes.specs.camera import CameraSpec
 from scenes.specs.load import LIBRARY, load_camera
 from scenes.specs.resolved import resolve_camera
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
 from tests.twin.commands import files, invoke
@@ -68,7 +68,7 @@ def test_first_order_data_by_hand(gf7, gf7_alone) -> None:
     exit_pupil = abs(data.exit_pupil_distance) / told["working_f_number"]
     assert told["exit_pupil_m"] == pytest.approx(exit_pupil, rel=1e-9)
     assert data.chief_ray_angle[0] < data.chief_ray_angle[1] < 1e-3  # nearly telecentric
-    assert dict(data.obscuration) == {}
+    assert dict(data.obscuration.shares) == dict(data.obscuration.holes) == {}
 
 
 def test_the_entrance_pupil_is_where_chief_rays_cross(backend, gf7, gf7_alone) -> None:
@@ -89,7 +89,7 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     file = tmp_path / "low.yaml"
     file.write_text(GF7.replace("field_bias: 6 deg", "field_bias: 1.5 deg"), "utf-8")
     model = derive_camera(load_camera(file), backend)
-    shares = obscuration(model, backend)
+    shares = obscuration(model, backend).shares
     # M2 as a flat disk at its vertex, its sag is some millimetres; worst at the field whose image is nearest to it
     nodes = quadrature.disk(20)
     points = ray_paths(model, backend, [(0.0, -1.0)], np.stack([nodes.x, nodes.y], axis=-1), 6.0).points[:, 0]
@@ -103,6 +103,48 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     taken = float(met @ nodes.share)
     assert 0.1 < taken < 0.9
     assert shares["M2"] == pytest.approx(taken, abs=0.05)  # 144 rays tell shares to some percent
+
+
+CASSEGRAIN = """
+name: cassegrain
+focal_length: 4 m
+entrance_pupil: 500 mm
+field_bias: 0 deg
+field: {x: 0.2 deg, y: 0.2 deg}
+wavelength: 650 nm
+stop: M1
+mirrors:
+  M1: {z: 0 m, radius: -2 m, conic: -1}
+  M2: {z: -0.7 m, radius: -0.8 m, conic: -2.77777777777778}
+image: {z: 0.5 m}
+line: {pixels: 2000, pitch: 7 um}
+"""
+
+
+def test_a_mirror_that_light_goes_through_has_a_hole_there(backend, tmp_path) -> None:
+    """The first mirror of a telescope about its axis does not take all of its light."""
+    file = tmp_path / "cassegrain.yaml"
+    file.write_text(CASSEGRAIN, "utf-8")
+    data = first_order_data(CameraOptics.alone(derive_camera(load_camera(file), backend), backend))
+    # by similar triangles: 0.5 m before the image at F/8, and chief rays that come from M2's vertex 0.7 m before M1
+    slope, half = 0.25 / 4.0, 4.0 * np.tan(np.hypot(1.0, 1.0) * np.deg2rad(0.2))
+    assert dict(data.obscuration.holes) == {"M1": pytest.approx(0.5 * slope + half * 0.7 / 1.2, rel=0.1)}
+    told = FIRST_ORDER(data)
+    # M2 is 77 mm and its edge in radius: some 9 % of the beam, and the line's edge nothing more
+    assert list(told["obscuration"]) == ["M2"]
+    assert 0.07 < told["obscuration"]["M2"] < 0.15
+    assert told["hole_radius_mm"]["M1"] == pytest.approx(1e3 * data.obscuration.holes["M1"])
+    # with a hole of that size stated there is nothing to be told
+    stated = CASSEGRAIN.replace("conic: -1}", "conic: -1, edges: [{blocks: circle, radius: 60 mm}]}")
+    file.write_text(stated, "utf-8")
+    holed = obscuration(derive_camera(load_camera(file), backend), backend)
+    assert dict(holed.holes) == {}
+    assert list(holed.shares) == ["M2"]
+    # light that goes through where the mirror is used is lost, hole or not
+    file.write_text(CASSEGRAIN.replace("y: 0.2 deg", "y: 2.5 deg"))
+    wide = obscuration(derive_camera(load_camera(file), backend), backend)
+    assert wide.shares["M1"] > 0.9
+    assert dict(wide.holes) == {}
 
 
 def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
@@ -286,8 +328,9 @@ def test_files_that_it_takes(tmp_path) -> None:
         (("gf7_pair",), "gf7_pair: which of its cameras is meant is not said; allowed: --camera forward"),
         (("gf7_pair", "--camera", "foreward"), "no such camera; did you mean 'forward'\\? Found 'foreward'"),
         (("gf7", "--camera", "backward"), "gf7: --camera backward: the file holds one camera, gf7"),
-        (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus tilt"),
-        (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus tilt"),
+        (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus --tilt"),
+        (("gf7", "--tilt"), "--tilt goes with --refocus"),
+        (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus --tilt"),
         (("scenes/examples/perturb.yaml",), "perturb.yaml:1: there is no camera's prescription in this file"),
         (("nowhere.yaml",), "nowhere.yaml: no such file"),
     ],
@@ -300,10 +343,36 @@ def test_what_it_refuses(tmp_path, words: tuple[str, ...], message: str) -> None
 
 
 def test_a_camera_without_a_focus_cannot_be_refocused(tmp_path, backend) -> None:
-    file = gf7_with(tmp_path, "-2.70 m")
+    file = gf7_with(tmp_path, "-2.70 m", focal_length="12.3 m")
     result = invoke(app, file, "--refocus", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert re.search(r"gf7_moved.yaml:\d+: mirrors: refocusing cannot help", "".join(result.stderr.split("\n")))
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="no focus after M3"):
         run_camera(resolve_camera(Path(file)), backend, refocus=True)
+
+
+@pytest.mark.parametrize(
+    ("words", "turned", "noted"),
+    [
+        (("--refocus",), False, False),
+        (("--refocus", "--tilt"), True, False),
+        (("--refocus", "tilt"), True, True),
+    ],
+)
+def test_tilt_is_an_option(tmp_path, monkeypatch, words, turned, noted) -> None:
+    """The word of earlier versions is read, and told how it is written."""
+    asked = []
+
+    def run(setup, backend, refocus, tilt, advance):
+        asked.append((refocus, tilt))
+        raise InputError(Issue("enough"))
+
+    monkeypatch.setattr("twin.camera.camera_run.run_camera", run)
+    done = invoke(app, "gf7", *words, "--out", str(tmp_path / "run"))
+    assert asked == [(True, turned)]
+    assert ("is written --refocus --tilt" in done.stderr) == noted
+    shown = invoke(app, "--help").stdout
+    assert "--tilt" in shown
+    assert "[tilt]" not in shown
+    assert "[what]" not in shown

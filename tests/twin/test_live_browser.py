@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -93,6 +94,7 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     assert value > 1.0
     run = render_job(resolve(job_of(page, tmp_path)), backend)
     assert run.resolved.job.perturb[M2].shift[2] == pytest.approx(1e-6 * value, rel=1e-12)
+    page.page.select_option("#crop", "whole")
     told = page.page.evaluate("liveTwin.last")
     assert told["readings"] == json.loads(json.dumps(stated(run.recovered_dict())))
     assert told["truth"] == json.loads(json.dumps(run.truth_dict()))
@@ -109,6 +111,79 @@ def test_dragging_the_despace_moves_the_spots_as_twin_render_does(page, backend,
     distance = np.linalg.norm(np.subtract(moved, at_rest))
     # the factor is shown with two digits; the view is in single precision
     assert distance == pytest.approx(1e-6 * value * factor, rel=0.06)
+
+
+def test_a_filter_opens_what_fits_and_the_way_there(page):
+    """M2 shows the knobs of both M2, not those of the bodies that carry them; an empty filter folds all as before."""
+    shown = """[...document.querySelectorAll('#tree .knob')].filter((one) => one.checkVisibility())
+        .map((one) => one.dataset.knob.split(' ')[0])"""
+    page.page.evaluate("document.querySelectorAll('#tree details').forEach((one) => { one.open = false; })")
+    page.page.fill("#filter", "m2")
+    page.page.wait_for_timeout(100)
+    assert set(page.page.evaluate(shown)) == {M2, "base/backward/M2"}
+    page.page.fill("#filter", "back m2")
+    page.page.wait_for_timeout(100)
+    assert set(page.page.evaluate(shown)) == {"base/backward/M2"}
+    page.page.fill("#filter", "central")
+    page.page.wait_for_timeout(100)
+    assert set(page.page.evaluate(shown)) == {"base/central_prism"}
+    page.page.fill("#filter", "")
+    page.page.wait_for_timeout(100)
+    assert page.page.evaluate(shown) == []
+
+
+@pytest.mark.parametrize(("typed", "value"), [("3,5", 3.5), ("3.5", 3.5), ("\N{MINUS SIGN}0,25", -0.25), ("1e-1", 0.1)])
+def test_a_typed_number_has_a_point_or_a_comma(page, typed, value):
+    field = page.number(DESPACE)
+    field.press("Control+a")
+    field.type(typed)
+    field.press("Enter")
+    page.still()
+    assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == value
+    field.press("ArrowUp")
+    step = page.page.evaluate(f"liveTwin.knobs.rows.get('{DESPACE}')[0].step")
+    assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == pytest.approx(value + step)
+
+
+def test_what_is_no_number_is_marked_and_not_taken(page):
+    field = page.number(DESPACE)
+    field.fill("2")
+    for typed in ("1.234,5", "2 um", "two", ""):
+        field.fill(typed)
+        assert field.get_attribute("aria-invalid") == "true"
+        assert page.page.evaluate(f"liveTwin.knobs.knobs['{DESPACE}']") == 2
+    page.page.fill("#frames", "3,5")
+    assert page.page.get_attribute("#frames", "aria-invalid") == "true"
+
+
+def test_spots_are_shown_near_and_fill_their_picture(page):
+    """A picture shows the spot, not a CCD with a point of light in it; crosses leave its light free."""
+    assert page.page.input_value("#crop") == "spot"
+    grey = canvas(page, "forward/left")
+    assert grey.shape[0] <= 32
+    assert np.count_nonzero(grey > 25) > 0.03 * grey.size
+
+
+def test_wide_tables_show_that_they_scroll(browser, command):
+    """At the width of a phone a shadow lies at the edge behind which there is more; scrolled there it is gone."""
+    page = Page(browser, command.address, 390, 844)
+    page.ready()
+    table = page.page.locator(".wide").first
+    table.scroll_into_view_if_needed()
+    assert table.evaluate("(one) => one.scrollWidth > one.clientWidth + 20")
+
+    def edge(side: int) -> float:
+        box = table.bounding_box()
+        x = box["x"] + (1 if side < 0 else box["width"] - 4)
+        clip = {"x": x, "y": box["y"] + 40, "width": 3, "height": box["height"] - 60}
+        place = np.frombuffer(page.page.screenshot(clip=clip), np.uint8)
+        return float(np.median(cv2.imdecode(place, cv2.IMREAD_GRAYSCALE)))
+
+    assert edge(1) < 225.0 < 245.0 < edge(-1)
+    table.evaluate("(one) => { one.scrollLeft = one.scrollWidth; }")
+    page.page.wait_for_timeout(200)
+    assert edge(-1) < 225.0 < 240.0 < edge(1)
+    page.close()
 
 
 def test_the_view_in_three_dimensions_does_not_hold_up_a_drag(page):
@@ -362,7 +437,7 @@ def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
         page.ready()
         plan = Plan.of(resolve_study(tmp_path / "study" / "config.yaml"))
         for column in plan.columns:
-            row = page.page.locator("#factors .knob", has_text=column.name).locator("input[type=number]").first
+            row = page.page.locator("#factors .knob", has_text=column.name).locator("input.number").first
             assert float(row.input_value()) == pytest.approx(float(column.values[1234]))
         assert page.page.inner_text("#opened") == "study, run 1234"
         assert "run 1234 of the study study_aperture" in page.page.get_attribute("#opened", "title")
@@ -371,11 +446,11 @@ def test_a_run_folder_and_a_study_are_opened(browser, tmp_path):
     with running("scenes/examples/study_aperture.yaml", "--port", "0") as command:
         page = Page(browser, command.address)
         page.ready()
-        row = page.page.locator("#factors .knob", has_text="turn").locator("input[type=number]").first
+        row = page.page.locator("#factors .knob", has_text="turn").locator("input.number").first
         row.fill("4")
         page.still()
         assert page.page.evaluate(f"liveTwin.knobs.knobs['{TURN}']") == 4.0
-        aperture = page.page.locator("#factors .knob", has_text="aperture").locator("input[type=number]").first
+        aperture = page.page.locator("#factors .knob", has_text="aperture").locator("input.number").first
         sigma = "liveTwin.last.readings.cameras.forward.model.d_f_um_sigma_noise"
         before = page.page.evaluate(sigma)
         aperture.fill("30")

@@ -17,6 +17,8 @@ from twin.run.page import FIGURES, RunFacts, _template, checksum, inline, page_p
 from twin.run.report import Report, Section
 from twin.run.svg import look, new_figure, to_svg
 
+ROOMS = Path(__file__).parents[2] / "twin"
+
 ROOT = Path(__file__).resolve().parents[2]
 TEMPLATES = sorted(path for path in (ROOT / "twin").rglob("*.html.j2"))
 EVIL = (
@@ -121,6 +123,17 @@ def test_the_style_of_every_page_is_the_sheet():
     assert style is not None
     assert style[1].strip() == "{% include 'sheet.css' %}"
     assert {path.name for path in TEMPLATES} == {"page.html.j2", "artefact.html.j2"}
+
+
+def test_reports_and_the_live_page_have_one_rule_for_what_scrolls():
+    server = pytest.importorskip("twin.live.server", reason="the extra `live` is not installed")
+    rules = (ROOMS / "run" / "scroll.css").read_text("utf-8")
+    assert ".wide" in rules
+    assert rules.strip() in page_of("plain")
+    live = ROOMS / "live" / "page"
+    assert server.PARTS["scroll.css"].read_text("utf-8") == rules
+    assert '<link rel="stylesheet" href="scroll.css">' in (live / "index.html").read_text("utf-8")
+    assert ".wide" not in (live / "live.css").read_text("utf-8").replace("#spots, .wide, #strip", "")
 
 
 @pytest.mark.parametrize("evil", EVIL)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -369,6 +370,25 @@ def test_bad_measurement_files(images, tmp_path, text, told):
         assert part in result.stderr
     assert not (tmp_path / "out").exists()
     assert "Traceback" not in result.stderr
+
+
+def test_a_missing_file_is_missing_though_there_is_a_picture_of_it(images, tmp_path):
+    """The preview beside the frames holds eight bits of a stretched mean; a PNG with 16 bits is frames."""
+    folder = tmp_path / "images"
+    shutil.copytree(images, folder)
+    for file in folder.glob("forward_left_after.*"):
+        file.unlink()
+    cv2.imwrite(str(folder / "forward_left_after.png"), np.full((32, 32), 7, np.uint8))
+    (tmp_path / "measurement.yaml").write_text(HEAD + "frames: images\n")
+    with pytest.raises(InputError) as caught:
+        resolve_measurement(tmp_path / "measurement.yaml")
+    told = str(caught.value)
+    assert "no frames of forward/left after" in told
+    assert "forward_left_after.png is a picture with 8 bits" in told
+    assert "forward_left_after.tiff" in told
+    cv2.imwrite(str(folder / "forward_left_after.png"), np.full((32, 32), 7, np.uint16))
+    setup = resolve_measurement(tmp_path / "measurement.yaml")
+    assert setup.test.frames["forward/left"].after[0][0].endswith("forward_left_after.png")
 
 
 def test_a_job_is_told_from_a_measurement(images, tmp_path):

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, parse_yaml
 from twin.main_job.monitor_reading import stated
 from twin.monitor.truth import trace_truth
+from twin.study import scripted
+from twin.study.progress_bar import tell_all, tell_through
 from twin.study.runs.setup import study_from_text
 from twin.study.scripted import config_text
 
@@ -316,6 +319,48 @@ def test_a_wrong_range_is_explained(pair: twin.InstrumentTwin, vary: dict, says:
         config_text(pair, vary, 10, 0, "sobol")
 
 
+TELLS = (
+    "import os, sys, time\n"
+    "assert sys.argv[-2] == '--progress-fd'\n"
+    "for k in range(3): os.write(int(sys.argv[-1]), f'{k + 1} 3\\n'.encode())\n"
+)
+
+
+def test_a_study_tells_how_far_it_is() -> None:
+    """To a function of the caller's, to nobody, and a failure's words where they are not shown."""
+    command, told = [sys.executable, "-c", TELLS], []
+    assert scripted._run(command, False, lambda done, runs: told.append((done, runs))) == (0, "")
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert scripted._run(command, False, True) == (0, "")
+    silent = [sys.executable, "-c", "import sys\nassert '--progress-fd' not in sys.argv\nsys.exit('no light')"]
+    assert scripted._run(silent, True, True) == (1, "no light\n")
+
+
+def test_a_function_that_is_told_may_break_off_the_study() -> None:
+    """Its error comes out, and the study's process does not go on."""
+
+    def enough(done: int, runs: int) -> None:
+        raise RuntimeError("enough")
+
+    begun = time.monotonic()
+    with pytest.raises(RuntimeError, match="enough"):
+        scripted._run([sys.executable, "-c", f"{TELLS}time.sleep(60)\n"], True, enough)
+    assert time.monotonic() - begun < 30.0
+
+
+def test_the_command_tells_a_pipe() -> None:
+    reading, writing = os.pipe()
+    told = tell_through(writing)
+    assert not os.get_inheritable(writing)
+    told(1, 2)
+    told(2, 2)
+    os.close(writing)
+    found = []
+    with os.fdopen(reading) as lines:
+        tell_all(lines, lambda done, runs: found.append((done, runs)))
+    assert found == [(1, 2), (2, 2)]
+
+
 @pytest.mark.slow
 def test_a_study_runs_from_a_script_without_a_guard(tmp_path: Path) -> None:
     """Its workers do not run the script again, and the first run is what rendering its values gives."""
@@ -324,7 +369,10 @@ def test_a_study_runs_from_a_script_without_a_guard(tmp_path: Path) -> None:
         "import twin\n"
         "print('once')\n"
         "pair = twin.load('gf7_pair')\n"
-        "found = twin.study(pair, {'base/forward/M2': {'shift': '0 0 (-5 .. 5) um'}}, n=4, quiet=True)\n"
+        "told = []\n"
+        "found = twin.study(pair, {'base/forward/M2': {'shift': '0 0 (-5 .. 5) um'}}, n=4, quiet=True,\n"
+        "                   progress=lambda done, runs: told.append((done, runs)))\n"
+        "assert told[-1] == (4, 4), told\n"
         f"found.to_netcdf({str(tmp_path / 'found.nc')!r}, engine='h5netcdf')\n"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(twin.__file__).parent.parent)}

@@ -32,7 +32,7 @@ def main(
             help="Camera, instrument or job: a name of the library (gf7), a YAML file, or the config.yaml of a run.",
         ),
     ],
-    what: Annotated[str | None, typer.Argument(metavar="[tilt]", help="With --refocus: turn the image, too.")] = None,
+    what: Annotated[str | None, typer.Argument(hidden=True, metavar="")] = None,
     camera: Annotated[str | None, typer.Option("--camera", help="Which camera, where there are several.")] = None,
     refocus: Annotated[
         bool, typer.Option("--refocus", help="Find the best image plane first; writes the camera's file with it.")
@@ -44,6 +44,7 @@ def main(
     temperature: Annotated[
         str | None, typer.Option("--temperature", metavar="TEXT", help='Warm all of it, "+2 K".')
     ] = None,
+    tilt: Annotated[bool, typer.Option("--tilt", help="With --refocus: turn the image about the line, too.")] = False,
     out: Out = None,
     backend: BackendName = "llvm",
     force: Force = False,
@@ -63,7 +64,7 @@ def main(
         python -m twin.camera my_camera.yaml --perturb "M2 shift z 20 um" --perturb "M2 rotate x 3 arcsec"
 
     With --refocus the image plane is moved to the least mean square wavefront error over the field, with
-    `--refocus tilt` turned about the line as well. The camera's file with that plane, comments kept, is in artefacts/
+    `--refocus --tilt` turned about the line as well. The camera's file with that plane, comments kept, is in artefacts/
     and can be used as it is.
 
     With --perturb and --temperature, and of a job, the camera is looked at in that state, and the first paragraph says
@@ -74,10 +75,15 @@ def main(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
+    turned = tilt or what is not None  # what stood there in earlier versions
 
     def resolve() -> CameraSetup:
         if what is not None and (what != TILT or not refocus):
-            raise InputErrorText(f"{what!r} has no meaning here; there is --refocus {TILT}")
+            raise InputErrorText(f"{what!r} has no meaning here; there is --refocus --{TILT}")
+        if tilt and not refocus:
+            raise InputErrorText(f"--{TILT} goes with --refocus")
+        if what is not None:
+            typer.echo(f"--refocus {TILT} is written --refocus --{TILT}; this version still reads it", err=True)
         warmed = [] if temperature is None else [f"{BASE} temperature {temperature}"]
         return resolve_camera(file, camera).perturbed([*(perturb or ()), *warmed])
 
@@ -87,11 +93,11 @@ def main(
         from twin.camera.camera_run import CAMERA, camera_data, run_camera
         from twin.run.data_files import netcdf
 
-        run = run_camera(setup, session.backend, refocus, what == TILT, session.advance)
+        run = run_camera(setup, session.backend, refocus, turned, session.advance)
         # what a refocused camera's file lacked has been done; how good it is now its verdict says
         warnings = () if refocus else blur_warnings(setup, session.backend)
         session.folder.write_bytes("optics.nc", netcdf(camera_data(run)))
-        options = (*((what,) if what else ()), *(("--refocus",) if refocus else ()))
+        options = (*(("--refocus",) if refocus else ()), *((f"--{TILT}",) if turned else ()))
         again = (PROGRAM, "config.yaml", *options, "--backend", session.backend.name)
         shown, config = camera_report(run, warnings), setup.to_yaml()
         return finished(session, KIND, shown, CAMERA(run), config=config, program=PROGRAM, again=again)

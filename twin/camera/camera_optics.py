@@ -19,6 +19,7 @@ from typing import Self
 import numpy as np
 import xarray as xr
 
+from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
@@ -65,6 +66,7 @@ INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
 
+@shows("field", "rms [waves]", "peak_to_valley [waves]", "strehl", "vignetted [percent]", "map [waves]")
 @dataclass(frozen=True, eq=False)
 class Wavefront:
     """Wavefront error at one field.
@@ -133,6 +135,7 @@ class Wavefront:
         )
 
 
+@shows("field", "rms [um]", "farthest [um]", "airy [um]", "rays [um]")
 @dataclass(frozen=True, eq=False)
 class Spot:
     """Where the rays of one field meet the line CCD.
@@ -166,6 +169,7 @@ class Spot:
         return xr.Dataset(data, attrs={**told, "rms_m": self.rms, "airy_m": self.airy})
 
 
+@shows("field", "at_nyquist", "nyquist [cycles/mm]", "frequency [cycles/mm]", "wavelengths [nm]")
 @dataclass(frozen=True, eq=False)
 class Mtf:
     """Modulation transfer at one field, of the optics alone.
@@ -186,6 +190,12 @@ class Mtf:
     wavelengths: np.ndarray
     nyquist: float
 
+    @property
+    def at_nyquist(self) -> np.ndarray:
+        """Along the line and along the track at the pixels' Nyquist frequency, (2,); NaN beyond the table."""
+        ends = {"left": np.nan, "right": np.nan}
+        return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
+
     def at(self, frequency: float) -> np.ndarray:
         """Along the line and along the track at a frequency among the table's, cycles/m, (2,)."""
         return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
@@ -202,6 +212,7 @@ class Mtf:
         )
 
 
+@shows("model.spec.name", "model.mirrors", "model.line_focal_length [m]", "model.spec.entrance_pupil [mm]", "state")
 @dataclass(frozen=True, eq=False)
 class CameraOptics:
     """One camera in one state, ready to be looked at.

@@ -14,6 +14,7 @@ from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verdict
 from twin.camera.first_order_data import FIRST_ORDER
+from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, one_sentence
 from twin.run.svg import look, to_svg
@@ -111,6 +112,9 @@ def first_order_table(run: CameraRun) -> Table:
         ("obscuration by its own parts",
          ", ".join(f"{b} {100 * s:.2f}%" for b, s in n["obscuration"].items()) or "none"),
     ]  # fmt: skip
+    if n["hole_radius_mm"]:
+        holes = ", ".join(f"{b} a hole of {r:.1f} mm radius or more" for b, r in n["hole_radius_mm"].items())
+        rows.append(("light goes through", f"{holes} (the file states none: edges: [{{blocks: circle, radius: ...}}])"))
     caption = f"In the middle of the field, at {1e9 * run.camera.wavelength:.0f} nm, unless it says otherwise."
     return Table("first-order", "First-order data", caption, ("quantity", "value"), rows)
 
@@ -126,7 +130,7 @@ def _layout(run: CameraRun) -> Section:
     caption = (
         "To one scale, in the prescription's frame; mirrors with their clear apertures, dash-dotted the parent axis."
     )
-    figure = _figure("layout", "Layout with rays", caption, plots.layout_figure, model, backend)
+    figure = _figure("layout", "Layout with rays", caption, layout_figure, model, backend)
     return Section("Layout", (), (figure,))
 
 

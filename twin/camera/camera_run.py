@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 
 from analysis.monitor import parameters
+from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
@@ -56,6 +57,7 @@ QUALITY_FIELDS = (-1.0, 0.0, 1.0)
 """Shares of half the line at which bodies of an instrument are looked for in the beam."""
 
 
+@shows("errors_before [waves]", "errors_after [waves]", "tilt")
 @dataclass(frozen=True, eq=False)
 class Refocus:
     """A focal plane found anew.
@@ -112,6 +114,7 @@ def _short(value: Any) -> str:
     return f"({', '.join(map(str, value))})" if isinstance(value, list) else str(value)
 
 
+@shows("camera.name", "errors [waves]", "worst")
 @dataclass(frozen=True, eq=False)
 class CameraRun:
     """A judged camera.

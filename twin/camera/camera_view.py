@@ -12,6 +12,7 @@ Of a job's perturbed instrument it is made by
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from html import escape
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
-from twin.run.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes
+from twin.run.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION
 """Colours of the direction along the line, and along the track."""
@@ -83,12 +84,26 @@ def draw_mtf(axes: Axes, mtf: Mtf, label: bool = True) -> None:
     plain_axes(axes)
 
 
+class Pictured:
+    """What a notebook shows as its words and its figure."""
+
+    def plot(self) -> Figure:
+        """The figure."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        figure = self.plot()
+        # an svg has no size of its own here, and would be as wide as the notebook
+        width = f"{figure.get_figwidth():.1f}in"
+        return f'<p>{escape(repr(self))}</p><div style="max-width: {width}">{to_svg(figure)}</div>'
+
+
 SIZE = (4.6, 4.0)
 """Width and height of a picture, inches."""
 
 
-@dataclass(frozen=True, eq=False)
-class WavefrontView(Wavefront):
+@dataclass(frozen=True, eq=False, repr=False)
+class WavefrontView(Wavefront, Pictured):
     """A wavefront error that can be drawn."""
 
     def plot(self) -> Figure:
@@ -104,8 +119,8 @@ class WavefrontView(Wavefront):
         return figure
 
 
-@dataclass(frozen=True, eq=False)
-class SpotView(Spot):
+@dataclass(frozen=True, eq=False, repr=False)
+class SpotView(Spot, Pictured):
     """A spot that can be drawn."""
 
     def plot(self) -> Figure:
@@ -120,8 +135,8 @@ class SpotView(Spot):
         return figure
 
 
-@dataclass(frozen=True, eq=False)
-class MtfView(Mtf):
+@dataclass(frozen=True, eq=False, repr=False)
+class MtfView(Mtf, Pictured):
     """An MTF that can be drawn."""
 
     def plot(self) -> Figure:
@@ -135,8 +150,16 @@ class MtfView(Mtf):
         return figure
 
 
-class CameraView(CameraOptics):
+class CameraView(CameraOptics, Pictured):
     """``CameraOptics`` of which wavefront, spot and MTF have ``plot()``; made by ``alone`` or ``within``, as that."""
+
+    def plot(self) -> Figure:
+        """The layout as designed with rays of three fields, in the plane of symmetry and from above."""
+        # it draws with what the reports draw with
+        from twin.camera.layout_plot import layout_figure
+
+        with look("layout"):
+            return layout_figure(self.model, self.path.backend)
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = 129) -> WavefrontView:
         """Wavefront error at a field (shares of the half field along the line, along the track); ``points`` of its map

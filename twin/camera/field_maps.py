@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.orientation.distortion_model import principal_distance, principal_distance_and_point
+from analysis.short_repr import shows
 from optics.numerics.backend import Backend
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
@@ -25,6 +26,7 @@ FOCUS_DEPTHS = 3.0
 """Reach through focus, in depths of focus lambda F^2 * 2."""
 
 
+@shows("distance [m]", "rms [um]", "largest [um]", "line_distance [m]", "line_largest [um]")
 @dataclass(frozen=True, eq=False)
 class Distortion:
     """Where the camera images directions, against the nearest perfect camera.
@@ -127,6 +129,7 @@ def distortion(optics: CameraOptics) -> Distortion:
     )
 
 
+@shows("share", "focus [um]", "illumination", "vignetted", "mtf")
 @dataclass(frozen=True, eq=False)
 class FieldCurves:
     """Along the line, at the middle of the field along the track.
@@ -185,6 +188,7 @@ def field_curves(optics: CameraOptics, sharp: bool, count: int = 21) -> FieldCur
     )
 
 
+@shows("fields", "defocus [um]", "best [um]", "error [waves]")
 @dataclass(frozen=True, eq=False)
 class ThroughFocus:
     """At fields, along the light.

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.short_repr import shows
 from optics.geometry.aperture import Aperture, Circle, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
@@ -29,6 +30,7 @@ _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
 _RINGS = 6
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class RayPaths:
     """Rays in the prescription frame.
@@ -98,23 +100,73 @@ def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
     return edge
 
 
-def obscuration(model: CameraModel, backend: Backend) -> Mapping[str, float]:
-    """Share of a beam, of what edges leave of it, that the camera's own mirrors and line CCDs take before it is theirs:
-    body -> the largest over the field. A body that takes nothing is not there.
+@dataclass(frozen=True)
+class InTheWay:
+    """What of a camera stands in its own light.
+
+    Attributes:
+        shares: body -> share of a beam that it takes, the largest over the field; a body that takes nothing is not
+            there.
+        holes: mirror -> least radius of the hole about its middle that light needs which goes through it, metres: of
+            mirrors whose file states no hole and that no light is reflected at there.
+    """
+
+    shares: Mapping[str, float]
+    holes: Mapping[str, float]
+
+
+def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
+    """Which of the camera's own mirrors and line CCDs stand in a beam, of what edges leave of it, before it is theirs.
+
+    A mirror through whose middle light goes, and whose middle reflects none, has a hole there, whether its file states
+    one or not: the first mirror of a telescope about its axis, whose second one shadows that place.
     """
     nodes = quadrature.disk(_RINGS)
     paths = ray_paths(model, backend, _FIELDS, np.stack([nodes.x, nodes.y], axis=-1), EARLIER)
     edges, bare = obstacles(model), model.bare_assembly(apertures=False)
     blocked: dict[str, np.ndarray] = {}
+    through: dict[str, list[np.ndarray]] = {}
     for k in range(len(paths.names)):
         ends = paths.names[max(k - 1, 0) : k + 1] if k else paths.names[:1]
         for body, edge in edges.items():
             if body not in ends:
-                taken = _met(backend, bare, body, edge, paths.points[k], paths.points[k + 1])
+                taken, places = _met(backend, bare, body, edge, paths.points[k], paths.points[k + 1])
                 blocked[body] = blocked.get(body, np.zeros(taken.shape, bool)) | taken
+                through.setdefault(body, []).append(np.where(taken[..., None], places, np.nan))
     lit = _lit(model, bare, paths)
-    shares = {body: float(np.max((taken & lit) @ nodes.share / (lit @ nodes.share))) for body, taken in blocked.items()}
-    return {body: share for body, share in shares.items() if share > 0.0}
+    holes = _holes(model, bare, paths, blocked, through, lit)
+    shares = {
+        body: float(np.max((taken & lit) @ nodes.share / (lit @ nodes.share)))
+        for body, taken in blocked.items()
+        if body not in holes
+    }
+    return InTheWay(FrozenMap({body: share for body, share in shares.items() if share > 0.0}), FrozenMap(holes))
+
+
+def _holes(
+    model: CameraModel,
+    bare: Assembly,
+    paths: RayPaths,
+    blocked: Mapping[str, np.ndarray],
+    through: Mapping[str, list[np.ndarray]],
+    lit: np.ndarray,
+) -> dict[str, float]:
+    """Radii of the holes of mirrors that light needs, metres."""
+    out = {}
+    for body in model.mirrors:
+        if model.spec.mirrors[body].light is not None or not np.any(blocked.get(body, False)):
+            continue
+        # what another one takes reaches neither the hole nor the mirror about it; one that takes nearly all of it
+        # has a hole itself
+        others = [taken for name, taken in blocked.items() if name != body and np.mean(taken) < 0.5]
+        left = lit & ~np.any(others, axis=0) if others else lit
+        met = np.concatenate([places[left & np.isfinite(places[..., 0])] for places in through[body]])
+        used = bare.nominal_pose(body).inverse().apply(paths.points[1 + paths.names.index(body)])[left]
+        if met.size and used.size:
+            radius = float(np.max(np.hypot(met[:, 0], met[:, 1])))
+            if radius < float(np.min(np.hypot(used[:, 0], used[:, 1]))):
+                out[body] = radius
+    return out
 
 
 def _lit(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
@@ -127,16 +179,21 @@ def _lit(model: CameraModel, bare: Assembly, paths: RayPaths) -> np.ndarray:
     )
 
 
-def _met(backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Which of the stretches start..end, (F, N, 3), meet the clear area of a body, (F, N)."""
+def _met(
+    backend: Backend, bare: Assembly, body: str, edge: Aperture, start: np.ndarray, end: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which of the stretches start..end, (F, N, 3), meet the clear area of a body, (F, N), and where its surface, in
+    its own x and y, (F, N, 2).
+    """
     way = end - start
     length = np.linalg.norm(way, axis=-1)
     obstacle = Element(body, body, bare.elements[body].surface, Interaction.PASS, edge)
     system = assemble(bare.with_element(obstacle), [(body,)])
     rays = make_rays(backend, start.reshape(-1, 3), (way / length[..., None]).reshape(-1, 3))
-    _, _, path, inside = trace(backend, system, rays).numpy()
+    position, _, path, inside = trace(backend, system, rays).numpy()
     path, inside = path.reshape(length.shape), inside.reshape(length.shape)
-    return np.asarray(inside & (path > _NEAR) & (path < length - _NEAR))
+    place = position.reshape(*length.shape, 3)[..., :2]
+    return np.asarray(inside & (path > _NEAR) & (path < length - _NEAR)), place
 
 
 _NEAR = 1e-6
@@ -150,6 +207,7 @@ _RIM = 48
 """Rays on the edge of the stop."""
 
 
+@shows("focal_length [m]", "aperture", "image [mm]", "obscuration.shares", "obscuration.holes")
 @dataclass(frozen=True, eq=False)
 class FirstOrderData:
     """What was traced in the middle of the field for `FIRST_ORDER`; lengths in metres, angles in radians.
@@ -164,7 +222,7 @@ class FirstOrderData:
         round_aperture: numerical aperture of the round beam with the same solid angle at the image.
         image: length and width of the image of the whole field.
         chief_ray_angle: of chief rays against the image's normal: in the middle, and the largest over the field.
-        obscuration: body of the camera -> share of the beam that it takes, largest over the field; empty for none.
+        obscuration: what of the camera stands in its own beam.
     """
 
     spec: CameraSpec
@@ -177,7 +235,7 @@ class FirstOrderData:
     round_aperture: float
     image: tuple[float, float]
     chief_ray_angle: tuple[float, float]
-    obscuration: Mapping[str, float]
+    obscuration: InTheWay
 
     @property
     def working_f_number_line(self) -> float:
@@ -236,7 +294,14 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
         "of chief rays against the image's normal: in the middle, and the largest over the field",
     ),
     Quantity("length_m", lambda d: d.length, "along the parent axis between the outermost of mirrors and image"),
-    Quantity("obscuration", lambda d: d.obscuration, "body of the camera -> largest share of a beam that it takes"),
+    Quantity(
+        "obscuration", lambda d: d.obscuration.shares, "body of the camera -> largest share of a beam that it takes"
+    ),
+    Quantity(
+        "hole_radius_mm",
+        lambda d: d.obscuration.holes,
+        "mirror -> least radius of the hole that light needs which goes through it, where its file states none",
+    ),
 )
 
 
@@ -262,7 +327,7 @@ def first_order_data(optics: CameraOptics) -> FirstOrderData:
         round_aperture=round_aperture(cosines),
         image=(float(length), float(width)),
         chief_ray_angle=(float(slant[middle]), float(np.max(slant))),
-        obscuration=FrozenMap(obscuration(model, backend)),
+        obscuration=obscuration(model, backend),
     )
 
 

@@ -17,6 +17,7 @@ from analysis.monitor.estimators import Estimator, applicable, judged
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Quantity, posterior_sigma, quantities
 from analysis.monitor.recovery import Recovery
+from analysis.short_repr import shows
 from analysis.spots.fit_state import FALSE_ALARM as SPOT_ALARM
 from analysis.spots.fit_state import FitStates
 from twin.monitor.crosstalk import CameraCrosstalk, estimator_gains
@@ -35,6 +36,7 @@ CENTROID_NOTES = {
 """Method of finding spots -> its name for readers."""
 
 
+@shows("cameras", "frames", "centroid", "recovery")
 @dataclass(frozen=True, eq=False)
 class MonitorReading:
     """One state's reading.

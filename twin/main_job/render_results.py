@@ -14,6 +14,7 @@ from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import Estimator
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP, Parameter
 from analysis.monitor.recovery import Recovery
+from analysis.short_repr import shows
 from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from scenes.models.obstruction import Obstruction
@@ -111,6 +112,7 @@ class JobRun:
         return ()
 
 
+@shows("experiment", "seed", "before [DN]", "after [DN]")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderRun(JobRun):
     """One job's outcome, of an instrument with a monitor: also what its spots say.

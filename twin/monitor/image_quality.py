@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.aperture import Circle
 from optics.geometry.tree import State
@@ -91,6 +92,7 @@ class PupilOutline:
     pieces: np.ndarray
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class CameraQuality:
     """One camera in S states at F fields. NaN where it is not known; ``reasons`` says why.
@@ -121,6 +123,7 @@ class CameraQuality:
     pupils: tuple[tuple[PupilOutline, ...], ...]
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class ImageQuality:
     """All cameras.

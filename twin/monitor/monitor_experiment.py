@@ -16,6 +16,7 @@ from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.monitoring import MonitorGeometry
+from analysis.short_repr import shows
 from analysis.spots.spot_template import SpotTemplate
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
@@ -48,6 +49,7 @@ TEMPLATE_MARGIN = 40
 """Pixels by which the calibrated spot shape is larger than the CCD, so that it can be shifted over it."""
 
 
+@shows("resolved.instrument.name", "resolved.instrument.cameras")
 class MonitorExperiment:
     """An instrument with its detectors and its nominal calibration; whatever is derived is worked out once, on demand.
 

@@ -14,6 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots, recover
+from analysis.short_repr import shows
 from analysis.spots.centroid import mean_frames
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import PlacedBodies, State
@@ -59,6 +60,7 @@ class Observing:
     frames: int | None = None
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class Light:
     """What comes of S states to the area CCDs.
@@ -76,6 +78,7 @@ class Light:
     photons: np.ndarray
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class Observation:
     """What S states do and what their images say.

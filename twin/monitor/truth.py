@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from analysis.monitor.ground_error import GroundGeometry
+from analysis.short_repr import shows
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.raytrace.assembly import points_to_world
@@ -26,6 +27,7 @@ ACROSS = np.array([0.0, 1.0, 0.0])
 """Near which, in the world, the first transverse axis of a chief ray is taken."""
 
 
+@shows("cameras", "principal_distance", "angle [deg]", "angle_change [arcsec]", "lines")
 @dataclass(frozen=True, eq=False)
 class Truth:
     """True changes of every camera for S states.

@@ -15,6 +15,7 @@ from analysis.monitor.curvature import MotionModel
 from analysis.monitor.disturbances import Consistency, Disturbances
 from analysis.monitor.monitoring import MonitorGeometry, coefficients
 from analysis.monitor.recovery import Recovery, recover, recovery_of
+from analysis.short_repr import shows
 from analysis.spots.noise import NoiseModel
 from analysis.spots.screened_fit import one_shape
 from analysis.spots.spot_positions import NoiseParts, SpotError, SpotPositions
@@ -46,6 +47,7 @@ __all__ = ["RecoverRun", "run_recover", "state_name"]
 CALIBRATE, READ, MEASURE = "calibrate", "read the frames", "search and measure the spots"
 
 
+@shows()
 @dataclass(frozen=True, eq=False)
 class RecoverRun:
     """What a measurement gave.

@@ -11,6 +11,7 @@ from typing import Any
 
 import pandas as pd
 
+from analysis.short_repr import shows
 from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
@@ -24,6 +25,7 @@ from twin.run.report import Report, with_warnings
 from twin.run.run_folder import RunFolder
 
 
+@shows("name", "report.verdict", "report.warnings")
 @dataclass(frozen=True, eq=False)
 class TestResult:
     """A finished test.

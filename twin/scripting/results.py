@@ -17,6 +17,7 @@ from analysis.monitor import parameters
 from analysis.monitor.estimators import judged
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
+from analysis.short_repr import shows
 from optics.numerics.backend import Backend
 from twin.main_job.assumptions import contradicted
 from twin.main_job.monitor_reading import MonitorReading
@@ -29,6 +30,7 @@ from twin.run.run_folder import RunFolder
 from twin.targets.target_measurement import PlaceTargets
 
 
+@shows("verdict", "truth", "before [DN]", "after [DN]", "warnings")
 @dataclass(frozen=True, eq=False)
 class Shot:
     """An exposure of the nominal and of the perturbed instrument.

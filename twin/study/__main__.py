@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import cli
+from twin.study.progress_bar import Told, tell_through
 from twin.study.runs.cluster import ClusterError
 from twin.study.runs.engine import Estimate, IncompleteError, ProgramFault
 from twin.study.runs.engine import Progress as EngineProgress
@@ -54,6 +55,7 @@ def main(
     backend: cli.BackendName = "llvm",
     as_json: cli.AsJson = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing but errors and warnings.")] = False,
+    progress_fd: Annotated[int | None, typer.Option("--progress-fd", hidden=True, min=3)] = None,
 ) -> None:
     """Run a job many times with varied values and keep the numbers that matter.
 
@@ -87,7 +89,8 @@ def main(
         run_gradient(file, cli.Options(out, None, backend, force, as_json, quiet))
         return
     with cli.explained(errors):
-        display = _Display(errors, quiet or as_json)
+        told = (lambda done, total: None) if progress_fd is None else tell_through(progress_fd)
+        display = _Display(errors, quiet or as_json, told)
         try:
             with display.bar, display.heartbeat:
                 run = run_study(file, options, display.progress(), place.append)
@@ -135,8 +138,8 @@ def _how_to_go_on(file: Path, place: list[StudyFolder]) -> str:
 class _Display:
     """What the user sees while a study runs: lines on stderr, and a bar where it is a terminal."""
 
-    def __init__(self, console: Console, silent: bool) -> None:
-        self.console, self.silent = console, silent
+    def __init__(self, console: Console, silent: bool, told: Told = lambda done, total: None) -> None:
+        self.console, self.silent, self._told = console, silent, told
         self.bar = Progress(
             TextColumn("runs"),
             BarColumn(),
@@ -174,6 +177,7 @@ class _Display:
         )
 
     def _done(self, done: int, total: int) -> None:
+        self._told(done, total)
         now = time.monotonic()
         if self._began is None:
             self._began = (now, done)

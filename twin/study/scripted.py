@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import xarray as xr
 
@@ -21,6 +25,7 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.run.owned_files import scratch
+from twin.study.progress_bar import Told, shown_bar, tell_all
 from twin.study.runs.base_job import Tree
 
 _NUMBER = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
@@ -72,6 +77,7 @@ def study(
     workers: int | None = None,
     out: str | Path | None = None,
     quiet: bool = False,
+    progress: bool | Told = True,
 ) -> xr.Dataset:
     """Perturb, render and recover an instrument many times, on all cores.
 
@@ -87,7 +93,9 @@ def study(
             of the model and true values of every camera's parameters and of the angle between two cameras.
         workers: number of processes; one for each core if not given.
         out: folder of the study, with its report, which stays; none is kept if not given.
-        quiet: show no progress.
+        quiet: show neither progress nor warnings.
+        progress: whether a bar is shown on a terminal and in a notebook; or what is told the number of runs that are
+            there and of all, ``progress(done, runs)``, each time that some are.
 
     Returns:
         A value of every factor and response for each ``run``; runs whose light is lost are ``failed``, with a
@@ -104,12 +112,50 @@ def study(
         # A process of its own: workers started from here would run the caller's script once more, each of them.
         command = [sys.executable, "-m", str(__package__), str(file), "--out", str(target), "--yes", "--json"]
         command += [] if workers is None else ["--workers", str(workers)]
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE if quiet else None, text=True)
-        if done.returncode:
-            why = f": {done.stderr.strip()}" if quiet else "; see above"
-            raise RuntimeError(f"the study ended with exit code {done.returncode}{why}")
+        code, said = _run(command, quiet, progress)
+        if code:
+            why = f": {said.strip()}" if quiet else "; see above"
+            raise RuntimeError(f"the study ended with exit code {code}{why}")
         with xr.open_dataset(target / "study.nc", engine="h5netcdf") as data:
             return data.load()
+
+
+def _run(command: list[str], quiet: bool, progress: bool | Told) -> tuple[int, str]:
+    """Run a study's command to its end; its exit code, and what it said where nobody is shown that."""
+    with ExitStack() as stack:
+        kept = stack.enter_context(tempfile.TemporaryFile("w+")) if quiet else None
+        told = progress if callable(progress) else shown_bar() if progress and not quiet else None
+        with _telling(command, kept, told is not None) as (done, lines):
+            if told is not None:
+                tell_all(lines, told)
+            code = done.wait()
+        if kept is None:
+            return code, ""
+        kept.seek(0)
+        return code, kept.read()
+
+
+@contextmanager
+def _telling(
+    command: list[str], kept: IO[str] | None, asked: bool
+) -> Iterator[tuple[subprocess.Popen[bytes], IO[str]]]:
+    """A study in a process of its own, and the lines by which it tells how far it is, if it is asked to."""
+    reading, writing = os.pipe()
+    with os.fdopen(reading) as lines:
+        try:
+            more = ["--progress-fd", str(writing)] if asked else []
+            done = subprocess.Popen(
+                [*command, *more], stdout=subprocess.DEVNULL, stderr=kept, pass_fds=(writing,) if asked else ()
+            )
+        finally:
+            os.close(writing)
+        try:
+            yield done, lines
+        except BaseException:
+            # what is told may break off the study, and so does Ctrl-C
+            done.send_signal(signal.SIGINT)
+            done.wait()
+            raise
 
 
 def config_text(

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from analysis.short_repr import shows
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
@@ -67,6 +68,7 @@ class LocalMap:
         return np.asarray(self.coefficients[1:3].T / self.scale)
 
 
+@shows("position [mm]", "path [m]", "valid")
 @dataclass(frozen=True, eq=False)
 class LineRays:
     """Rays of F beams, N each, where they meet the line CCD, in its own frame: X' along the track, Y' along the line.

@@ -316,15 +316,30 @@ def _found(
         files = {}
         for when in (BEFORE, AFTER):
             stem = f"{channel.replace('/', '_')}_{when}"
-            file = next((stem + ending for ending in ENDINGS if stem + ending in names), None)
+            present = [stem + ending for ending in ENDINGS if stem + ending in names]
+            file = next((name for name in present if not _is_picture(place / name)), None)
             if file is None:
-                meant = nearest(f"{stem}.tiff", names)
+                meant = None if present else nearest(f"{stem}.tiff", names)
                 text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
+                if present:
+                    text += f": {present[0]} is a picture with 8 bits to look at, not what was recorded"
                 allowed = f"{stem}.tiff (or {others}), or CAMERA/SIDE: {{before: FILE, after: FILE}}"
                 raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
             files[when] = (str((place / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))
     return frames, ()
+
+
+def _is_picture(file: Path) -> bool:
+    """Whether a file is a PNG with 8 bits, as the twin writes one beside the frames of every channel. Raw frames of
+    such a camera are named one by one.
+    """
+    try:
+        with file.open("rb") as stream:
+            head = stream.read(25)
+    except OSError:
+        return False
+    return head.startswith(b"\x89PNG\r\n\x1a\n") and len(head) == 25 and head[24] < 16
 
 
 def read_frame_table(path: Path, channels: tuple[str, ...]) -> tuple[dict[str, ChannelFramesSpec], tuple[float, ...]]:

@@ -1,5 +1,7 @@
 """Cameras made of foreign prescriptions and prescriptions made of cameras: both trace the same."""
 
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -321,3 +323,33 @@ def test_what_a_zemax_file_cannot_hold_is_refused(tmp_path: Path, backend) -> No
     (tmp_path / "singlet.yaml").write_text(text, "utf-8")
     back = read_batoid(tmp_path / "singlet.yaml", 650e-9)
     assert [s.index for s in back.surfaces] == [s.index for s in lens.surfaces]
+
+
+def test_fields_are_those_of_the_file(tmp_path: Path, backend) -> None:
+    """0 and 2 deg on one axis are the middle and the end of the camera's field; what it adds is told."""
+    path = tmp_path / "singlet.zmx"
+    path.write_text(SINGLET, "utf-8")
+    lens = read_zemax(path, own_glasses())
+    made = camera_of(lens, "singlet", backend)
+    assert (made.camera.field_bias, made.camera.field.x, made.camera.field.y) == (0.0, math.radians(2), math.radians(2))
+    notes = [str(note) for note in made.notes if note.statement == "field"]
+    assert len(notes) == 1
+    assert "one axis alone, to 2 deg" in notes[0]
+    assert "corners are 2.828 deg out" in notes[0]
+    assert "--field '2 deg'" in notes[0]
+    # a round field is asked for in words, and has the square in it
+    made = camera_of(replace(lens, round_field=True), "singlet", backend)
+    assert made.camera.field.x == pytest.approx(math.radians(2) / math.sqrt(2.0), rel=1e-14)
+
+
+def test_numbers_are_written_without_the_tail_of_conversions(tmp_path: Path, backend) -> None:
+    """The half field is half of 6.1 deg less 5.9 deg, in radians 1e-15 off; 15 digits are what the file has."""
+    path = tmp_path / "tma.zmx"
+    path.write_text(TMA.replace("YFLN 6 6.1 5.9", "YFLN 6 6.15 5.85"), "utf-16")
+    lens = read_zemax(path)
+    text = camera_text(camera_of(lens, "tma", backend), lens)
+    assert "y: 540 arcsec" in text
+    assert "field_bias: 6 deg" in text
+    numbers = re.findall(r"[0-9]+[.][0-9]+", text.partition("name:")[2])
+    assert numbers
+    assert not [number for number in numbers if re.search(r"9{6}[0-9]?$|0{6}[0-9]$", number)]

@@ -1,10 +1,13 @@
 // The knobs: a tree of bodies, a slider for each number, the course's times, a study's factors.
+import { check, readNumber, stepped } from './numbers.js';
+
 const byId = (id) => document.getElementById(id);
 const element = (tag, properties = {}, ...children) => {
   const out = Object.assign(document.createElement(tag), properties);
   out.append(...children);
   return out;
 };
+const field = (properties = {}) => element('input', { type: 'text', className: 'number', inputMode: 'decimal', autocomplete: 'off', ...properties });
 const NAMES = { rotate: 'rotate', shift: 'shift', figure: 'figure', scale: 'scale', temperature: 'temperature', gradient: 'gradient' };
 // the number as the slider steps it, without the tail of a binary fraction
 const tidy = (value, step) => Number(value.toFixed(Math.max(0, Math.min(12, 2 - Math.floor(Math.log10(step))))));
@@ -18,13 +21,12 @@ class Row {
     this.step = (reach - low_) / 1000;
     this.slider = element('input', { type: 'range' });
     this.slider.setAttribute('aria-label', `${label} in ${unit || 'units'}`);
-    this.number = element('input', { type: 'number', step: 'any' });
+    this.number = field();
+    stepped(this.number, () => this.step, (value) => tidy(value, this.step));
     this.number.setAttribute('aria-label', `${label} in ${unit || 'units'}, as a number`);
     const reset = element('button', { textContent: '↺', title: 'back to where it began' });
     const more = element('button', { textContent: '…', title: 'range and step' });
-    this.low = element('input', { type: 'number', step: 'any' });
-    this.high = element('input', { type: 'number', step: 'any' });
-    this.steps = element('input', { type: 'number', step: 'any', min: 0 });
+    [this.low, this.high, this.steps] = [field(), field(), field()];
     this.ends = element('div', { className: 'ends', hidden: true },
       element('label', {}, 'from ', this.low), element('label', {}, 'to ', this.high), element('label', {}, 'step ', this.steps));
     const name = element('span', { className: 'label', title: `${label} [${unit}]` }, label.split(' ').slice(long ? 0 : 1).join(' ') || label, ' ', element('small', {}, unit));
@@ -35,21 +37,16 @@ class Row {
     this.slider.addEventListener('input', () => this.turn(tidy(Number(this.slider.value), this.step)));
     this.slider.addEventListener('change', done);
     this.number.addEventListener('input', () => {
-      const typed = Number(this.number.value);
-      if (this.number.value === '' || !Number.isFinite(typed) || (limit && Math.abs(typed) > limit)) {
-        this.number.setAttribute('aria-invalid', 'true');
-        return;
-      }
-      this.number.removeAttribute('aria-invalid');
-      this.turn(typed, true);
+      const typed = readNumber(this.number.value);
+      if (check(this.number, Number.isFinite(typed) && !(limit && Math.abs(typed) > limit))) this.turn(typed, true);
     });
-    this.number.addEventListener('change', () => { this.show(this.value); done(); });
+    this.number.addEventListener('change', () => { check(this.number, true); this.show(this.value); done(); });
     reset.addEventListener('click', () => { this.turn(this.first); done(); });
     more.addEventListener('click', () => { this.ends.hidden = !this.ends.hidden; });
     for (const end of [this.low, this.high, this.steps]) {
       end.addEventListener('change', () => {
-        const [a, b, s] = [this.low, this.high, this.steps].map((input) => Number(input.value));
-        if (a < b && s > 0) this.range(a, b, s);
+        const [a, b, s] = [this.low, this.high, this.steps].map((input) => readNumber(input.value));
+        if (check(end, a < b && s > 0)) this.range(a, b, s);
       });
     }
   }
@@ -238,15 +235,24 @@ export class Knobs {
     byId('moved').hidden = !names.length;
   }
 
+  // what fits is opened, and what leads to it without its own knobs
   filter() {
     const words = byId('filter').value.toLowerCase().split(/\s+/).filter(Boolean);
+    if (words.length && !this.opened) this.opened = new Set([...this.boxes.keys()].filter((path) => this.boxes.get(path).open));
+    const all = (path) => words.every((word) => path.toLowerCase().includes(word));
+    // a word of a body's own name, and not of those that carry it alone
+    const own = (path) => all(path) && words.some((word) => path.slice(path.lastIndexOf('/') + 1).toLowerCase().includes(word));
+    const fitting = [...this.boxes.keys()].filter(own);
     for (const [path, box] of this.boxes) {
-      const fits = words.every((word) => path.toLowerCase().includes(word));
-      const below = !fits && [...this.boxes.keys()].some((other) => other.startsWith(`${path}/`)
-        && words.every((word) => other.toLowerCase().includes(word)));
-      box.hidden = words.length > 0 && !fits && !below;
-      if (words.length) box.open = below || (fits && path.split('/').length < 4);
+      const fits = fitting.includes(path);
+      const way = !fits && fitting.some((other) => other.startsWith(`${path}/`));
+      const carried = fitting.some((other) => path.startsWith(`${other}/`));
+      box.hidden = words.length > 0 && !fits && !way && !carried;
+      box.classList.toggle('way', words.length > 0 && way);
+      if (words.length) box.open = fits || way;
+      else if (this.opened) box.open = this.opened.has(path);
     }
+    if (!words.length) this.opened = null;
   }
 
   // --- the course --------------------------------------------------------------------------------------------------
@@ -272,7 +278,7 @@ export class Knobs {
     clearTimeout(this.timer);
     const step = () => {
       this.goTo((this.time + 1) % this.course.times.length);
-      this.timer = setTimeout(step, 1000 / Math.min(30, Math.max(0.5, Number(byId('speed').value) || 4)));
+      this.timer = setTimeout(step, 1000 / Math.min(30, Math.max(0.5, readNumber(byId('speed').value) || 4)));
     };
     if (on) step();
   }

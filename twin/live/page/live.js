@@ -1,5 +1,6 @@
 // The page of the live twin: what it asks for, what it is told, and what the user did.
 import { Knobs } from './knobs.js';
+import { check, readNumber, stepped } from './numbers.js';
 import { Spots } from './spots.js';
 import { Readings } from './readings.js';
 import { Scene } from './scene.js';
@@ -40,6 +41,8 @@ class Live {
   // --- what the user does ------------------------------------------------------------------------------------------
   listen() {
     for (const id of ['noise', 'frames', 'seed']) byId(id).addEventListener('input', () => this.changed());
+    for (const id of ['frames', 'seed']) stepped(byId(id), () => 1);
+    stepped(byId('speed'), () => 0.5);
     for (const id of ['show', 'stretch', 'crop', 'marks']) byId(id).addEventListener('input', () => this.spots.draw());
     byId('undo').addEventListener('click', () => this.travel(this.undo, this.redo));
     byId('redo').addEventListener('click', () => this.travel(this.redo, this.undo));
@@ -97,8 +100,8 @@ class Live {
   // --- what is asked for -------------------------------------------------------------------------------------------
   state() {
     const whole = (id, low, high, otherwise) => {
-      const value = Math.round(Number(byId(id).value));
-      return byId(id).value !== '' && value >= low && value <= high ? value : otherwise;
+      const value = readNumber(byId(id).value);
+      return check(byId(id), Number.isInteger(value) && value >= low && value <= high) ? value : otherwise;
     };
     const { knobs, pivots, time } = this.knobs.values();
     return {
@@ -242,7 +245,7 @@ class Live {
     this.setBlind(false);
     this.recording({ on: false, states: 0 });
     this.snapshot = JSON.stringify(this.knobs.values());
-    this.status('connected');
+    this.status('computing the first state');
     this.changed();
   }
 
@@ -262,6 +265,7 @@ class Live {
 
   paint(told, images) {
     this.last = told;
+    document.body.classList.remove('waiting');
     this.problem(told);
     this.spots.take(told, images);
     if (!told.problem) {

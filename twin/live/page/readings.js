@@ -62,6 +62,7 @@ export class Readings {
         name.title = row.meaning;
         row.cells = Array.from({ length: heads.length }, () => row.line.insertCell());
         if (this.monitored) row.cells[1 + hello.estimators.indexOf(hello.judged)].className = 'judged';
+        for (const cell of row.cells) cell.textContent = '…';
         row.texts = [];
         row.name = `${group.title} ${name.textContent}`;
       }

@@ -25,7 +25,7 @@ export class Spots {
       image.setAttribute('aria-label', `spot of channel ${key}`);
       const marks = make('canvas', 'marks');
       const caption = document.createElement('figcaption');
-      const told = document.createElement('span');
+      const told = Object.assign(document.createElement('span'), { textContent: 'row … px\ncolumn … px' });
       caption.append(Object.assign(document.createElement('b'), { textContent: key.replaceAll('/', ' ') }), told);
       stack.append(image, marks);
       figure.append(stack, caption);

@@ -1,0 +1,160 @@
+"""Results that show themselves in a few words: a ``__repr__`` of chosen fields with units, arrays by shape and range.
+
+>>> @shows("rms [um]", "rays [um]")
+... @dataclass
+... class Spot:
+...     rms: float  # metres
+...     rays: np.ndarray  # metres
+>>> Spot(2e-6, np.zeros((217, 2)))
+<Spot: rms 2 um; rays 217 x 2, all 0 um>
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from math import degrees
+from typing import Any, TypeVar
+
+import numpy as np
+
+from analysis.units import ARCSEC, MM_PER_M, UM_PER_M
+
+PER_SI: Mapping[str, float] = {
+    "mm": MM_PER_M,
+    "um": UM_PER_M,
+    "nm": 1e9,
+    "arcsec": 1.0 / ARCSEC,
+    "deg": degrees(1.0),
+    "cycles/mm": 1.0 / MM_PER_M,
+    "percent": 100.0,
+}
+"""How many of a unit make one SI unit; any other unit is written as it stands, to the number as it is."""
+
+LONGEST, MOST, FEW = 70, 400, 4
+"""Characters of a value and of the whole text; numbers of an array that are written out."""
+
+_FIELD = re.compile(r"(?P<path>[\w.]+)(?: \[(?P<unit>[^\]]+)\])?")
+_SI_ENDING = re.compile(r"_(rad|m|s)$")
+Kind = TypeVar("Kind", bound=type)
+
+
+def shows(*chosen: str) -> Callable[[Kind], Kind]:
+    """Give a class a short ``__repr__``, which those that inherit from it have, too.
+
+    Args:
+        chosen: ``name``, or ``name [unit]`` for a value that is kept in SI units; a name may be a property, or lead to
+            one (``report.verdict``). All fields of a dataclass that its own repr would tell, where none is named.
+    """
+    parsed = [match for text in chosen if (match := _FIELD.fullmatch(text)) is not None]
+    if len(parsed) != len(chosen):
+        raise ValueError(f"fields are written 'name' or 'name [unit]', found {chosen}")
+
+    def shown(self: Any) -> str:
+        named = [(one["path"], one["unit"] or "") for one in parsed] or _own(self)
+        parts = []
+        for path, unit in named:
+            if text := summary(_value(self, path), unit):
+                parts.append(f"{_label(path, unit)} {text}")
+        text = f"{type(self).__name__}: {'; '.join(parts)}" if parts else type(self).__name__
+        return f"<{_cut(text, MOST)}>"
+
+    def take(kind: Kind) -> Kind:
+        kind.__repr__ = shown  # type: ignore[assignment]
+        return kind
+
+    return take
+
+
+def summary(value: Any, unit: str = "") -> str:
+    """One value in a few words; empty for nothing.
+
+    Args:
+        value: SI where a unit is given.
+        unit: in which it is told.
+    """
+    if value is None or (isinstance(value, tuple | list | Mapping | str) and not value):
+        return ""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return _cut(" ".join(value.split()), LONGEST)
+    if isinstance(value, int | np.integer):
+        return _with(f"{value}", unit)
+    if isinstance(value, float | np.floating):
+        return _with(_number(float(value), unit), unit)
+    if isinstance(value, Mapping):
+        return _named(value)
+    dims = getattr(value, "dims", None)
+    if dims is not None and hasattr(value, "data_vars"):
+        return _named(value.data_vars)
+    if dims is not None and hasattr(value, "values"):
+        size = " x ".join(f"{n} {name}" for name, n in zip(dims, value.shape, strict=True))
+        return f"{size}{_range(np.asarray(value.values), unit)}"
+    if isinstance(value, tuple | list) and not all(isinstance(one, int | float | np.number) for one in value):
+        texts = [one if isinstance(one, str) else summary(one, unit) for one in value]
+        return _cut(", ".join(texts), LONGEST) if len(value) <= FEW else f"{len(value)} of them"
+    if isinstance(value, np.ndarray | tuple | list):
+        return _array(np.asarray(value), unit)
+    text = repr(value)
+    # what would be written out at length, and what says no more than where it is kept, is told by its kind
+    return text if len(text) <= LONGEST and " object at 0x" not in text else type(value).__name__
+
+
+def _own(value: Any) -> list[tuple[str, str]]:
+    """Fields of a dataclass that its own repr would tell; units are those of their names."""
+    if not is_dataclass(value):
+        return []
+    return [(one.name, "") for one in fields(value) if one.repr and not one.name.startswith("_")]
+
+
+def _label(path: str, unit: str) -> str:
+    """A field's name for readers, without the SI unit that it ends in where another one is told."""
+    name = path.rpartition(".")[2]
+    return (_SI_ENDING.sub("", name) if unit else name).replace("_", " ")
+
+
+def _value(owner: Any, path: str) -> Any:
+    for name in path.split("."):
+        owner = getattr(owner, name)
+    return owner
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
+def _with(text: str, unit: str) -> str:
+    return f"{text} {unit}" if unit else text
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value * PER_SI.get(unit, 1.0):.4g}"
+
+
+def _named(value: Mapping[Any, Any]) -> str:
+    return _cut(", ".join(str(name) for name in value), LONGEST)
+
+
+def _array(values: np.ndarray, unit: str) -> str:
+    if values.ndim == 1 and values.size == 1 and values.dtype.kind in "iuf":
+        return _with(_number(float(values[0]), unit), unit)
+    if values.ndim == 1 and 0 < values.size <= FEW and values.dtype.kind in "iuf":
+        return _with(f"({', '.join(_number(float(v), unit) for v in values)})", unit)
+    if values.ndim == 0:
+        return summary(values.item(), unit)
+    return f"{' x '.join(str(n) for n in values.shape)}{_range(values, unit)}"
+
+
+def _range(values: np.ndarray, unit: str) -> str:
+    """From the least to the largest of the finite numbers, as a further part; empty where there are none."""
+    if values.dtype.kind == "b":
+        return f", {np.count_nonzero(values)} true"
+    if values.dtype.kind not in "iuf" or not values.size:
+        return ""
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    if not finite.size:
+        return ", none finite"
+    low, high = (_number(float(v), unit) for v in (finite.min(), finite.max()))
+    return _with(f", all {low}" if low == high else f", {low} to {high}", unit)

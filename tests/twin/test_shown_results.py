@@ -1,0 +1,147 @@
+"""Results show themselves in a few words: what they are, their numbers with units, arrays by shape and range."""
+
+from __future__ import annotations
+
+import pydoc
+import re
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import twin
+from analysis.monitor.monitoring import CameraParameters, MonitorGeometry
+from analysis.short_repr import LONGEST, MOST, shows, summary
+from twin.camera.camera_view import CameraView
+from twin.scripting.procedures import TestResult
+from twin.scripting.results import Shot
+
+
+@pytest.fixture(scope="module")
+def gf7_view(backend, gf7) -> CameraView:
+    return CameraView.alone(gf7, backend)
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (2e-6, "um", "2 um"),
+        (0.123456, "", "0.1235"),
+        (5.512, "m", "5.512 m"),
+        (np.deg2rad(1.25), "deg", "1.25 deg"),
+        (71428.6, "cycles/mm", "71.43 cycles/mm"),
+        (3, "", "3"),
+        (True, "", "yes"),
+        (None, "um", ""),
+        ((), "", ""),
+        ("two  words", "", "two words"),
+        ((1.0, -0.5), "", "(1, -0.5)"),
+        (("M1", "M2"), "", "M1, M2"),
+        ([f"{k}" for k in range(9)], "", "9 of them"),
+        ({"forward": 1, "backward": 2}, "", "forward, backward"),
+        (np.array([650e-9]), "nm", "650 nm"),
+        (np.linspace(-1e-6, 2e-6, 50), "um", "50, -1 to 2 um"),
+        (np.array([[np.nan, 1.0], [0.5, np.inf]]), "", "2 x 2, 0.5 to 1"),
+        (np.full((2, 3), np.nan), "", "2 x 3, none finite"),
+        (np.zeros((2, 3)), "um", "2 x 3, all 0 um"),
+        (np.array([True, False, True]), "", "3, 2 true"),
+        (np.zeros((0, 4)), "", "0 x 4"),
+        (xr.DataArray(np.arange(6.0).reshape(2, 3), dims=("channel", "row")), "DN", "2 channel x 3 row, 0 to 5 DN"),
+        (xr.Dataset({"a": 1, "b": 2}), "", "a, b"),
+        (object(), "", "object"),
+        (SimpleNamespace(a=np.zeros(500)), "", "SimpleNamespace"),
+    ],
+)
+def test_a_value_in_a_few_words(value: Any, unit: str, text: str) -> None:
+    assert summary(value, unit) == text
+    assert len(summary("word " * 100)) == LONGEST
+
+
+def test_a_class_shows_its_fields() -> None:
+    @shows("rms_m [um]", "inner.size", "none")
+    @dataclass
+    class One:
+        rms_m: float
+        inner: Any
+        none: Any = None
+
+    class Two(One):
+        """Inherits it."""
+
+    @shows()
+    @dataclass
+    class Every:
+        first: int
+        hidden: int = field(repr=False)
+        _own: int = 3
+
+    assert repr(One(2e-6, np.zeros(3))) == "<One: rms 2 um; size 3>"
+    assert repr(Two(2e-6, np.zeros(3))) == "<Two: rms 2 um; size 3>"
+    assert repr(Every(1, 2)) == "<Every: first 1>"
+    with pytest.raises(ValueError, match="fields are written"):
+        shows("rms um m")
+
+
+def test_views_of_a_camera(gf7_view: CameraView) -> None:
+    shown = {
+        repr(gf7_view): ["CameraView: name gf7; mirrors M1, M2, M3; line focal length 5.51 m; entrance pupil 600 mm"],
+        repr(gf7_view.wavefront()): [
+            "WavefrontView: field (0, 0); rms 0.0159",
+            "waves; strehl 0.99",
+            "map 129 x 129, -0.03",
+        ],
+        repr(gf7_view.spot((1, 0))): ["SpotView: field (1, 0); rms 1.094 um", "airy 7.401 um; rays 217 x 2"],
+        repr(gf7_view.mtf()): ["MtfView: field (0, 0); at nyquist (0.4701, 0.4545); nyquist 71.43 cycles/mm", "650 nm"],
+        repr(gf7_view.pupils([(0.0, 0.0)])[0]): ["PupilFunction(centre="],
+        repr(gf7_view.rays([(0.0, 0.0)], np.zeros((1, 2)))): ["LineRays: position 1 x 1 x 3"],
+    }
+    for text, parts in shown.items():
+        assert len(text) <= MOST
+        assert text.count("\n") <= 1
+        for part in parts:
+            assert part in text
+
+
+@pytest.mark.parametrize("what", ["camera", "wavefront", "spot", "mtf"])
+def test_views_have_their_figure_in_a_notebook(gf7_view: CameraView, what: str) -> None:
+    view: Any = gf7_view if what == "camera" else getattr(gf7_view, what)()
+    html = view._repr_html_()
+    assert html.startswith("<p>&lt;")
+    assert re.search(r"<svg [^>]*viewBox", html)
+    assert "<script" not in html
+
+
+def test_a_shot_and_a_test() -> None:
+    frames = xr.DataArray(np.zeros((4, 9, 64, 64), np.uint16), dims=("channel", "frame", "row", "column"))
+    nothing: Any = None
+    truth = xr.Dataset({"d_f_um": 1.0})
+    shot = Shot(frames, frames, truth, truth, "Nothing moved. " * 20, ("careful",), nothing, nothing, 0.0, 0.0)
+    assert repr(shot).startswith("<Shot: verdict Nothing moved.")
+    assert "before 4 channel x 9 frame x 64 row x 64 column, all 0 DN" in repr(shot)
+    assert len(repr(shot)) <= MOST
+    report: Any = SimpleNamespace(verdict="The plane is flat.", warnings=())
+    result = TestResult("lab focus", {}, report, nothing, nothing, nothing, "focus")
+    assert repr(result) == "<TestResult: name lab focus; verdict The plane is flat.>"
+
+
+def test_monitor_results() -> None:
+    geometry = MonitorGeometry(5.512, 0.2347, 12e-6, 0.0, np.deg2rad(1.22))
+    assert repr(geometry) == (
+        "<MonitorGeometry: focal length 5.512 m; separation 234.7 mm; pixel 12 um; field alpha 0 deg; "
+        "field beta 1.22 deg>"
+    )
+    changes = CameraParameters.from_vector(np.zeros((50, 4)), np.tile(np.eye(4), (50, 1, 1)))
+    assert repr(changes) == (
+        "<CameraParameters: d alpha 50, all 0 arcsec; d beta 50, all 0 arcsec; d gamma 50, all 0 arcsec; "
+        "d f 50, all 0 um>"
+    )
+
+
+def test_help_leads_with_what_is_called() -> None:
+    told = pydoc.plain(pydoc.render_doc(twin))
+    contents = told.index("PACKAGE CONTENTS")
+    for name in twin.__all__:
+        assert re.search(rf"\b{name}\b", told[:contents]), name
