@@ -170,7 +170,7 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     assert "were laid over each other" in " ".join(result.stderr.split())
     place = np.array(found["position_px"])
     wanted = shift - 0.5 * np.tan(turned)
-    moved = (place - place.mean() - wanted + wanted.mean()) / np.array(found["position_sigma_px"])
+    moved = (place - place.mean() - wanted + wanted.mean()) / np.array(found["position_px_sigma"])
     assert np.max(np.abs(moved)) < 5.0
     printed = run(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um")
     assert "laid over each other" in printed.stdout

@@ -565,7 +565,7 @@ def test_the_angle_command_on_measurements(files) -> None:
     assert numbers["time_s"] == 1.0
     assert numbers["points"] == {"forward": 44, "aft": 44}
     assert numbers["along_track"]["wide_deg"] == pytest.approx(49.98, abs=0.02)
-    assert 0.05 < numbers["along_track"]["wide_sigma_arcsec"] < 1.0
+    assert 0.05 < numbers["along_track"]["wide_arcsec_sigma"] < 1.0
     refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
     assert refused.exit_code == 2
     assert "angles.wide" in refused.stderr

@@ -263,12 +263,12 @@ def test_contract(done) -> None:
     data = json.loads(result.stdout)
     assert result.stderr == ""
     assert data == json.loads((folder / "angle.json").read_text("utf-8"))
-    values = {"alpha_deg", "beta_deg", "alpha_sigma_arcsec", "beta_sigma_arcsec"}
+    values = {"alpha_deg", "beta_deg", "alpha_arcsec_sigma", "beta_arcsec_sigma"}
     assert set(data["planes"]) == {"printed", "corrected", "tls"}
     for method in (*data["planes"].values(), data["resection"]):
         assert values <= set(method)
         assert abs(method["alpha_deg"] - 25.0) < 0.02
-        assert 0.1 < method["alpha_sigma_arcsec"] < 0.2
+        assert 0.1 < method["alpha_arcsec_sigma"] < 0.2
     assert set(data["truth"]) == {"look", "dihedral", "along_track"}
     assert data["angles"] == {"alpha": ["forward", "nadir"], "beta": ["nadir", "aft"]}
     assert data["folded"] == {"alpha": False, "beta": False}

@@ -193,7 +193,7 @@ def write(folder: Path, old: str, new: str) -> Path:
 
 def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     folder, data = done
-    assert set(data["planes"]["tls"]) == {"alpha_deg", "alpha_sigma_arcsec"}
+    assert set(data["planes"]["tls"]) == {"alpha_deg", "alpha_arcsec_sigma"}
     assert set(data["difference_arcsec"]) == {"alpha"}
     assert [(r["what"], r["axis"]) for r in data["sensitivity"]] == [
         (what, axis) for what in ("station", "forward", "backward") for axis in "xyz"
@@ -206,7 +206,7 @@ def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     alone = trace_truth(gf7_pair, backend, [state]).angle_change[0] / ARCSEC
     assert change["trace"]["alpha"] == pytest.approx(alone, abs=0.01)
     assert change["truth"]["alpha"] == pytest.approx(change["trace"]["alpha"], abs=1e-6)
-    sigma = data["along_track"]["alpha_sigma_arcsec"]
+    sigma = data["along_track"]["alpha_arcsec_sigma"]
     assert abs(change["ground"]["alpha"] - change["trace"]["alpha"]) < 3.9 * sigma
     text = (folder / "report.html").read_text("utf-8")
     assert "the trace of the instrument says" in text

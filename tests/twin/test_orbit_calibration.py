@@ -131,7 +131,7 @@ def test_numbers_say_what_their_sigmas_hold(full) -> None:
     rate = -SETUP.test.errors.star_tracker.thermal.amplitude[1] * np.radians(-0.063)
     assert found["pitch rate"]["truth"] == pytest.approx(rate, rel=0.05)
     assert "drift of the biases" in data["sigmas"]["sigma"]
-    assert data["sigmas"]["held_start_sigma_m"] == expected
+    assert data["sigmas"]["held_start_m_sigma"] == expected
 
 
 @pytest.mark.slow

@@ -87,7 +87,7 @@ def test_files(folder: Path) -> None:
     # nothing that only the truth knows
     known = "".join((folder / "artefacts" / f"{n}.json").read_text("utf-8") for n in ("camera", "trajectory"))
     assert "0.65009" not in known
-    assert read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["focal_length_m"] == 0.65 + 90e-6
+    assert read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["principal_distance_m"] == 0.65 + 90e-6
 
 
 def test_other_software_finds_the_ground(folder: Path) -> None:
@@ -104,7 +104,7 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
         x0, y0 = line["principal_point_m"]
         y = (np.array(points["pixel"]) - 0.5 * (line["pixels"] - 1)) * line["pitch_m"] - y0
         grown = 1.0 + line["k1_per_m2"] * (x0**2 + y**2)
-        look = np.stack([x0 * grown, -y * grown, np.full_like(y, line["focal_length_m"])], axis=-1)
+        look = np.stack([x0 * grown, -y * grown, np.full_like(y, line["principal_distance_m"])], axis=-1)
         look = look @ np.array(line["camera_to_body"]).T
         look = Rotation.from_quat(turn(seconds)).apply(look / np.linalg.norm(look, axis=-1, keepdims=True))
         arm = np.array(points["itrs_m"]) - position(seconds)

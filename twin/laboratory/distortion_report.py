@@ -258,7 +258,7 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
         )
         caption += " Line: by exact chief rays of the as-built camera."
-    shown = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
+    shown = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "distortion_compensated_um_sigma")
     further = ("residual_compensated_um", "sets_kept")
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),

@@ -120,7 +120,7 @@ class LiveBench:
             "channels": [{"key": c.key, "camera": c.camera, "side": c.side} for c in experiment.path.channels],
             "rows": experiment.path.shape[0],
             "columns": experiment.path.shape[1],
-            "pixel_um": 1e6 * experiment.path.pitch,
+            "pitch_um": 1e6 * experiment.path.pitch,
             "white": experiment.detector.max_dn,
             "offset": float(experiment.expected_frames(np.zeros((1, 1)))[0, 0]),
             "nodes": nodes,

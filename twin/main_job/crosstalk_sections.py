@@ -38,7 +38,7 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     for k, (name, table) in enumerate(run.crosstalk.items()):
         labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
         first = _pretty(table.observability.statements[0].split(": ", 1), labels)
-        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.focal_length_statements()]
+        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_statements()]
         title = f"Three ways to change the focal length of {name}: piston, despace, growth"
         parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
     return Section("What a motion does to the spots", (), tuple(parts), len(run.crosstalk), "motions")
@@ -84,8 +84,8 @@ def crosstalk_section(run: RenderRun) -> Section:
         "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
         f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
         "run's "
-        'noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. "printed" is '
-        "eqs. (2), (3), (5) and Table 1, which agree there."
+        "noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. paper is both "
+        "paper single, eqs. (2), (3), (5), and paper joint, Table 1, which agree there."
     )
     tables = tuple(_crosstalk(run, k) for k in range(len(run.crosstalk)))
     return Section("Crosstalk: what every motion reads as", (about,), tables, name="crosstalk", closed=True)
@@ -130,7 +130,7 @@ def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tup
             continue
         heading = run.estimators[estimator].title
         if (estimator, parameter) in PRINTED:
-            heading = "printed" if same else {"paper_single": "printed (7)", "paper_joint": "Table 1"}[estimator]
+            heading = "paper" if same else f"{heading}, {'(7)' if estimator == 'paper_single' else 'Table 1'}"
         columns.append((heading, estimator))
     return columns
 

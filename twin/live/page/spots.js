@@ -107,7 +107,7 @@ export class Spots {
     if (!byId('marks').checked || this.told.problem) return 0;
     let most = 0;
     this.figures.forEach((_, channel) => {
-      const { sigma_row: row, sigma_column: column } = this.spot(channel, 'after');
+      const { row_sigma: row, column_sigma: column } = this.spot(channel, 'after');
       most = Math.max(most, row, column);
     });
     const cropped = byId('crop').value === 'spot' ? CROP / this.hello.columns : 1;
@@ -146,7 +146,7 @@ export class Spots {
     if (enlarged) {
       pen.strokeStyle = '#ff7f2a';
       pen.beginPath();
-      pen.ellipse(...at(after), enlarged * after.sigma_column * scale, enlarged * after.sigma_row * scale, 0, 0, 2 * Math.PI);
+      pen.ellipse(...at(after), enlarged * after.column_sigma * scale, enlarged * after.row_sigma * scale, 0, 0, 2 * Math.PI);
       pen.stroke();
     }
   }
