@@ -78,7 +78,7 @@ class Estimator(ABC):
     """Makes changes of all cameras of the shifts of all spots.
 
     Attributes:
-        title: for readers, a word or two.
+        title: for readers, its name in files with blanks.
         note: for readers, what it is.
         stated: whether it needs stated disturbances; without any it does not stand in the results.
     """
@@ -229,11 +229,11 @@ class Posterior(Estimator):
 ESTIMATORS: dict[str, Estimator] = {
     "paper_single": Formula(
         "paper_single",
-        "printed, single",
-        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
+        "paper single",
+        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed, one change at a time",
         monitoring.paper_single,
     ),
-    "paper_joint": Formula("paper_joint", "printed, joint", "joint changes as Wang et al. (2018) print them"),
+    "paper_joint": Formula("paper_joint", "paper joint", "joint changes as Wang et al. (2018) print them"),
     "derived": Formula(
         "derived",
         "derived",
