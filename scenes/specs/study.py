@@ -358,7 +358,7 @@ class ResponseSpec(Spec):
 
     @field_validator("key", "sigma", "noise", "minus", mode="before")
     @classmethod
-    def _by_new_names(cls, value: Any) -> Any:
+    def _key_by_new_names(cls, value: Any) -> Any:
         if not isinstance(value, list | tuple) or not all(isinstance(part, str | int) for part in value):
             return value
         now = key_now(value)

@@ -184,7 +184,7 @@ def test_signs_are_those_of_the_simulated_sensor(line):
     """Points from the twin's pixel to ground through th1.yaml, 1e-9 m of rounding each: 1e-15 m in the image."""
     spec = load_three_line_camera("th1")
     one = spec.lines[line]
-    model = LineModel.of(mounting(line), (one.focal_length, *one.principal_point), one.position, one.k1, one.k2)
+    model = LineModel.of(mounting(line), (one.principal_distance, *one.principal_point), one.position, one.k1, one.k2)
     platform = CirclePlatform(wobble=5.0 * ARCSEC)
     sensor = Sensor(line_cameras(spec)[line], platform, Earth(), 0.7e-3, -3.0, 10_000, NO_EFFECTS)
     lines, pixels = np.random.default_rng(9).uniform(0, 9999, (2, 30))

@@ -71,7 +71,7 @@ BAD = {
     "patch line": (PATCH, "patch: {pixel: 6000, line: fore}", "patch.line", ["no such line", "forward"]),
     "pixel": (PATCH, "patch: {pixel: 12000}", "patch.pixel", ["outside the line", "11999.5"]),
     "time": (PATCH, "patch: {pixel: 6000, time: 11 min}", "patch.time", ["outside the orbit data"]),
-    "change": (PATCH, f"{PATCH}\nchanges: {{back: {{}}}}", "changes.back", ["no such line"]),
+    "change": (PATCH, f"{PATCH}\nperturb: {{back: {{}}}}", "perturb.back", ["no such line"]),
     "relief": (PATCH, f"{PATCH}\nground: {{terrain: {{kind: fractal}}}}", "ground.terrain", ["without relief"]),
     "spacing": (PATCH, f"{PATCH}\nground: {{texture: {{spacing: 0 m}}}}", "ground.texture.spacing", ["0.1 m"]),
 }

@@ -59,7 +59,7 @@ def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
     turned = line_model(drifted_payload(WHOLE.camera, drift), "aft")
     expected = line_model(WHOLE.camera, "aft").drifted(drift["aft"])
     np.testing.assert_allclose(turned.to_body, expected.axes, rtol=0, atol=1e-14)
-    assert turned.interior[0] == pytest.approx(expected.focal_length, abs=1e-15)
+    assert turned.interior[0] == pytest.approx(expected.principal_distance, abs=1e-15)
 
 
 @pytest.mark.second
@@ -188,7 +188,12 @@ def test_command(tmp_path: Path) -> None:
 
 BAD = {
     "line": ("  aft: {angles", "  after: {angles", "drift.after", ["no such line", "aft"]),
-    "negative": ("focal_length: 10 um}", "focal_length: -10 um}", "monitor.focal_length", ["outside the limits"]),
+    "negative": (
+        "principal_distance: 10 um}",
+        "principal_distance: -10 um}",
+        "monitor.principal_distance",
+        ["outside the limits"],
+    ),
     "negative drift": ("[1 arcsec, 1 arcsec, 2 arcsec]", "[-1 arcsec, 0 arcsec, 0 arcsec]", "drift", ["outside"]),
 }
 

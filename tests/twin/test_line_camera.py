@@ -32,7 +32,7 @@ TH1 = load_three_line_camera("th1")
 
 def payload(**lines) -> ThreeLineCameraSpec:
     """Lines of 650 mm, otherwise as given in YAML."""
-    text = {name: {"focal_length": "650 mm", **line} for name, line in lines.items()}
+    text = {name: {"principal_distance": "650 mm", **line} for name, line in lines.items()}
     return ThreeLineCameraSpec.model_validate({"name": "own", "pixels": 12000, "pitch": "6.5 um", "lines": text})
 
 
@@ -42,7 +42,7 @@ def test_the_file() -> None:
     for (name, line), degrees in zip(TH1.lines.items(), (25, 0, -25, 2, 0), strict=True):
         pixels, pitch = TH1.pixels_of(name), TH1.pitch_of(name)
         pixel = ground.get(name, 5.0)
-        assert 500e3 * pitch / line.focal_length == pytest.approx(pixel, rel=1e-12)
+        assert 500e3 * pitch / line.principal_distance == pytest.approx(pixel, rel=1e-12)
         assert pixels * pixel == pytest.approx(60e3)
         assert math.degrees(line.look) == pytest.approx(degrees, abs=1e-12)
         half = 0.5 * pixels * pitch
@@ -75,7 +75,9 @@ def test_ideal_lines_obey_collinearity(name: str) -> None:
     place = np.stack([np.zeros_like(pixel), (pixel - 0.5 * last) * pitch], axis=-1) - np.array(line.principal_point)
     corrected = place * (1.0 + line.k1 * np.sum(place**2, axis=-1, keepdims=True))
     # rounding of a length of 0.65 to 1.6 m
-    np.testing.assert_allclose(-line.focal_length * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=3e-15)
+    np.testing.assert_allclose(
+        -line.principal_distance * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=3e-15
+    )
 
 
 def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:

@@ -456,7 +456,7 @@ def test_printed_model_reproduces_the_spots_and_goes_into_a_payload(folder: Path
     spec = load_three_line_camera("th1")
     line = LineCameraSpec(
         look="0 deg",
-        focal_length=f"{f} m",
+        principal_distance=f"{f} m",
         principal_point=("0 mm", f"{point} m"),
         k1=f"{k1} 1/m^2",
         pixels=pixels,
@@ -495,7 +495,7 @@ def test_printed_model_reproduces_the_spots_and_goes_into_a_payload(folder: Path
     assert missed(terms["principal_distance"]) < 0.3
     assert missed(data["principal_distance_mm"]) > 15.0
     values, covariance = np.array(own["values"]), np.array(own["covariance"])
-    assert own["terms"] == ["axis", "focal_length", "principal_point", "k1"]
+    assert own["terms"] == ["axis", "principal_distance", "principal_point", "k1"]
     away = values - [0.0, 1e3 * f, 1e3 * point, k1]
     # chi-square of three parameters; by chance beyond 30 once in 1e6
     assert away[1:] @ np.linalg.solve(covariance[1:, 1:], away[1:]) < 30.0

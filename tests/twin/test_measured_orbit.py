@@ -231,7 +231,7 @@ def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
     for name in names:
         said = WHOLE.camera.lines[name]
         mounts.append((Rotation.from_rotvec([0.0, said.look, 0.0]) * Rotation.from_rotvec(said.rotate)).as_matrix())
-        start.append([said.focal_length, *said.principal_point])
+        start.append([said.principal_distance, *said.principal_point])
         distortion.append(said.k1)
     mounts, start, distortion = np.array(mounts), np.array(start), np.array(distortion)
     free = [k for k in range(9) if k not in (4, 5)]  # x and y of the nadir line are the gauge

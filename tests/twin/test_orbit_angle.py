@@ -60,8 +60,8 @@ def directions(name: str, pixel: np.ndarray) -> np.ndarray:
     y = (pixel - 0.5 * (camera.pixels - 1)) * camera.pitch - line.principal_point[1]
     x = np.full_like(y, -line.principal_point[0])
     grow = 1.0 + line.k1 * (x**2 + y**2)
-    vectors = np.stack([-x * grow, -y * grow, np.full_like(y, line.focal_length)], axis=-1)
-    change = SETUP.test.changes.get(name)
+    vectors = np.stack([-x * grow, -y * grow, np.full_like(y, line.principal_distance)], axis=-1)
+    change = SETUP.test.perturb.get(name)
     turned = Rotation.from_rotvec(change.rotate if change else (0.0, 0.0, 0.0))
     vectors = (turned * Rotation.from_euler("Y", line.look) * Rotation.from_rotvec(line.rotate)).apply(vectors)
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]

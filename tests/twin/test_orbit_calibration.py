@@ -61,9 +61,9 @@ def interior_of_the_file() -> dict[str, float]:
     """True interior orientation, from the files' numbers alone, metres."""
     found: dict[str, float] = {}
     for name in LINES:
-        line, change = SETUP.camera.lines[name], SETUP.test.changes[name]
-        values = np.array([line.focal_length, *line.principal_point])
-        values += [change.focal_length, *change.principal_point]
+        line, change = SETUP.camera.lines[name], SETUP.test.perturb[name]
+        values = np.array([line.principal_distance, *line.principal_point])
+        values += [change.principal_distance, *change.principal_point]
         found |= dict(zip((f"{name} f", f"{name} x", f"{name} y"), values, strict=True))
     return found
 
@@ -169,7 +169,7 @@ def test_before_calibration_errors_are_of_the_100_m_class(full) -> None:
     out; in height 10%, for the curved Earth lets the outer rays converge more steeply."""
     test = SETUP.test
     shift = np.hypot(*test.errors.star_tracker.bias[:2]) * 500e3
-    x = {k: test.changes[k].principal_point[0] / 0.65 for k in ("forward", "aft")}
+    x = {k: test.perturb[k].principal_point[0] / 0.65 for k in ("forward", "aft")}
     look = np.radians(25.0)
     height = abs(x["forward"] - x["aft"]) * 500e3 / np.cos(look) ** 2 / (2.0 * np.tan(look))
     for errors in full.before.values():
@@ -531,9 +531,9 @@ def test_command(full, tmp_path: Path) -> None:
 BAD = {
     "few points": ("control: 60,", "control: 3,", "points.control", ["too few points", "6 or more"]),
     "gauge": (
-        "nadir: {focal_length: -70 um}",
+        "nadir: {principal_distance: -70 um}",
         "nadir: {principal_point: [9 um, 0 um]}",
-        "changes.nadir",
+        "perturb.nadir",
         ["is the gauge", "star_tracker.bias"],
     ),
     "field": ("- [Beijing, Anhui]", "- [Beijing, Anhuy]", "schemes", ["no such field", "did you mean 'Anhui'"]),

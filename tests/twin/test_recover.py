@@ -124,8 +124,8 @@ def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, imag
         g = camera.geometry
         look = np.degrees(camera.look_rad)
         text += (
-            f"  {name}: {{focal_length: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, pixel: 12 um, "
-            f"look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
+            f"  {name}: {{principal_distance: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, "
+            f"pitch: 12 um, look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
         )
     found = measured(images.parent, text, backend, run, "geometry.yaml")
     whole, r = run.recovery, found.last.recovery
@@ -350,8 +350,11 @@ PLAIN = "forward/left: {before: a.tif, after: b.tif}"
         (HEAD + f"frames:\n  {PLAIN}\n", ["no such file", "a.tif"]),
         (HEAD + "frames:\n  forwad/left: {before: a.tif, after: b.tif}\n", ["no such channel", "did you mean"]),
         (HEAD + f"times: [0 s, 1 s]\nframes:\n  {PLAIN}\n", ["not as many entries as times"]),
-        ("geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["template: measured"]),
-        (HEAD + "geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["both"]),
+        (
+            "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n",
+            ["template: measured"],
+        ),
+        (HEAD + "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n", ["both"]),
         (HEAD + "frames: bad.csv\n", ["bad.csv:2", "no such channel"]),
         (HEAD + "frames: heads.csv\n", ["heads.csv:1", "not the head of a column"]),
     ],

@@ -331,7 +331,10 @@ def test_clear_errors_outside_the_image_and_the_orbit(trajectory) -> None:
 
 def test_a_look_past_the_earth_is_nan() -> None:
     """From 500 km the horizon lies at 68 degrees."""
-    lines = {"past": {"look": "70 deg", "focal_length": "650 mm"}, "near": {"look": "64 deg", "focal_length": "650 mm"}}
+    lines = {
+        "past": {"look": "70 deg", "principal_distance": "650 mm"},
+        "near": {"look": "64 deg", "principal_distance": "650 mm"},
+    }
     spec = ThreeLineCameraSpec.model_validate({"name": "own", "pixels": 12000, "pitch": "6.5 um", "lines": lines})
     past, near = (sensor(camera, ALL) for camera in line_cameras(spec).values())
     assert np.all(np.isnan(past.ground(5000.0, 6000.0)))

@@ -87,7 +87,9 @@ def test_files(folder: Path) -> None:
     # nothing that only the truth knows
     known = "".join((folder / "artefacts" / f"{n}.json").read_text("utf-8") for n in ("camera", "trajectory"))
     assert "0.65009" not in known
-    assert read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["principal_distance_m"] == 0.65 + 90e-6
+    assert (
+        read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["principal_distance_m"] == 0.65 + 90e-6
+    )
 
 
 def test_other_software_finds_the_ground(folder: Path) -> None:

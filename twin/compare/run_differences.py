@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from scenes.specs.result_names import by_new_names
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import why_unreadable
-from scenes.specs.result_names import by_new_names
 from scenes.yaml.json_file import read_json
 from scenes.yaml.units import split_quantity, unit_ratio
 from scenes.yaml.yaml_file import read_yaml

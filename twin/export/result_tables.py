@@ -17,8 +17,8 @@ import h5py
 
 from analysis.monitor import parameters
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.study import unit_of
 from scenes.specs.result_names import by_new_names
+from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
 from twin.run.data_files import DataColumn, DataTable
 from twin.run.run_folder import MANIFEST

@@ -44,10 +44,10 @@ CORRELATIONS: Record[InteriorOrientation] = Record(
 LINE: Record[LineOrientation] = Record(
     "The joint model as a line of a payload's file: tan of the angle from the camera's Z is (y - y0) times "
     "(1 + k1 (y - y0)^2) / f, with y the place along the line. Units: axis, the camera's Z from the zero of the "
-    "angles, arcsec; focal_length and principal_point mm; k1 1/m^2; the covariance in these.",
+    "angles, arcsec; principal_distance and principal_point mm; k1 1/m^2; the covariance in these.",
     Quantity("terms", lambda line: LINE_TERMS, "names of the unknowns"),
     Quantity("values", lambda line: line.values * _LINE_UNIT, "unknowns"),
-    Quantity("sigma", lambda line: line.sigma * _LINE_UNIT, "standard deviations"),
+    Quantity("values_sigma", lambda line: line.sigma * _LINE_UNIT, "standard deviations"),
     Quantity("covariance", lambda line: line.covariance * np.outer(_LINE_UNIT, _LINE_UNIT), "of the unknowns"),
 )
 JOINT: Record[DistortionRun] = Record(

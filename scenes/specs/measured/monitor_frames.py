@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -21,6 +21,7 @@ from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, reso
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import PositiveLength
 from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, one_given, short_for, validate
 from scenes.yaml.units import MOMENT, parse_quantity
@@ -61,20 +62,26 @@ class GeometrySpec(Spec):
     """What the formulas need of one camera's monitor, where the instrument is not modelled.
 
     Attributes:
-        focal_length: principal distance, metres.
+        principal_distance: along the line, metres.
         separation: distance of the two area CCDs, metres.
-        pixel: pitch of their pixels, metres.
+        pitch: of their pixels, metres.
         look: angle of the camera's line of sight about the base's Y, radians.
         field: angle from the visual axis at which the area CCDs stand, radians.
-        focal_length_across: plate scale across the line, metres; the focal length by default.
+        principal_distance_across: plate scale across the line, metres; the principal distance by default.
     """
 
-    focal_length: PositiveLength
+    old_keys: ClassVar[OldKeys] = {
+        "focal_length": "principal_distance",
+        "focal_length_across": "principal_distance_across",
+        "pixel": "pitch",
+    }
+
+    principal_distance: PositiveLength
     separation: PositiveLength
-    pixel: PixelPitch
+    pitch: PixelPitch
     look: LookAngle = 0.0
     field: FieldPlace = 0.0
-    focal_length_across: PositiveLength | None = None
+    principal_distance_across: PositiveLength | None = None
 
 
 class MeasurementSpec(Spec):

@@ -1,13 +1,14 @@
 """The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.yaml.errors import Problem
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
@@ -153,7 +154,7 @@ class OrbitAngleSpec(TitledSpec):
             lines of a payload are ideal projections, those of an instrument are traced, one for each of its cameras.
         angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, aft]
             where the camera has these lines, or alpha between the lines of a camera that has two.
-        changes: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
+        perturb: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
             vector in body axes, for an instrument node path -> perturbation as in a job.
         earth: its rotation.
         orbit: true orbit.
@@ -167,9 +168,11 @@ class OrbitAngleSpec(TitledSpec):
         seed: of every random number.
     """
 
+    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
+
     camera: Reference
     angles: Angles = None
-    changes: Paths[Change] = Field(default_factory=dict, validate_default=True)
+    perturb: Paths[Change] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     orbit: OrbitSpec
     attitude: AttitudeSpec = AttitudeSpec()

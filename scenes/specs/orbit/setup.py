@@ -160,17 +160,17 @@ def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
     is built.
     """
-    _require_lines(test, test.changes, lines)
-    for name, change in test.changes.items():
+    _require_lines(test, test.perturb, lines)
+    for name, change in test.perturb.items():
         for action in change.uses():
             if action != "rotate":
                 allowed = "a rotation, or an instrument of traced cameras instead of a payload"
                 raise test.error(
-                    f"a payload's line does not allow {action}", ("changes", name, action), allowed=allowed
+                    f"a payload's line does not allow {action}", ("perturb", name, action), allowed=allowed
                 )
         if change.pivot != DEFAULT_PIVOT:
             problem = "a payload's line has no pivots"
-            raise test.error(problem, ("changes", name, "pivot"), found=change.pivot, allowed="no pivot")
+            raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")
 
 
 class CalibrationSetup(ExperimentSetup[OrbitCalibrationSpec]):
@@ -313,12 +313,12 @@ def resolve_simulate(path: str | Path) -> SimulateSetup:
 def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:
     """InputError unless all lines that are named exist and can be rendered, and the patch lies on one of them."""
     names = tuple(camera.lines)
-    named = [(("patch", "line"), test.patch.line), *((("changes", name), name) for name in test.changes)]
+    named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
     for key, name in [*((("lines",), name) for name in test.lines), *named]:
         if name not in names:
             allowed = f"{names_text(names)}, the lines of {camera.name}"
             raise test.error(unknown("no such line", name, names, allowed=allowed), key)
-    _require_places(test, test.changes, camera)
+    _require_places(test, test.perturb, camera)
     _require_images_of(test, test.lines, camera)
     line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
     _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
@@ -332,12 +332,12 @@ def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec
         found = f"{names_text(tuple(camera.lines))} in {camera.name}"
         problem = f"the camera has no {' and no '.join(missing)} line"
         raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
-    _require_lines(test, test.changes)
-    _require_places(test, (*test.changes, *test.drift), camera)
-    if "nadir" in test.changes and any(test.changes["nadir"].principal_point):
+    _require_lines(test, test.perturb)
+    _require_places(test, (*test.perturb, *test.drift), camera)
+    if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
         raise test.error(
             "the nadir line's principal point is the gauge",
-            ("changes", "nadir", "principal_point"),
+            ("perturb", "nadir", "principal_point"),
             allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
         )
     fewest = min(camera.pixels_of(name) for name in LINES)
@@ -359,14 +359,14 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
-            raise test.error(problem, ("changes", name), allowed="a line with `shift` and `rotate` of its CCDs")
+            raise test.error(problem, ("perturb", name), allowed="a line with `shift` and `rotate` of its CCDs")
 
 
 def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = LINES) -> None:
     """InputError unless every change is one of a line."""
     for name in changes:
         if name not in lines:
-            raise test.error(unknown("no such line", name, lines), ("changes", name))
+            raise test.error(unknown("no such line", name, lines), ("perturb", name))
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:

@@ -106,7 +106,7 @@ def monitored(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Ad
         if factor == 0.0:
             metres = height_per_arcsec(campaign)
         advance("drift", k + 1, len(FACTORS))
-    angles = [one.angles[0] for one in setup.test.drift.values() if any(one.angles) or one.focal_length]
+    angles = [one.angles[0] for one in setup.test.drift.values() if any(one.angles) or one.principal_distance]
     return Monitoring(tuple(sizes), float(np.sqrt(np.mean(np.square(angles or [0.0])))), metres)
 
 
@@ -118,7 +118,10 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
     test = setup.test
     drift = {
         name: one.model_copy(
-            update={"angles": tuple(factor * v for v in one.angles), "focal_length": factor * one.focal_length}
+            update={
+                "angles": tuple(factor * v for v in one.angles),
+                "principal_distance": factor * one.principal_distance,
+            }
         )
         for name, one in test.drift.items()
     }

@@ -56,7 +56,7 @@ def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> F
     if not spec.drift:
         return FrozenMap({})
     unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
-    sigma = {name: np.array([*one.angles, one.focal_length]) for name, one in spec.drift.items()}
+    sigma = {name: np.array([*one.angles, one.principal_distance]) for name, one in spec.drift.items()}
     return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
 
 
@@ -80,7 +80,7 @@ def _sample_readings(
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
     """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
     assert spec.monitor is not None
-    return np.array([*spec.monitor.angles, spec.monitor.focal_length])
+    return np.array([*spec.monitor.angles, spec.monitor.principal_distance])
 
 
 _LEAST_IMAGE = 0.02

@@ -126,7 +126,7 @@ def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
         "Interior orientation of a line and its mounting in the body.",
         Quantity("pixels", camera.pixels_of),
         Quantity("pitch_m", camera.pitch_of),
-        Quantity("principal_distance_m", lambda name: camera.lines[name].focal_length),
+        Quantity("principal_distance_m", lambda name: camera.lines[name].principal_distance),
         Quantity("principal_point_m", lambda name: camera.lines[name].principal_point),
         Quantity("k1_per_m2", lambda name: camera.lines[name].k1),
         Quantity("k2_per_m4", lambda name: camera.lines[name].k2),

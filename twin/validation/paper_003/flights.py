@@ -216,7 +216,7 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
 def _per_shift(setup: CalibrationSetup) -> float:
     """Error of a height for a shift of the forward line along the track: flat ground, intersected with the aft line."""
     line = setup.camera.lines["forward"]
-    turn = np.cos(line.look) ** 2 / line.focal_length
+    turn = np.cos(line.look) ** 2 / line.principal_distance
     return float(height_error(turn, setup.test.altitude / np.cos(line.look), 2.0 * line.look, line.look))
 
 
