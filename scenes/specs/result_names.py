@@ -56,6 +56,7 @@ RENAMED: tuple[Renamed, ...] = (
     Renamed("heldout_points.sigma_arcsec", "mean_arcsec_sigma", ("turntable.json",)),
     Renamed("sigma_raw_um", "distortion_raw_um_sigma", ("distortion.json",)),
     Renamed("sigma_um", "distortion_compensated_um_sigma", ("distortion.json",)),
+    Renamed("line.sigma", "values_sigma", ("distortion.json",)),
     Renamed("sigma_mm", "values_mm_sigma", ("distortion.json",)),
     Renamed("sigma_lines_px", "displacement_lines_px_sigma", ("match.json", "simulate.json")),
     Renamed("sigma_pixels_px", "displacement_pixels_px_sigma", ("match.json", "simulate.json")),

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import pytest
 
+from docs.renamed import PAGE, page
 from scenes.kinds.file_kinds import FILE_KINDS
 from scenes.specs.measured.monitor_frames import GeometrySpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
@@ -74,9 +75,9 @@ def test_several_old_keys_in_one_mapping(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_new_names_are_keys_and_old_ones_are_not() -> None:
-    assert FILE_KINDS  # which imports every kind of file
+    assert all(issubclass(kind.model, Spec) for kind in FILE_KINDS)  # which imports them
     found = [spec for spec in every_spec() if spec.old_keys and spec.__module__.startswith("scenes.")]
-    assert len(found) >= 8
+    assert len(found) >= 10
     for spec in found:
         for old, new in spec.old_keys.items():
             assert new in spec.model_fields, (spec, new)
@@ -139,3 +140,7 @@ def test_a_study_may_ask_for_an_old_key(capsys: pytest.CaptureFixture[str]) -> N
     assert found.units == "m/arcsec"
     assert "note: study.yaml:1: key: is called 'height_m_per_arcsec' now" in capsys.readouterr().err
     assert key_now(("truth", "cameras", 0, "d_f_um")) == ("truth", "cameras", 0, "d_f_um")
+
+
+def test_the_note_to_users_is_the_tables() -> None:
+    assert PAGE.read_text("utf-8") == page(), "python -m docs.renamed"

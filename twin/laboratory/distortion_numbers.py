@@ -29,7 +29,7 @@ POINTS: Record[DistortionRun] = Record(
     Quantity("distortion_raw_um", lambda r: r.raw.distortion, "D with angles as read"),
     Quantity("distortion_compensated_um", lambda r: r.compensated.distortion, "D", "D", 2),
     Quantity("distortion_raw_um_sigma", lambda r: r.raw.sigma, "standard deviation of D with angles as read"),
-    Quantity("distortion_compensated_um_sigma", lambda r: r.compensated.sigma, "standard deviation of D", decimals=2),
+    Quantity("distortion_compensated_um_sigma", lambda r: r.compensated.sigma, "standard deviation of D", "sigma", 2),
     Quantity("residual_raw_um", lambda r: r.raw.smooth.residual, "from a smooth curve, with angles as read"),
     Quantity("residual_compensated_um", lambda r: r.compensated.smooth.residual, "from a curve", "from smooth", 2),
     Quantity("rms_over_sets_raw_um", lambda r: r.raw.rms_over_sets, "RMS of D of single sets, angles as read"),

@@ -57,9 +57,9 @@ def _monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
             f"The monitor reads each camera in each pass with {_angles(spec.monitor.angles)} and Δf "
             f"{format_quantity(spec.monitor.principal_distance, LENGTH)}, 1σ. Where a field is calibrated, its "
             "readings are observations of the drift, so that the interior orientation is that of the reference state; "
-            "where a field is tested, the reference cameras are drifted by its own readings. What a reading has in common in all "
-            "passes, the interior orientation takes up. Biases of the attitude, which act in plan, a monitor of the "
-            "cameras does not read."
+            "where a field is tested, the reference cameras are drifted by its own readings. What a reading has in "
+            "common in all passes, the interior orientation takes up. Biases of the attitude, which act in plan, a "
+            "monitor of the cameras does not read."
         )
     artefacts: list[Artefact] = [
         SvgFigure(
