@@ -77,7 +77,7 @@ def under_new_names(value: Any, renamed: OldKeys) -> Any:
     return {renamed.get(key, key): one for key, one in value.items()} if old else value
 
 
-def tell(file: str, lines: Mapping[KeyPath, int], renamed: Mapping[KeyPath, str]) -> None:
+def tell(file: str, lines: Mapping[KeyPath, int | None], renamed: Mapping[KeyPath, str]) -> None:
     """Write a note on stderr for every old name, once in a process."""
     for path, new in renamed.items():
         line = lines.get(path)

@@ -1,13 +1,17 @@
 """Old names of keys: read with a note where they stand, and never beside the new one."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import ClassVar
 
 import pytest
 
 from docs.renamed import PAGE, page
 from scenes.kinds.file_kinds import FILE_KINDS
+from scenes.specs.load import LIBRARY, PAYLOADS, SCENES
 from scenes.specs.measured.monitor_frames import GeometrySpec
+from scenes.specs.orbit.angle import LINES, three_lines, usual_angles
+from scenes.specs.orbit.setup import resolve_calibration
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.result_names import RENAMED, by_new_names, head_now, key_now
 from scenes.specs.study import ResponseSpec
@@ -140,6 +144,22 @@ def test_a_study_may_ask_for_an_old_key(capsys: pytest.CaptureFixture[str]) -> N
     assert found.units == "m/arcsec"
     assert "note: study.yaml:1: key: is called 'height_m_per_arcsec' now" in capsys.readouterr().err
     assert key_now(("truth", "cameras", 0, "d_f_um")) == ("truth", "cameras", 0, "d_f_um")
+
+
+def test_a_payload_with_an_old_line_is_one_of_three_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its line keeps the name that the user's files and tables have for it."""
+    text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
+    (tmp_path / "own.yaml").write_text(text.replace("  backward:", "  aft:"), "utf-8")
+    test = (SCENES / "orbit/calibrate.yaml").read_text("utf-8").replace("camera: th1", "camera: own.yaml")
+    (tmp_path / "calibrate.yaml").write_text(test.replace("  backward:", "  aft:"), "utf-8")
+    setup = resolve_calibration(tmp_path / "calibrate.yaml")
+    assert three_lines(setup.camera.lines) == ("forward", "nadir", "aft")
+    assert "own.yaml:22: lines.aft: is called 'backward' now" in capsys.readouterr().err
+    assert usual_angles(("forward", "nadir", "aft")) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+    assert three_lines(("forward", "nadir", "backward", "aft")) == LINES
+    (tmp_path / "calibrate.yaml").write_text(test, "utf-8")
+    with pytest.raises(InputError, match=r"perturb.backward: no such line.*forward, nadir, aft"):
+        resolve_calibration(tmp_path / "calibrate.yaml")
 
 
 def test_the_note_to_users_is_the_tables() -> None:

@@ -37,7 +37,7 @@ def payload(**lines) -> ThreeLineCameraSpec:
 
 
 def test_the_file() -> None:
-    assert list(TH1.lines) == ["forward", "nadir", "aft", "high_resolution", "multispectral"]
+    assert list(TH1.lines) == ["forward", "nadir", "backward", "high_resolution", "multispectral"]
     ground = {"high_resolution": 2.0, "multispectral": 10.0}
     for (name, line), degrees in zip(TH1.lines.items(), (25, 0, -25, 2, 0), strict=True):
         pixels, pitch = TH1.pixels_of(name), TH1.pitch_of(name)
@@ -87,7 +87,7 @@ def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:
         assert ends[0, 1] > 0.05
         assert ends[1, 1] < -0.05
     assert cameras["forward"].look(np.array([6000.0]))[0, 0] > 0.42
-    assert cameras["aft"].look(np.array([6000.0]))[0, 0] < -0.42
+    assert cameras["backward"].look(np.array([6000.0]))[0, 0] < -0.42
 
 
 def test_fifth_order_distortion_and_slope() -> None:
@@ -195,7 +195,7 @@ def test_a_turn_within_the_plane_changes_the_look_but_not_the_planes() -> None:
     """A camera rolled by w about its own X keeps its plane; the angle of the looks has cos = cos a cos w exactly."""
     a, w = math.radians(25.0), math.radians(1.5)
     cameras = line_cameras(
-        payload(nadir={"look": "0 deg"}, aft={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
+        payload(nadir={"look": "0 deg"}, backward={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
     )
     assert dihedral_angle(*cameras.values()) == pytest.approx(a, abs=1e-13)
     assert look_angle(*cameras.values()) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)

@@ -164,7 +164,7 @@ IMAGES = {
     "correlation of 2": (lambda t: _with_column(t, "correlation", "2.0"), [":2: correlation", "out of range"]),
     "with a unit": (swapped("pixel", "pixel [mm]"), [":1: pixel [mm]", "no unit"]),
     "one camera": (
-        lambda t: "\n".join(r for r in t.split("\n") if "nadir" not in r and "aft" not in r),
+        lambda t: "\n".join(r for r in t.split("\n") if "nadir" not in r and "backward" not in r),
         ["no check point is seen by two"],
     ),
     "no number": (cell(5, 2, "1_000"), [":5: line", "not a number"]),

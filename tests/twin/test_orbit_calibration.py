@@ -116,7 +116,7 @@ def test_numbers_say_what_their_sigmas_hold(full) -> None:
     data = CALIBRATION(full)
     found, plain = data["parameters"], simultaneous(full.campaign).sigma
     expected = SETUP.test.launch.interior
-    for name in ("forward x", "aft x"):
+    for name in ("forward x", "backward x"):
         one = found[name]
         assert abs(one["value"] - one["truth"]) < 4.0 * one["sigma"]
         assert one["sigma"] > 1.2 * plain[name]
@@ -145,7 +145,7 @@ def test_errors_of_the_outer_lines_are_as_large_as_their_sigmas() -> None:
         rates = rate_priors(campaign, latitude_fits(campaign, simultaneous(campaign)))
         found = simultaneous(campaign, rates)
         true = dict(zip(found.names, true_values(campaign, found.names), strict=True))
-        z.append([(found.value(n) - true[n]) / found.sigma[n] for n in ("forward x", "aft x", "pitch rate")])
+        z.append([(found.value(n) - true[n]) / found.sigma[n] for n in ("forward x", "backward x", "pitch rate")])
     assert np.abs(np.mean(z, axis=0)).max() < 4.0 / np.sqrt(24)
     size = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all((size > 0.5) & (size < 1.5))
@@ -164,14 +164,14 @@ def test_sigmas_are_those_of_the_paper(full) -> None:
 
 @pytest.mark.second
 def test_before_calibration_errors_are_of_the_100_m_class(full) -> None:
-    """By hand: in plan roll and pitch times 500 km, in height the change of x of forward minus aft, an angle a that
-    moves a point by 500 km a / cos^2 25 deg, over the base, 2 tan 25 deg. In plan 30%, for changes of y and f are left
-    out; in height 10%, for the curved Earth lets the outer rays converge more steeply."""
+    """By hand: in plan roll and pitch times 500 km, in height the change of x of forward minus backward, an angle a
+    that moves a point by 500 km a / cos^2 25 deg, over the base, 2 tan 25 deg. In plan 30%, for changes of y and f are
+    left out; in height 10%, for the curved Earth lets the outer rays converge more steeply."""
     test = SETUP.test
     shift = np.hypot(*test.errors.star_tracker.bias[:2]) * 500e3
-    x = {k: test.perturb[k].principal_point[0] / 0.65 for k in ("forward", "aft")}
+    x = {k: test.perturb[k].principal_point[0] / 0.65 for k in ("forward", "backward")}
     look = np.radians(25.0)
-    height = abs(x["forward"] - x["aft"]) * 500e3 / np.cos(look) ** 2 / (2.0 * np.tan(look))
+    height = abs(x["forward"] - x["backward"]) * 500e3 / np.cos(look) ** 2 / (2.0 * np.tan(look))
     for errors in full.before.values():
         assert 50.0 < errors.plan_rms < 200.0
         assert errors.plan_rms == pytest.approx(shift, rel=0.3)
@@ -498,7 +498,7 @@ def test_command(full, tmp_path: Path) -> None:
     assert set(INNER) <= set(data["parameters"])
     assert {"value", "sigma", "truth"} <= set(data["parameters"]["forward f"])
     truth = interior_of_the_file()
-    assert data["parameters"]["aft y"]["truth"] == pytest.approx(truth["aft y"], rel=1e-12)
+    assert data["parameters"]["backward y"]["truth"] == pytest.approx(truth["backward y"], rel=1e-12)
     matrix, names = np.array(data["correlations"]["matrix"]), data["correlations"]["names"]
     assert matrix.shape == (len(names), len(names))
     assert set(data["schemes"]) == {"1", "2", "3", "4", "5"}

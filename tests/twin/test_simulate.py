@@ -20,7 +20,7 @@ SIZE = "lines: 1000, pixels: 1000}"
 SMALL = "lines: 64, pixels: 80}"
 # such small images have no room for templates
 POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
-LINES = ("forward", "nadir", "aft")
+LINES = ("forward", "nadir", "backward")
 
 
 def write(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -129,7 +129,7 @@ def test_the_seed_decides(folder: Path, tmp_path: Path) -> None:
 # what is wrong, key, what to do about it
 BAD = {
     "no size": (SMALL, "lines: 0, pixels: 80}", "patch.lines", ["16"]),
-    "line": ("lines: [forward, nadir, aft]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
+    "line": ("lines: [forward, nadir, backward]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
     "edge": ("pixel: 6000", "pixel: 40", "patch", ["reaches into", "nadir"]),
     "short before": ("before: 60 s ", "before: 20 s ", "orbit", ["before the orbit data begin", "longer"]),
     "short after": ("after: 60 s", "after: 20 s", "orbit", ["after the orbit data end", "longer"]),

@@ -5,7 +5,16 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma, Relief, TerrainHeight, check_ends
+from scenes.specs.orbit.angle import (
+    LINES,
+    OLD_LINES,
+    DatumShift,
+    EffectsSpec,
+    GroundSigma,
+    Relief,
+    TerrainHeight,
+    check_ends,
+)
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text, unknown
@@ -66,7 +75,7 @@ class StripSpec(Spec):
 
 def _of_lines(drift: Named[CameraDriftSpec]) -> Named[CameraDriftSpec]:
     for name in drift:
-        if name not in LINES:
+        if name not in (*LINES, *OLD_LINES):
             raise unknown("no such line", name, LINES, (name,))
     return drift
 
@@ -258,7 +267,7 @@ class OrbitCalibrationSpec(TitledSpec):
     Attributes:
         name: as the file is called.
         description: for people.
-        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and aft.
+        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and backward.
         perturb: line -> how its interior has changed since the laboratory. The nadir line's principal point is the
             gauge and does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
         earth: its rotation.

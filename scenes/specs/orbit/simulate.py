@@ -62,7 +62,7 @@ class OrbitSimulateSpec(TitledSpec):
     old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
 
     camera: Reference
-    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "aft")
+    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")
     perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     orbit: OrbitSpec

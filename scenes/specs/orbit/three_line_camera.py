@@ -118,7 +118,7 @@ class ThreeLineCameraSpec(TitledSpec):
         description: for people.
         pixels: of each line that does not say its own; pixel 0 is at its -y end.
         pitch: of their pixels, metres.
-        lines: by name; normally forward, nadir and aft, in the order in which they see a point on the ground, then
+        lines: by name; normally forward, nadir and backward, in the order in which they see a point on the ground, then
             others such as a high-resolution and a multispectral one.
         image: how lines that do not say it themselves form and record their images; only rendering needs it.
     """

@@ -18,7 +18,6 @@ from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_prior
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.angle import LINES
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
@@ -188,7 +187,7 @@ def height_per_arcsec(campaign: Campaign) -> float:
 
 def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.simulated)
-    return [p for line in LINES for p in monitor_priors(one.name, line, one.readings[line], sigma)]
+    return [p for line, told in one.readings.items() for p in monitor_priors(one.name, line, told, sigma)]
 
 
 def _scheme(campaign: Campaign, alone: Mapping[str, Adjustment], names: tuple[str, ...], one: FieldPass) -> CheckErrors:
