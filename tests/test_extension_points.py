@@ -282,7 +282,7 @@ BAR = (8, 60)
 """Width and length of the toy target, pixels."""
 
 
-DERIVED = Formula("derived", "", "")
+DERIVED = Formula("derived", "")
 """The corrected formulas themselves."""
 
 

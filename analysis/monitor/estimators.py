@@ -143,15 +143,19 @@ class Formula(OfEachCamera):
     """A set of formulas of `analysis.monitor.monitoring`.
 
     Attributes:
-        name: there.
-        title, note: for readers.
+        name: there and in files.
+        note: for readers.
         exact: the formulas as they are, where they are not linear.
     """
 
     name: str
-    title: str
     note: str
     exact: Exact | None = None
+
+    @property
+    def title(self) -> str:  # type: ignore[override]
+        """The name with blanks."""
+        return self.name.replace("_", " ")
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
         """To cameras with a left and a right spot.
@@ -229,13 +233,11 @@ class Posterior(Estimator):
 ESTIMATORS: dict[str, Estimator] = {
     "paper_single": Formula(
         "paper_single",
-        "paper single",
         "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed, one change at a time",
         monitoring.paper_single,
     ),
-    "paper_joint": Formula("paper_joint", "paper joint", "joint changes as Wang et al. (2018) print them"),
+    "paper_joint": Formula("paper_joint", "joint changes as Wang et al. (2018) print them"),
     "derived": Formula(
-        "derived",
         "derived",
         "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
     ),

@@ -16,9 +16,11 @@ from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.result_names import RENAMED, by_new_names, head_now, key_now
 from scenes.specs.study import ResponseSpec
 from scenes.yaml import old_keys
+from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import InputError
 from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.spec import Spec, validate
+from scenes.yaml.units import LENGTH
 from scenes.yaml.yaml_file import parse_yaml
 
 PAYLOAD = """\
@@ -160,6 +162,21 @@ def test_a_payload_with_an_old_line_is_one_of_three_lines(tmp_path: Path, capsys
     (tmp_path / "calibrate.yaml").write_text(test, "utf-8")
     with pytest.raises(InputError, match=r"perturb.backward: no such line.*forward, nadir, aft"):
         resolve_calibration(tmp_path / "calibrate.yaml")
+
+
+def test_an_old_head_of_a_table_is_read_with_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    columns = (Column("line_sigma", old="sigma_line"), Column("x_sigma", LENGTH, needed=False, old="sigma_x"))
+    path = tmp_path / "points.csv"
+    path.write_text("sigma_line,sigma_x [mm]\n0.5,2\n", "utf-8")
+    table = read_table(path, columns)
+    assert (table["line_sigma"][0], table["x_sigma"][0]) == (0.5, 2e-3)
+    assert table.heads["x_sigma"] == "sigma_x [mm]"
+    told = capsys.readouterr().err
+    assert f"note: {path}:1: sigma_line: is called 'line_sigma' now" in told
+    assert "is called 'x_sigma' now" in told
+    path.write_text("sigma_line,line_sigma\n0.5,0.5\n", "utf-8")
+    with pytest.raises(InputError, match="another column holds the same"):
+        read_table(path, columns)
 
 
 def test_the_note_to_users_is_the_tables() -> None:

@@ -233,7 +233,7 @@ def check_files(
     attitude_csv(folder / "attitude.csv")
     ground, images = measured_points(seed, count, wrong)
     csv(folder / "ground.csv", ("point", "latitude [deg]", "longitude [deg]", "height [m]"), *zip(*ground, strict=True))
-    heads = ("point", "camera", "line", "pixel", "sigma_line", "sigma_pixel")
+    heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma")
     csv(folder / "image_points.csv", heads, *zip(*images, strict=True))
     times = [
         (name, k, calendar(FIRST + k * LINE_TIME, digits=9))

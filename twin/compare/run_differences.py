@@ -323,7 +323,7 @@ def is_sigma(key: str) -> bool:
 
 def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
     """Sigma of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both
-    runs, else ``x_sigma``, ``sigma_x`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
+    runs, else ``x_sigma`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
     of the same motions, and does not scatter between them.
 
     Args:
@@ -333,7 +333,7 @@ def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tu
     """
     file, key = place
     head, dot, last = key.rpartition(".")
-    names = (f"{last}_sigma_noise", f"{last}_sigma", f"sigma_{last}", *(("sigma",) if last == "value" else ()))
+    names = (f"{last}_sigma_noise", f"{last}_sigma", *(("sigma",) if last == "value" else ()))
     for name in names:
         both = [run.get((file, f"{head}{dot}{name}")) for run in (reference, other)]
         if all(_is_number(value) for value in both):

@@ -38,7 +38,7 @@ Files = Annotated[tuple[Reference, ...], short_for(None, str, schema=Reference |
 
 
 PerChannel = Annotated[Paths[Files], short_for(ALL, str, list, schema=Files | dict[str, Files]), Field(min_length=1)]
-"""Image files by channel, ``CAMERA/SIDE``, or for all."""
+"""Image files by channel, ``CAMERA/CHANNEL``, or for all."""
 FirstPixel = tuple[Annotated[Whole, Field(ge=0, le=65535)], Annotated[Whole, Field(ge=0, le=65535)]]
 
 
@@ -91,8 +91,8 @@ class MeasurementSpec(Spec):
         instrument: name of an instrument in scenes/library/instruments, or path of an own file: its model gives the
             spots' shape and what moves them.
         geometry: camera -> the few numbers of the formulas, in place of an instrument.
-        frames: folder with CAMERA_SIDE_before.tiff and CAMERA_SIDE_after.tiff (or .fits), a CSV table of files, or
-            CAMERA/SIDE -> files.
+        frames: folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files,
+            or CAMERA/CHANNEL -> files.
         times: of a series, of each entry of `after`.
         disturbances: what is expected to move, on which the sigmas rest, as in a job.
         template: where the calibrated shape of the spots is from: `twin`, or `measured` from the frames before.
@@ -162,7 +162,7 @@ class MeasurementSpec(Spec):
         if isinstance(self.frames, str):
             return self
         if not self.frames:
-            raise Problem("no frames", None, "CAMERA/SIDE: {before: FILE, after: FILE}", within=("frames",))
+            raise Problem("no frames", None, "CAMERA/CHANNEL: {before: FILE, after: FILE}", within=("frames",))
         for name, files in self.frames.items():
             where = ("frames", name, "after")
             if self.times is not None and len(files.after) != len(self.times):
@@ -214,7 +214,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """``CAMERA/SIDE`` of every channel, in the order of the spots."""
+        """``CAMERA/CHANNEL`` of every channel, in the order of the spots."""
         return _channels(self.test, self.model)
 
 
@@ -311,7 +311,7 @@ def _found(
     if is_file(place) and place.suffix.lower() == ".csv":
         return read_frame_table(place, channels)
     if is_file(place):
-        allowed = "a folder of frames, a .csv table of files, or CAMERA/SIDE: {before: FILE, after: FILE}"
+        allowed = "a folder of frames, a .csv table of files, or CAMERA/CHANNEL: {before: FILE, after: FILE}"
         raise spec.error("neither a folder nor a table", ("frames",), found=spec.frames, allowed=allowed)
     try:
         names = sorted(one.name for one in place.iterdir())
@@ -327,7 +327,7 @@ def _found(
             if file is None:
                 meant = nearest(f"{stem}.tiff", names)
                 text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
-                allowed = f"{stem}.tiff (or {others}), or CAMERA/SIDE: {{before: FILE, after: FILE}}"
+                allowed = f"{stem}.tiff (or {others}), or CAMERA/CHANNEL: {{before: FILE, after: FILE}}"
                 raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
             files[when] = (str((place / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))

@@ -293,7 +293,7 @@ class ImagePointsFileSpec(Spec):
     """Where lines see ground points: a table of point, camera, line, pixel and their sigmas.
 
     Attributes:
-        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `sigma_line`, `sigma_pixel` and perhaps
+        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
             `correlation`.
         centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
         first_pixel: number of the first pixel of a line.
