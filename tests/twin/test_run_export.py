@@ -236,7 +236,7 @@ def test_spots_and_readings_are_those_of_the_run(run, exported, tables) -> None:
     spots = read_back(exported[tables] / f"tables/spots.{tables}")
     assert len(spots["row"]) == 8
     for k in range(8):
-        own = found["spots"][spots["camera"][k]][spots["side"][k]][spots["state"][k]]
+        own = found["spots"][spots["camera"][k]][spots["channel"][k]][spots["state"][k]]
         assert {name: spots[name][k] for name in own} == own
     readings = read_back(exported[tables] / f"tables/readings.{tables}")
     assert len(readings["camera"]) == sum(len(one) for one in found["cameras"].values())
