@@ -59,7 +59,7 @@ class Instrument:
         """Camera -> distance of its pair of area CCDs (the papers' L), metres; without a pair the largest of two."""
         out = {}
         for name in self.cameras:
-            places = {c.side: c.ccd[1] for c in self.channels if c.camera == name}
+            places = {c.name: c.ccd[1] for c in self.channels if c.camera == name}
             pair = [places[side] for side in SIDES] if set(SIDES) <= set(places) else list(places.values())
             out[name] = abs(max(pair) - min(pair))
         return out

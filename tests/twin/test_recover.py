@@ -44,7 +44,7 @@ def images(run, tmp_path_factory):
     folder.mkdir()
     for i, channel in enumerate(run.experiment.path.channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
-            (folder / f"{channel.camera}_{channel.side}_{when}.tiff").write_bytes(tiff(frames, FrameFacts()))
+            (folder / f"{channel.camera}_{channel.name}_{when}.tiff").write_bytes(tiff(frames, FrameFacts()))
     return folder
 
 
@@ -95,7 +95,7 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     """
     text = HEAD + "times: [0 min, 10 min, 20 min]\nframes:\n"
     for channel in run.experiment.path.channels:
-        key = f"{channel.camera}_{channel.side}"
+        key = f"{channel.camera}_{channel.name}"
         before, after = (tifffile.imread(images / f"{key}_{when}.tiff") for when in ("before", "after"))
         tifffile.imwrite(tmp_path / f"{key}_b.tif", before[:, 10:86, 8:90], photometric="minisblack")
         for name, frames in (("a0", after[:4]), ("a1", before), ("a2", after[4:])):
@@ -156,7 +156,7 @@ def test_dark_and_flat_frames_take_the_pattern_off(run, images, backend, tmp_pat
     for what, frames in (("dark", dark), ("flat", flat)):
         text += f"{what}:\n"
         for i, channel in enumerate(run.experiment.path.channels):
-            name = f"{what}_{channel.camera}_{channel.side}.fits"
+            name = f"{what}_{channel.camera}_{channel.name}.fits"
             fits.PrimaryHDU(frames[i]).writeto(tmp_path / name)
             text += f"  {channel.key}: {name}\n"
     found = measured(tmp_path, text, backend, run)

@@ -117,7 +117,7 @@ class LiveBench:
         return {
             "instrument": twin.name,
             "cameras": list(twin.cameras),
-            "channels": [{"key": c.key, "camera": c.camera, "side": c.side} for c in experiment.path.channels],
+            "channels": [{"key": c.key, "camera": c.camera, "name": c.name} for c in experiment.path.channels],
             "rows": experiment.path.shape[0],
             "columns": experiment.path.shape[1],
             "pitch_um": 1e6 * experiment.path.pitch,
