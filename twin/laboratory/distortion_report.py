@@ -78,7 +78,7 @@ def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str]
             angles = f"as read, each good to {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
         facts += [
             ("angles", f"{angles}; the line's middle is imaged at {format_quantity(files.zero, ANGLE)}"),
-            ("focal length, about", format_quantity(run.about, LENGTH)),
+            ("principal distance, about", format_quantity(run.about, LENGTH)),
             *(("file", f"{one['file']}, {one['rows']} rows") for one in data["files"]),
         ]
     if isinstance(run, SimulatedDistortion):

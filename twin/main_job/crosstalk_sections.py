@@ -25,7 +25,7 @@ UNSEEN = 0.01
 
 
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Moves of the spots by each motion, and three ways to change the focal length."""
+    """Moves of the spots by each motion, and three ways to change the principal distance."""
     caption = (
         "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
@@ -39,7 +39,7 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
         labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
         first = _pretty(table.observability.statements[0].split(": ", 1), labels)
         points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_statements()]
-        title = f"Three ways to change the focal length of {name}: piston, despace, growth"
+        title = f"Three ways to change the principal distance of {name}: piston, despace, growth"
         parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
     return Section("What a motion does to the spots", (), tuple(parts), len(run.crosstalk), "motions")
 

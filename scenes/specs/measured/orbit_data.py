@@ -313,7 +313,7 @@ class UncertaintySpec(Spec):
         attitude: of the measured attitude with the camera's mounting, about each axis.
         position: of the orbit, along each axis.
         interior: of each line's place in the focal plane, pixels along and across it.
-        scale: of each line's focal length, relative.
+        scale: of each line's principal distance, relative.
         time: of the line times against those of orbit and attitude.
     """
 

@@ -190,7 +190,7 @@ class CalibrationImagesSpec(Spec):
     def _are_enough(self) -> "CalibrationImagesSpec":
         if len(self.patches) < LEAST_PATCHES:
             found = f"{len(self.patches)}"
-            problem = "too few patches to tell focal length from attitude"
+            problem = "too few patches to tell principal distance from attitude"
             raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
             found = f"control {self.points.control}, check {self.points.check}"
