@@ -1,7 +1,7 @@
 """Names in results that are others since a version: keys of JSON, columns of CSV, attributes of netCDF.
 
-The one table of them. Studies that ask for an old key and comparisons of runs with older ones read it, golden runs are
-held against older golden files by it, and docs/renamed.md, the note to users, is written from it.
+The one table of them. Studies that ask for an old key and comparisons of runs with older ones read it, and
+docs/renamed.md, the note to users, is written from it, by which golden runs are held against older golden files.
 """
 
 from __future__ import annotations
@@ -110,12 +110,6 @@ def by_new_names(tree: Any, file: str = "", above: tuple[str, ...] = ()) -> Any:
         file, above = f"{kind.partition(' ')[0]}.json", ()
     names = {key: (*above, str(key)) for key in tree}
     return {new_name(names[key], file): by_new_names(one, file, names[key]) for key, one in tree.items()}
-
-
-def head_now(head: str, file: str) -> str:
-    """The head of a column of a table, with its unit in brackets, by the name of now."""
-    name, bracket, unit = head.partition(" [")
-    return f"{new_name((name,), file)}{bracket}{unit}"
 
 
 def key_now(key: Iterable[str | int]) -> tuple[str | int, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-import re
 import tempfile
 import time
 from dataclasses import dataclass
@@ -13,10 +12,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from scenes.specs.result_names import by_new_names, head_now, new_name
 from tests.golden.compare import Comparison, compare, compare_elsewhere
 from tests.golden.fields import fields_of, kept_fields, write_fields
 from tests.golden.jobs import Job, run
+from tests.golden.renamed import fields_of_now, names_of_now
 from tests.golden.snapshot import Reader
 
 FOLDER = Path(__file__).parent
@@ -126,40 +125,6 @@ def write(job: Job) -> tuple[int, float]:
 
 def _compact(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"), ensure_ascii=False)
-
-
-def names_of_now(snapshot: dict[str, Any]) -> dict[str, Any]:
-    """A snapshot of an older version with the names that results have now: files by name, what was printed."""
-    return {place: _named(place.rpartition("/")[2], part) for place, part in snapshot.items()}
-
-
-def fields_of_now(kept: dict[str, Any]) -> dict[str, Any]:
-    """Fields of an older version's files, likewise."""
-    return {place: _named_fields(place.rpartition("/")[2], part) for place, part in kept.items()}
-
-
-def _named(file: str, part: Any) -> Any:
-    if file.endswith(".csv") and isinstance(part, dict) and isinstance(part.get("head"), list):
-        return part | {"head": [head_now(head, file) if isinstance(head, str) else head for head in part["head"]]}
-    return by_new_names(part, file) if file.endswith((".json", ".nc")) or file == "stdout" else part
-
-
-def _named_fields(file: str, part: dict[str, Any]) -> dict[str, Any]:
-    if "columns" in part:
-        return part | {"columns": [head_now(head, file) for head in part["columns"]]}
-    if "fields" in part:
-        return part | {"fields": {_path_now(path, file): sort for path, sort in part["fields"].items()}}
-    return part
-
-
-def _path_now(path: str, file: str) -> str:
-    """A path of fields by the names of now; what stands in braces is names of the run's own."""
-    parts = re.findall(r"(?:\{[^}]*\}|[^.{])+", path)
-    plain = [part.replace("[]", "") for part in parts]
-    return ".".join(
-        part if "{" in part else part.replace(plain[k], new_name(plain[: k + 1], file), 1)
-        for k, part in enumerate(parts)
-    )
 
 
 def check(job: Job) -> Outcome:

@@ -13,7 +13,7 @@ from scenes.specs.measured.monitor_frames import GeometrySpec
 from scenes.specs.orbit.angle import LINES, three_lines, usual_angles
 from scenes.specs.orbit.setup import resolve_calibration
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
-from scenes.specs.result_names import RENAMED, by_new_names, head_now, key_now
+from scenes.specs.result_names import RENAMED, by_new_names, key_now
 from scenes.specs.study import ResponseSpec
 from scenes.yaml import old_keys
 from scenes.yaml.csv_table import Column, read_table
@@ -124,8 +124,6 @@ def test_results_by_the_names_of_now() -> None:
     assert by_new_names({"focal_length_m": 1.0}, "optics.json") == {"focal_length_m": 1.0}
     assert by_new_names({"focal_length_m": 1.0}, "camera.json") == {"principal_distance_m": 1.0}
     assert by_new_names([{"beta_sigma_arcsec": 1.0}]) == [{"beta_arcsec_sigma": 1.0}]
-    assert head_now("sigma_row [px]", "spots.csv") == "row_sigma [px]"
-    assert head_now("side", "spots.csv") == "channel"
 
 
 def test_new_names_stay() -> None:

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
+from scenes.specs.result_names import RENAMED, new_name
 from scenes.yaml import old_keys
-from tests.golden.golden import fields_of_now, names_of_now
+from tests.golden.renamed import fields_of_now, name_now, names_of_now
 from twin.compare import run_differences
 from twin.scripting.procedures import _merged
 from twin.study.runs.base_job import key_now
@@ -99,3 +100,10 @@ def test_golden_files_of_an_older_version_are_held_against_the_names_of_now() ->
         "monitor.json": {"fields": {"propagation.height_m_sigma_noise[]": "number", "{a.b|side}.x[]": "text"}},
         "tables/spots.csv": {"columns": ["channel", "row_sigma [px]"]},
     }
+
+
+def test_the_golden_check_reads_the_table_that_users_read() -> None:
+    for one in RENAMED:
+        for file in one.files or ("",):
+            old, new = one.old.replace("*", "alpha"), one.new.replace("*", "alpha")
+            assert name_now(old.split("."), file) == new == new_name(old.split("."), file)
