@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import typer
+
 from scenes.kinds.file_kinds import FILE_KINDS
 from scenes.specs.result_names import RENAMED
 from scenes.yaml.spec import Spec
@@ -44,5 +46,10 @@ def page() -> str:
     return head + mark + tables()
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Write the tables of docs/renamed.md, the note to users on names that are others now."""
     PAGE.write_text(page(), "utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)
