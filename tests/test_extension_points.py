@@ -282,7 +282,7 @@ BAR = (8, 60)
 """Width and length of the toy target, pixels."""
 
 
-DERIVED = Formula("derived", "", "")
+DERIVED = Formula("derived", "")
 """The corrected formulas themselves."""
 
 
@@ -858,7 +858,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     # spots: as a whole they may turn; one mirror by an angle, about an axis square to the beams, is a facet by twice
     # that, and the spot moves by four times f; the focal length differs by 3 % across the line
     def turned(part: str, vector: tuple[float, float, float], pivot: str = "origin") -> State:
-        return {f"base/{c.camera}/monitor/{c.side}/{part}": Motion(rotate=vector, pivot=pivot) for c in channels}
+        return {f"base/{c.camera}/monitor/{c.name}/{part}": Motion(rotate=vector, pivot=pivot) for c in channels}
 
     channels = instrument.channels
     whole = [turned(prism, tuple(TURN * np.eye(3)[a]), "centre") for prism in PRISMS for a in range(3)]

@@ -86,7 +86,7 @@ def main(
 
     A job with a course, a table of temperatures and motions over time (scenes/examples/orbit.yaml, launch.yaml and
     heat_soak.yaml), also gets every time's numbers and images: course.json, course.nc and
-    images/CAMERA_SIDE_course.tiff.
+    images/CAMERA_CHANNEL_course.tiff.
 
     With `render: {images: [spots, knife_edge, bars]}` (also star and pinhole) test targets at infinity are imaged on
     every camera's panchromatic line CCD, in its middle and near its ends, before and after; mtf.json has the MTF

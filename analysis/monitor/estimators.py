@@ -78,7 +78,7 @@ class Estimator(ABC):
     """Makes changes of all cameras of the shifts of all spots.
 
     Attributes:
-        title: for readers, a word or two.
+        title: for readers, its name in files with blanks.
         note: for readers, what it is.
         stated: whether it needs stated disturbances; without any it does not stand in the results.
     """
@@ -143,15 +143,19 @@ class Formula(OfEachCamera):
     """A set of formulas of `analysis.monitor.monitoring`.
 
     Attributes:
-        name: there.
-        title, note: for readers.
+        name: there and in files.
+        note: for readers.
         exact: the formulas as they are, where they are not linear.
     """
 
     name: str
-    title: str
     note: str
     exact: Exact | None = None
+
+    @property
+    def title(self) -> str:  # type: ignore[override]
+        """The name with blanks."""
+        return self.name.replace("_", " ")
 
     def applies(self, cameras: Mapping[str, CameraCalibration], disturbances: Disturbances | None) -> bool:
         """To cameras with a left and a right spot.
@@ -229,13 +233,11 @@ class Posterior(Estimator):
 ESTIMATORS: dict[str, Estimator] = {
     "paper_single": Formula(
         "paper_single",
-        "printed, single",
-        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed",
+        "eqs. (2), (3), (5), (7) of Wang et al. (2018) as printed, one change at a time",
         monitoring.paper_single,
     ),
-    "paper_joint": Formula("paper_joint", "printed, joint", "joint changes as Wang et al. (2018) print them"),
+    "paper_joint": Formula("paper_joint", "joint changes as Wang et al. (2018) print them"),
     "derived": Formula(
-        "derived",
         "derived",
         "the same spot coordinates with the factors of a plane return, plate scale and distortion calibrated",
     ),

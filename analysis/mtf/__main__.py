@@ -64,7 +64,10 @@ def main(
     roi: Annotated[
         str, typer.Option(help="Region ROW,COLUMN,HEIGHT,WIDTH in pixels; the first pixel is 0,0.", show_default=False)
     ],
-    pixel_size: Annotated[str, typer.Option(help='Pixel pitch with its unit: "7 um", "0.007 mm".', show_default=False)],
+    pitch: Annotated[
+        str | None, typer.Option(help='Pixel pitch with its unit: "7 um", "0.007 mm". Needed.', show_default=False)
+    ] = None,
+    pixel_size: Annotated[str | None, typer.Option(hidden=True)] = None,
     bars: Annotated[
         str | None,
         typer.Option(
@@ -123,15 +126,15 @@ def main(
 
     Example, with images of `python -m twin.render scenes/examples/targets.yaml --out runs/targets`:
     `python -m analysis.mtf runs/targets/images/forward_centre_knife_edge_along_before.tiff --roi 24,24,64,64
-    --pixel-size "7 um" --plot mtf.png`
+    --pitch "7 um" --plot mtf.png`
 
     Exit codes: 0 measured; 2 bad input, with a sentence that says what to change; 1 the result cannot be printed.
     After 2 no file is written.
     """
     errors = Console(stderr=True)
     try:
-        pitch = _pixel_size(pixel_size)
-        frequency = _frequency(bars, pitch) if bars is not None else None
+        size = _pitch(_given_pitch(pitch, pixel_size, errors))
+        frequency = _frequency(bars, size) if bars is not None else None
         _check_levels(saturation, offset)
         for path, kinds in ((plot, PLOT_KINDS), (csv_file, (".csv",))):
             _check_target(path, kinds, image)
@@ -167,8 +170,8 @@ def main(
         warnings += page_warnings(found, step)
         if isinstance(found, EdgeMtf):
             edge = found
-            _write(plot, lambda path: _draw(edge, pitch, path))
-            _write(csv_file, lambda path: _write_csv(edge, pitch, path))
+            _write(plot, lambda path: _draw(edge, size, path))
+            _write(csv_file, lambda path: _write_csv(edge, size, path))
     except (EdgeError, BarError, ImageError, _Wrong) as error:
         # what is wrong with an image says which: there may be many in a script
         named = isinstance(error, _Wrong) or str(image) in str(error)
@@ -186,11 +189,11 @@ def main(
         errors.print(f"warning: {text}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     try:
         if isinstance(found, BarMtf):
-            _print_bars(found, pitch, offset, as_json)
+            _print_bars(found, size, offset, as_json)
         elif as_json:
-            _print_json(_edge_json(found, pitch, offset))
+            _print_json(_edge_json(found, size, offset))
         else:
-            _print_edge(found, pitch, offset, [path for path in (plot, csv_file) if path is not None])
+            _print_edge(found, size, offset, [path for path in (plot, csv_file) if path is not None])
         sys.stdout.flush()
     except OSError as error:
         errors.print(f"error: the result cannot be printed ({error.strerror})", markup=False, soft_wrap=True)
@@ -237,7 +240,16 @@ def _step(source: ImageFile, region: Array, gamma: str | None) -> float:
     return float(max(ends[1] - ends[0], ends[3] - ends[2]))
 
 
-def _pixel_size(text: str) -> float:
+def _given_pitch(pitch: str | None, pixel_size: str | None, errors: Console) -> str:
+    """The option, also by its old name."""
+    if pixel_size is not None:
+        errors.print("note: --pixel-size is called --pitch now; the old name is read for one version", soft_wrap=True)
+    if (pitch is None) == (pixel_size is None):
+        raise _Wrong('--pitch is missing: the pixel pitch, as "7 um"' if pitch is None else "--pitch is given twice")
+    return str(pitch if pixel_size is None else pixel_size)
+
+
+def _pitch(text: str) -> float:
     """Pixel pitch in millimetres."""
     match = re.fullmatch(r"\s*([-+0-9.eE]+)\s*(\S*)\s*", text)
     try:
@@ -246,9 +258,9 @@ def _pixel_size(text: str) -> float:
         value = math.nan
     unit = match[2] if match else ""
     if unit not in _LENGTHS or not math.isfinite(value):
-        raise _Wrong(f'--pixel-size {text!r} is not a length with its unit: write it as "7 um" or "0.007 mm"')
+        raise _Wrong(f'--pitch {text!r} is not a length with its unit: write it as "7 um" or "0.007 mm"')
     if not 1e-6 <= value * _LENGTHS[unit] <= 10:
-        raise _Wrong(f"--pixel-size {text!r} must lie between 1 nm and 10 mm")
+        raise _Wrong(f"--pitch {text!r} must lie between 1 nm and 10 mm")
     return value * _LENGTHS[unit]
 
 
@@ -357,11 +369,11 @@ def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
     return {
         "axis": edge.axis,
         "angle_deg": math.degrees(edge.angle),
-        "angle_sigma_deg": math.degrees(edge.angle_sigma),
+        "angle_deg_sigma": math.degrees(edge.angle_sigma),
         "position_px": edge.position,
-        "position_sigma_px": edge.position_sigma,
+        "position_px_sigma": edge.position_sigma,
         "curvature_per_px": edge.curvature,
-        "curvature_sigma_per_px": edge.curvature_sigma,
+        "curvature_per_px_sigma": edge.curvature_sigma,
         "dark_dn": edge.dark - offset,
         "bright_dn": edge.bright - offset,
         "noise_dark_dn": edge.noise_dark,
@@ -371,7 +383,7 @@ def _edge_json(edge: EdgeMtf, pitch: float, offset: float) -> dict[str, Any]:
         "mtf_nyquist_sigma": nyquist_sigma,
         "mtf_nyquist_noise_bias": float(np.interp(0.5, edge.frequency, edge.noise_bias)),
         "mtf50_cycles_per_mm": _or_none(half / pitch),
-        "mtf50_sigma_cycles_per_mm": _or_none(half_sigma / pitch),
+        "mtf50_cycles_per_mm_sigma": _or_none(half_sigma / pitch),
         "frequency_cycles_per_mm": (edge.frequency / pitch).tolist(),
         "frequency_cycles_per_pixel": edge.frequency.tolist(),
         "mtf": edge.mtf.tolist(),
@@ -385,9 +397,9 @@ def _pages_json(edge: EdgeMtf) -> dict[str, Any]:
     assert pages is not None
     return {
         "position_px": pages.position.tolist(),
-        "position_sigma_px": pages.position_sigma.tolist(),
+        "position_px_sigma": pages.position_sigma.tolist(),
         "angle_deg": np.degrees(pages.angle).tolist(),
-        "angle_sigma_deg": np.degrees(pages.angle_sigma).tolist(),
+        "angle_deg_sigma": np.degrees(pages.angle_sigma).tolist(),
         "drift_px_rms": pages.drift,
         "chi_square": pages.chi_square,
         "degrees_of_freedom": pages.degrees_of_freedom,

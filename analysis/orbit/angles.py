@@ -1,7 +1,7 @@
 """Intersection angles of line cameras from the planes in which they photograph (paper 000, eqs. 6-7), and their errors.
 
-alpha is the angle between the forward and the nadir plane, beta between the nadir and the aft plane; both acute and
-positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle in the same way. The
+alpha is the angle between the forward and the nadir plane, beta between the nadir and the backward plane; both acute
+and positive. Any other pair of lines, such as the nadir and a high-resolution line, has an angle in the same way. The
 paper's form is arccos |a . b|; its rounding error grows as 1/sin(angle) and swallows angles below
 1e-8 rad, so the value used here is atan2(|a x b|, |a . b|), good to rounding at every angle.
 
@@ -110,9 +110,9 @@ def _propagated(gradient: Array, planes: Sequence[PlaneFit], station: Station) -
     return np.asarray(own + shared @ station.covariance @ shared.T)
 
 
-def intersection_angles(forward: PlaneFit, nadir: PlaneFit, aft: PlaneFit) -> PlaneAngles:
-    """Angles alpha (forward, nadir) and beta (nadir, aft), eqs. 6 and 7, in this order. Raises AngleError."""
-    return angles_between((forward, nadir, aft), ((0, 1), (1, 2)))
+def intersection_angles(forward: PlaneFit, nadir: PlaneFit, backward: PlaneFit) -> PlaneAngles:
+    """Angles alpha (forward, nadir) and beta (nadir, backward), eqs. 6 and 7, in this order. Raises AngleError."""
+    return angles_between((forward, nadir, backward), ((0, 1), (1, 2)))
 
 
 def off_axis_angle(line: PlaneFit, nadir: PlaneFit) -> PlaneAngles:

@@ -86,10 +86,10 @@ def check_places(
             if not some.point.size:
                 continue
             camera, ground = cameras[line], one.ground[some.point]
-            distance = np.linalg.norm(ground - some.station, axis=1) / float(camera.focal_length)
+            distance = np.linalg.norm(ground - some.station, axis=1) / float(camera.principal_distance)
             miss = misclosure(camera, some, ground, np.zeros(3), np.zeros(3))
             far.append(distance * np.linalg.norm(miss, axis=1))
-            told = [(start or {}).get(f"{one.name} {n}", 0.0) * float(camera.focal_length) for n in BIAS[:2]]
+            told = [(start or {}).get(f"{one.name} {n}", 0.0) * float(camera.principal_distance) for n in BIAS[:2]]
             told += [(start or {}).get(f"{line} {n}", 0.0) for n in INTERIOR[1:]]
             expected.append(distance * float(np.linalg.norm(told)))
         if not far:

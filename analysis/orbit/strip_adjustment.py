@@ -4,8 +4,8 @@ Points that several lines see (tie points, with the check points among them) tie
 together: rays that do not meet show errors of the attitude. Unknowns are the errors of the readings, with their given
 sigmas as priors, and the points; cameras and attitude bias come from a calibration.
 
-What no tie point can tell is the datum. With lines that look forward and aft by a, which see a place T seconds before
-and after the nadir line, all rays still meet when
+What no tie point can tell is the datum. With lines that look forward and backward by a, which see a place T seconds
+before and after the nadir line, all rays still meet when
 
 - the whole pass rolls: the scene shifts with it;
 - it rolls at a constant rate and is yawed by rate * T / tan a: the scene turns with it;

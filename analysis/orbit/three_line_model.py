@@ -129,7 +129,7 @@ class LineModel:
         return np.asarray(self.to_body @ self._turned())
 
     @property
-    def focal_length(self) -> Array:
+    def principal_distance(self) -> Array:
         """Principal distance of the drifted camera, metres."""
         return np.asarray(self.interior[0] + self.drift[3])
 
@@ -138,7 +138,7 @@ class LineModel:
         at = image - self.interior[1:]
         square = np.sum(at**2, axis=1)
         at = at * (1.0 + square * (self.k1 + self.k2 * square))[:, None]
-        look = np.column_stack([-at, np.full(len(at), self.focal_length)]) @ self.axes.T
+        look = np.column_stack([-at, np.full(len(at), self.principal_distance)]) @ self.axes.T
         return np.asarray(look / np.linalg.norm(look, axis=1, keepdims=True))
 
     def _turned(self, slope: int | None = None) -> Array:
@@ -245,7 +245,7 @@ def misclosure(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset
         bias: (3,) radians.
         offset: (3,) of the station, ITRS, metres.
     """
-    f, (x0, y0) = camera.focal_length, camera.interior[1:]
+    f, (x0, y0) = camera.principal_distance, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     seen = (q @ bias_rotation(bias) - camera.position) @ camera.axes
     x, y = rays.image[:, 0] - x0, rays.image[:, 1] - y0
@@ -267,7 +267,7 @@ def partials(camera: LineModel, rays: Rays, ground: Array, bias: Array, offset: 
     Raises:
         ValueError: a ground point behind a camera.
     """
-    f, (x0, y0) = camera.focal_length, camera.interior[1:]
+    f, (x0, y0) = camera.principal_distance, camera.interior[1:]
     q = np.einsum("nji,nj->ni", rays.attitude, ground - rays.station - offset)
     turn = bias_rotation(bias)
     mounted = (q @ turn - camera.position) @ camera.to_body

@@ -319,7 +319,7 @@ def fit_interior_orientation(
     )
 
 
-LINE_TERMS = ("axis", "focal_length", "principal_point", "k1")
+LINE_TERMS = ("axis", "principal_distance", "principal_point", "k1")
 """Names of the unknowns; the last three are keys of a payload's line."""
 _STEPS = 20
 

@@ -119,13 +119,13 @@ def _build(
         index |= {f"{root}/{lens}": n for lens, n in glass_indices(model.spec).items()}
         if not own:
             continue
-        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.side}") for channel in own)]
+        bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in own)]
         given = spec.channels_of(name)
-        distances = {channel: given[channel.side].prism_180.distance for channel in own}
+        distances = {channel: given[channel.name].prism_180.distance for channel in own}
         beams = leaving_beams(model, distances, to_base, backend)
         facets = facet_places(spec, beams)
         for channel in own:
-            chain = monitor_chain(spec, channel, given[channel.side], beams[channel], facets[channel], to_base)
+            chain = monitor_chain(spec, channel, given[channel.name], beams[channel], facets[channel], to_base)
             bodies += chain.bodies
             elements.update({e.name: e for e in chain.elements})
             way = tuple(e.name for e in chain.elements)
@@ -137,7 +137,7 @@ def _build(
         channels += own
     solids = tuple(solid for chain in chains.values() for solid in chain.solids)
     if (block := spec.central_prism) is not None:
-        mirrors = {f"facet_{c.camera}_{c.side}": c.face_body for c in channels}
+        mirrors = {f"facet_{c.camera}_{c.name}": c.face_body for c in channels}
         farthest = [one.spread for name in spec.cameras for one in spec.channels_of(name).values()]
         spread = max(x for x, _ in farthest), max(y for _, y in farthest)
         solids = (*solids, facet_block(CENTRAL_PRISM, block.material, mirrors, spread, block.height))
@@ -229,7 +229,7 @@ def _channels(spec: InstrumentSpec, camera: str, model: CameraModel) -> list[Cha
             apart = 1e3 * abs(second.ccd[1] - first.ccd[1])
             raise spec.error(
                 f"the boards of {first.key} and {second.key} stand in each other: their CCDs are {apart:.4g} mm apart",
-                spec.key_of(camera, second.side, ("monitor", "field")),
+                spec.key_of(camera, second.name, ("monitor", "field")),
                 allowed=f"field places at which CCDs of {2e3 * half[1]:.4g} mm, and pinholes beside them, have room",
             )
     return out
@@ -239,7 +239,7 @@ def _monitor_bodies(plane_root: str, channels: list[Channel]) -> list[Body]:
     """Boards at the ends of the line CCD, with their reticles and area CCDs."""
     bodies = []
     for channel in channels:
-        bodies.append(Body(f"{plane_root}/{channel.side}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
+        bodies.append(Body(f"{plane_root}/{channel.name}", Pose(np.eye(3), np.array([*channel.ccd, 0.0]))))
         offset = np.array([channel.pinhole[0] - channel.ccd[0], channel.pinhole[1] - channel.ccd[1], 0.0])
         bodies.append(Body(channel.reticle_body, Pose(np.eye(3), offset)))
         bodies.append(Body(channel.ccd_body, Pose(_FLIP, np.zeros(3))))

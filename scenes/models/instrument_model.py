@@ -61,7 +61,7 @@ class Instrument:
         """
         out: dict[str, float] = {}
         for name in self.cameras if self.channels else ():
-            places = {c.side: c.ccd[1] for c in self.channels if c.camera == name}
+            places = {c.name: c.ccd[1] for c in self.channels if c.camera == name}
             pair = [places[side] for side in SIDES] if set(SIDES) <= set(places) else list(places.values())
             out[name] = abs(max(pair) - min(pair))
         return out

@@ -113,7 +113,7 @@ def _leaving(
             try:
                 _traced_out(model, [channel], distance, to_base, backend)
             except MisplacedError as error:
-                raise MisplacedError(str(error), error.key, error.remedy, (channel.camera, channel.side)) from error
+                raise MisplacedError(str(error), error.key, error.remedy, (channel.camera, channel.name)) from error
         raise
 
 
@@ -176,7 +176,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
     corners: dict[tuple[float, float], list[tuple[Channel, np.ndarray, np.ndarray, float]]] = {}
     out = {}
     for channel, beam in beams.items():
-        up, given = beam.direction, spec.channels_of(channel.camera)[channel.side]
+        up, given = beam.direction, spec.channels_of(channel.camera)[channel.name]
         side = np.sign(up[:2])
         offset = side * np.array(given.spread)
         lean, height = up[:2] / up[2], 0.0
@@ -186,7 +186,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} overlap: their beams meet the block only "
                     f"{1e3 * apart:.4g} mm from each other",
-                    spec.key_of(channel.camera, channel.side, (CENTRAL_KEY, "spread")),
+                    spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
                     allowed=f"a place at least {1e3 * least:.4g} mm from that of {other.key}",
                 )
             across = float(inner(lean - slope, offset - place))
@@ -194,7 +194,7 @@ def facet_places(spec: InstrumentSpec, beams: Mapping[Channel, LeavingBeam]) -> 
                 raise spec.error(
                     f"the facets of {channel.key} and {other.key} hide one another: the one that leans more has to "
                     "stand farther out",
-                    spec.key_of(channel.camera, channel.side, (CENTRAL_KEY, "spread")),
+                    spec.key_of(channel.camera, channel.name, (CENTRAL_KEY, "spread")),
                     allowed=f"a place on the other side of that of {other.key}",
                 )
             level = top + float(inner(lean - slope, 0.5 * (offset + place)))
@@ -275,7 +275,7 @@ def _made(
         return reflector.parts(mount)
     except ValueError as error:
         problem, _, least = str(error).partition("; ")
-        where = spec.key_of(channel.camera, channel.side, ("monitor", prism, key))
+        where = spec.key_of(channel.camera, channel.name, ("monitor", prism, key))
         raise spec.error(problem, where, allowed=least or "measures with which the prism can be made") from error
 
 
@@ -399,7 +399,7 @@ def _missed(
         choice = "a pupil_offset, monitor.field and angle_errors of the prisms with which it passes"
         if prism_of(element.body) is None and element.body != channel.face_body:
             choice = f"{_CARRIED}, or a camera with another {element.body.rpartition('/')[2]}"
-        return MisplacedError(what, key_of(element.body), choice, (channel.camera, channel.side))
+        return MisplacedError(what, key_of(element.body), choice, (channel.camera, channel.name))
     problem = f"the middle of the beam {channel.key} misses its facet"
     return MisplacedError(problem, (CENTRAL_KEY, "position"), _FACET)
 

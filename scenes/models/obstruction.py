@@ -254,7 +254,7 @@ def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPa
     if path in {solid.path for solid in instrument.solids}:
         where, choice = remedy(instrument, path)
         return where, f"{choice} beside the beam"
-    where = instrument.spec.key_of(channel.camera, channel.side, ("monitor", PRISM_0, "shift"))
+    where = instrument.spec.key_of(channel.camera, channel.name, ("monitor", PRISM_0, "shift"))
     return where, "a shift (or prism distance, or place on the central prism) that leads the beam past it"
 
 
@@ -285,7 +285,7 @@ def _cut(instrument: Instrument, backend: Backend, beam: MonitorBeam) -> Issue:
         key = ("monitor", "return_face", "aperture")
     elif key[0] != "cameras":
         key = (*key, "width")
-    key = instrument.spec.key_of(channel.camera, channel.side, key)
+    key = instrument.spec.key_of(channel.camera, channel.name, key)
     return instrument.spec.issue(
         f"the beam {channel.key} is cut at {element.name} on {element.body}{how}",
         key,

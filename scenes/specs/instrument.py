@@ -61,7 +61,7 @@ class Channel:
     """One monitor channel of one camera.
 
     Attributes:
-        camera, side: e.g. ``forward``, ``left``: the camera's and the channel's name; those of a plain pair are
+        camera, name: e.g. ``forward``, ``left``: the camera's and its own; those of a plain pair are
             ``left`` (the +Y end of the line) and ``right``.
         pinhole, ccd: positions in the focal plane's X, Y, metres.
         pupil_offset: of its beam's middle in the entrance pupil, X and Y, metres.
@@ -70,7 +70,7 @@ class Channel:
     """
 
     camera: str
-    side: str
+    name: str
     pinhole: tuple[float, float]
     ccd: tuple[float, float]
     pupil_offset: tuple[float, float]
@@ -79,22 +79,22 @@ class Channel:
 
     @property
     def key(self) -> str:
-        """``<camera>/<side>``, the prefix of the channel's elements and sequences."""
-        return f"{self.camera}/{self.side}"
+        """``<camera>/<name>``, the prefix of the channel's elements and sequences."""
+        return f"{self.camera}/{self.name}"
 
     @property
     def reticle_body(self) -> str:
         """Body path of the pinhole."""
-        return f"{BASE}/{self.camera}/focal_plane/{self.side}/reticle"
+        return f"{BASE}/{self.camera}/focal_plane/{self.name}/reticle"
 
     @property
     def ccd_body(self) -> str:
         """Body path of the area CCD."""
-        return f"{BASE}/{self.camera}/focal_plane/{self.side}/area_ccd"
+        return f"{BASE}/{self.camera}/focal_plane/{self.name}/area_ccd"
 
     def prism_body(self, prism: str) -> str:
         """Body path of one of ``PRISMS``."""
-        return f"{BASE}/{self.camera}/monitor/{self.side}/{prism}"
+        return f"{BASE}/{self.camera}/monitor/{self.name}/{prism}"
 
     def prism_elements(self, prism: str) -> str:
         """What the names of the elements of one of ``PRISMS`` begin with."""
@@ -103,7 +103,7 @@ class Channel:
     @property
     def face_body(self) -> str:
         """Body path of the return face."""
-        return f"{CENTRAL_PRISM}/{self.camera}_{self.side}"
+        return f"{CENTRAL_PRISM}/{self.camera}_{self.name}"
 
 
 Tilt = Annotated[tuple[float, float], Vector(Quantity(ANGLE, largest="1 deg"), 2)]

@@ -6,12 +6,14 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from scenes.specs.motion_text import key_below, motion_of
 from scenes.specs.procedures import studied
+from scenes.specs.result_names import key_now
 from scenes.specs.samplers import GRID, SAMPLERS
 from scenes.yaml.errors import KeyPath, Problem, key_text, shown, unknown
+from scenes.yaml.old_keys import note
 from scenes.yaml.spec import (
     Flag,
     Name,
@@ -373,6 +375,17 @@ class ResponseSpec(Spec):
     noise: Key | None = None
     minus: Key | None = None
 
+    @field_validator("key", "sigma", "noise", "minus", mode="before")
+    @classmethod
+    def _key_by_new_names(cls, value: Any) -> Any:
+        if not isinstance(value, list | tuple) or not all(isinstance(part, str | int) for part in value):
+            return value
+        now = key_now(value)
+        for old, new in zip(value, now, strict=True):
+            if old != new:
+                note(value, str(old), str(new))
+        return now
+
     @model_validator(mode="after")
     def _is_of_one_unit(self) -> ResponseSpec:
         for name, key in (("minus", self.minus), ("sigma", self.sigma), ("noise", self.noise)):
@@ -540,5 +553,5 @@ def unit_of(key: KeyPath) -> str:
     above = last.removesuffix(f"_{ending}")
     if not above.endswith("_per"):
         return UNITS[ending]
-    above = above.removesuffix("_per").removesuffix("etres")
+    above = above.removesuffix("_per")
     return f"{unit_of((f'_{above}',)) or 1}/{UNITS[ending]}"

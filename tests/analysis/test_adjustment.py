@@ -29,7 +29,7 @@ from tests.analysis.test_three_line_model import (
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)
 CONTROL, ORBIT = 1.0, 0.3
 BIAS = np.array([40.0, -60.0, 90.0]) * ARCSEC
-CHANGED = {"forward": (90e-6, -40e-6, 60e-6), "nadir": (-70e-6, 0.0, 0.0), "aft": (50e-6, 30e-6, -50e-6)}
+CHANGED = {"forward": (90e-6, -40e-6, 60e-6), "nadir": (-70e-6, 0.0, 0.0), "backward": (50e-6, 30e-6, -50e-6)}
 LABORATORY = cameras(CHANGED)
 HOLD_X = Gauge(held=("nadir x",))
 HOLD_XY = Gauge(held=("nadir x", "nadir y"))
@@ -78,7 +78,7 @@ def test_exact_data_return_everything_that_is_observable():
     assert found.values == pytest.approx(truth(found.names), rel=1e-6)
     assert found.chi_square < 1e-12
     assert found.iterations <= 4
-    assert found.cameras["aft"].interior == pytest.approx(INTERIOR["aft"], rel=1e-6)
+    assert found.cameras["backward"].interior == pytest.approx(INTERIOR["backward"], rel=1e-6)
     assert found.bias("Beijing") == pytest.approx(BIAS, rel=1e-6)
     assert str(found.gauge) == "held at the start values: nadir x"
     # tie points: a quarter is control, the rest must come from the images alone
@@ -104,7 +104,7 @@ def test_a_wrong_gauge_keeps_the_observable_combinations(gauge):
         change = dict(zip(found.names, found.values, strict=True))
         shift = [change[f"{k} x"] - wrong[k].interior[1] for k in INTERIOR]
         assert sum(shift) - 0.65 * change["Beijing pitch"] == pytest.approx(0, abs=1e-3 * 200e-6)
-    for line in ("forward", "aft"):
+    for line in ("forward", "backward"):
         assert error[f"{line} x"] - error["nadir x"] == pytest.approx(0, abs=1e-4 * 200e-6)
         assert error[f"{line} f"] == pytest.approx(0, abs=1e-6 * 0.65)
     assert error["nadir x"] + 0.65 * error["Beijing pitch"] == pytest.approx(0, abs=2e-3 * 200e-6)
@@ -166,19 +166,19 @@ def test_open_combinations_are_named():
         adjust([measured(VIEW)], LABORATORY, NOISE)
     (only,) = caught.value.open
     change = dict(zip(only.names, only.change, strict=True))
-    assert set(change) == {"forward x", "nadir x", "aft x", "Beijing pitch"}
+    assert set(change) == {"forward x", "nadir x", "backward x", "Beijing pitch"}
     assert change["nadir x"] / change["forward x"] == pytest.approx(1, rel=1e-3)
-    assert change["nadir x"] / change["aft x"] == pytest.approx(1, rel=1e-3)
+    assert change["nadir x"] / change["backward x"] == pytest.approx(1, rel=1e-3)
     assert change["Beijing pitch"] / change["nadir x"] == pytest.approx(-1 / 0.65, rel=1e-3)
     # roll against y is weak, yaw against y of the outer lines a correlation
     found = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_X)
     (weak,) = found.weak
-    assert set(weak.names) == {"forward y", "nadir y", "aft y", "Beijing roll"}
+    assert set(weak.names) == {"forward y", "nadir y", "backward y", "Beijing roll"}
     assert 1e-3 < weak.strength < 1e-2
     held = adjust([measured(VIEW)], LABORATORY, NOISE, gauge=HOLD_XY)
-    yaw, forward, aft = (held.names.index(n) for n in ("Beijing yaw", "forward y", "aft y"))
+    yaw, forward, backward = (held.names.index(n) for n in ("Beijing yaw", "forward y", "backward y"))
     assert held.correlation[yaw, forward] < -0.9
-    assert held.correlation[yaw, aft] > 0.9
+    assert held.correlation[yaw, backward] > 0.9
     assert np.isnan(held.correlation[held.names.index("nadir x"), yaw])
     # several fields share one interior: one gauge closes them all
     two = [measured(seen(3 + i, 20 + 4 * i, node=2.2 + 0.4 * i), name=f"F{i}") for i in range(2)]
@@ -288,7 +288,7 @@ def test_wrong_matches_lose_their_weight(robust):
         # 525 good points, 1 in 10 000 beyond the limit: more than three is a false alarm of 3e-7
         assert total - 15 <= 3
         assert distance(found) < stats.chi2.isf(1e-5, len(free))
-        assert np.sum(np.linalg.norm(found.residual["F0"]["aft"], axis=1) > REJECT) == 2
+        assert np.sum(np.linalg.norm(found.residual["F0"]["backward"], axis=1) > REJECT) == 2
     else:
         assert np.all(weights < 0.25)
         assert distance(found) < 0.1 * distance(plain)
@@ -467,8 +467,8 @@ def test_bad_input_is_told():
         adjust([field, field], LABORATORY, NOISE)
     with pytest.raises(CalibrationError, match="no unknown is called 'nadir z'"):
         adjust([field], LABORATORY, NOISE, gauge=Gauge(held=("nadir z",)))
-    with pytest.raises(CalibrationError, match="no camera is called 'aft'"):
-        adjust([field], {k: v for k, v in LABORATORY.items() if k != "aft"}, NOISE)
+    with pytest.raises(CalibrationError, match="no camera is called 'backward'"):
+        adjust([field], {k: v for k, v in LABORATORY.items() if k != "backward"}, NOISE)
     with pytest.raises(CalibrationError, match="sigmas must be finite"):
         adjust([field], LABORATORY, Noise(np.nan))
     with pytest.raises(CalibrationError, match="positive sigma"):

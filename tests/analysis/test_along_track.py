@@ -18,7 +18,9 @@ def frames(scene, names, noise=1.5, sigma_station=0.5, bend=0.0):
     return [line_frame(fit_plane(station, strips[k]), scene.tangents[k], bend) for k in names]
 
 
-@pytest.mark.parametrize("pair", [("forward", "nadir"), ("nadir", "aft"), ("aft", "forward"), ("nadir", "forward")])
+@pytest.mark.parametrize(
+    "pair", [("forward", "nadir"), ("nadir", "backward"), ("backward", "forward"), ("nadir", "forward")]
+)
 def test_signs(pair):
     """Positive where the first looks ahead; rounding of the points."""
     found = along_track_angles(frames(SCENE, pair), PAIR)
@@ -97,9 +99,9 @@ def test_a_free_bend_costs_what_it_should():
 
 
 def test_angles_add_up_with_their_covariance():
-    """From forward to nadir and on to aft it is as far as from forward to aft, errors and all: sides that differ by
-    the Earth's turn, 4 deg, tilt the axes by less than a per cent. Backwards it is as far."""
-    three = frames(SCENE, ("forward", "nadir", "aft"))
+    """From forward to nadir and on to backward it is as far as from forward to backward, errors and all: sides that
+    differ by the Earth's turn, 4 deg, tilt the axes by less than a per cent. Backwards it is as far."""
+    three = frames(SCENE, ("forward", "nadir", "backward"))
     found = along_track_angles(three, ((0, 1), (1, 2), (0, 2), (1, 0)))
     assert found.values[:2].sum() == pytest.approx(found.values[2], rel=1e-3)
     c = found.covariance / ARCSEC**2

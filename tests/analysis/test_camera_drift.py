@@ -20,8 +20,8 @@ DRIFTS = Unknowns(drift=True)
 SIGMA = np.array([0.05 * ARCSEC, 0.05 * ARCSEC, 1.2 * ARCSEC, 0.02e-3])
 """Of the monitor: paper 001, Table 5, with its factor of two in d_gamma and d_f taken out."""
 SIZE = np.array([3 * ARCSEC, 3 * ARCSEC, 5 * ARCSEC, 30e-6])
-"""Of the drift of forward and aft between fields."""
-LINES = ("forward", "nadir", "aft")
+"""Of the drift of forward and backward between fields."""
+LINES = ("forward", "nadir", "backward")
 
 
 def drifts(rng, count, size=SIZE):
@@ -76,11 +76,11 @@ def test_exact_data_and_readings_return_everything():
     assert found.chi_square < 1e-10
     for i, d in enumerate(drift):
         own = found.cameras_of(f"F{i}")
-        assert own["aft"].drift == pytest.approx(d["aft"], rel=1e-6)
-        assert own["aft"].interior == pytest.approx(found.cameras["aft"].interior, rel=1e-12)
+        assert own["backward"].drift == pytest.approx(d["backward"], rel=1e-6)
+        assert own["backward"].interior == pytest.approx(found.cameras["backward"].interior, rel=1e-12)
         points = intersect(fields[i].rays, own, NOISE, bias=found.bias(f"F{i}")).ground
         assert np.abs(points - fields[i].ground).max() < 1e-3  # 1e-6 of 40 arcsec of bias is 1e-4 m
-    assert np.all(found.cameras["aft"].drift == 0)
+    assert np.all(found.cameras["backward"].drift == 0)
 
 
 def test_what_the_monitor_does_not_tell_is_named():
@@ -165,7 +165,7 @@ def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
         rays[line] = replace(r, attitude=r.attitude @ turn)
     field = replace(still, rays=rays)
     unaware = adjust([field], LABORATORY, NOISE, gauge=HOLD_X)
-    moved = [unaware.value(f"{line} x") - TRUTH[f"{line} x"] for line in ("forward", "aft")]
+    moved = [unaware.value(f"{line} x") - TRUTH[f"{line} x"] for line in ("forward", "backward")]
     # the forward line comes first: the attitude that is taken as true lacks the turn by -rate * 33 s
     expected = 0.65 / np.cos(np.radians(25)) ** 2 * 33.3 * rates[1] * np.cos(np.radians(25)) ** 2
     assert moved[1] - moved[0] == pytest.approx(2 * expected, rel=0.1)
@@ -179,12 +179,12 @@ def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
     # nothing else tells the rate of pitch: what is not known of it is not known of x
     vague = [replace(p, sigma=10e-3 * ARCSEC) for p in told]
     loose = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"), priors=vague)
-    assert loose.sigma["aft x"] ** 2 - found.sigma["aft x"] ** 2 == pytest.approx(
+    assert loose.sigma["backward x"] ** 2 - found.sigma["backward x"] ** 2 == pytest.approx(
         (0.65 * 33.3 * 10e-3 * ARCSEC) ** 2, rel=0.1
     )
     # within a line the field passes in seconds, and the noise of its points is all that tells
     blind = adjust([field], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"))
-    assert blind.sigma["aft x"] > 5 * found.sigma["aft x"]
+    assert blind.sigma["backward x"] > 5 * found.sigma["backward x"]
     timeless = replace(field, rays={k: replace(r, time=None) for k, r in field.rays.items()})
     with pytest.raises(CalibrationError, match="times of all rays"):
         adjust([timeless], LABORATORY, NOISE, gauge=HOLD_X, unknowns=Unknowns(rate="common"), priors=told)
@@ -192,6 +192,6 @@ def test_a_drift_of_the_bias_goes_into_the_outer_lines_unless_it_is_told():
 
 def test_bad_readings_are_told():
     with pytest.raises(CalibrationError, match=r"must be \(4,\)"):
-        monitor_priors("F0", "aft", np.zeros(3), SIGMA)
-    two = monitor_priors("F0", "aft", np.zeros(4), [1e-7, 1e-7, np.inf, np.inf])
-    assert [next(iter(p.weights)) for p in two] == ["F0 aft d_alpha", "F0 aft d_beta"]
+        monitor_priors("F0", "backward", np.zeros(3), SIGMA)
+    two = monitor_priors("F0", "backward", np.zeros(4), [1e-7, 1e-7, np.inf, np.inf])
+    assert [next(iter(p.weights)) for p in two] == ["F0 backward d_alpha", "F0 backward d_beta"]

@@ -65,7 +65,7 @@ def test_a_rate_with_a_prior_is_told_and_its_sigma_is_in_x_of_the_outer_lines():
     field = turned(measured(VIEW, rng), lambda t: t[:, None] * 0.1 * ARCSEC * np.ones(3))
     blind, told = adjust([field], LABORATORY, NOISE, gauge=HOLD_XY), solved_for(field, 0.1 * ARCSEC)
     known = dict(zip(blind.names, truth(blind.names), strict=True))
-    for name in ("forward x", "aft x"):
+    for name in ("forward x", "backward x"):
         assert abs(blind.value(name) - known[name]) > 10 * blind.sigma[name]
         assert abs(told.value(name) - known[name]) < 5 * told.sigma[name]
         assert told.sigma[name] > 5 * blind.sigma[name]

@@ -192,7 +192,7 @@ def test_mtf_of_a_packed_tiff_and_of_a_fits_cube_is_that_of_the_plain_file(tmp_p
     fits.PrimaryHDU(pages).writeto(tmp_path / "cube.fits")
     found = []
     for name in ("plain.tif", "lzw.tif", "cube.fits"):
-        words = [str(tmp_path / name), "--roi", "8,8,64,64", "--pixel-size", "7 um", "--json"]
+        words = [str(tmp_path / name), "--roi", "8,8,64,64", "--pitch", "7 um", "--json"]
         result = CliRunner().invoke(app, words)
         assert result.exit_code == 0, result.stderr
         found.append(json.loads(result.stdout))

@@ -58,7 +58,7 @@ def edge_tiff(tmp_path):
 
 
 def test_json_against_the_formula(edge_tiff):
-    data = run_json(edge_tiff, "--roi", ROI, "--pixel-size", "7 um")
+    data = run_json(edge_tiff, "--roi", ROI, "--pitch", "7 um")
     f, mtf = np.array(data["frequency_cycles_per_pixel"]), np.array(data["mtf"])
     truth = np.array([gaussian_mtf(each) for each in f])
     # five sigma of the noise and the estimator's own 5e-4
@@ -73,7 +73,7 @@ def test_json_against_the_formula(edge_tiff):
 
 
 def test_printed_table(edge_tiff):
-    result = run(edge_tiff, "--roi", ROI, "--pixel-size", "0.007 mm")
+    result = run(edge_tiff, "--roi", ROI, "--pitch", "0.007 mm")
     assert result.exit_code == 0, result.stderr
     for text in ("cycles/mm", "sigma", "MTF at Nyquist (71.4 cycles/mm): 0.0", "MTF50: 3", "near-vertical", "deg"):
         assert text in result.stdout
@@ -106,7 +106,7 @@ def test_files(edge_tiff, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     plot, table = out / "mtf.png", out / "mtf.csv"
-    result = run(edge_tiff, "--roi", ROI, "--pixel-size", "7 um", "--plot", plot, "--csv", table)
+    result = run(edge_tiff, "--roi", ROI, "--pitch", "7 um", "--plot", plot, "--csv", table)
     assert result.exit_code == 0, result.stderr
     assert {path.name for path in out.iterdir()} == {"mtf.png", "mtf.csv"}
     picture = cv2.imread(str(plot))
@@ -127,7 +127,7 @@ def test_kinds_of_images(tmp_path):
     tifffile.imwrite(tmp_path / "real.tif", frame.astype(np.float32))
     tifffile.imwrite(tmp_path / "colour.tif", np.dstack([frame] * 3), photometric="rgb")
     for path in sorted(tmp_path.iterdir()):
-        data = run_json(path, "--roi", ROI, "--pixel-size", "7 um")
+        data = run_json(path, "--roi", ROI, "--pitch", "7 um")
         assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 5e-4), path.name
 
 
@@ -135,7 +135,7 @@ def test_luminance_weighs_the_channels(tmp_path):
     frame = edge_frame().astype(float)
     colour = np.dstack([frame * 0.5, frame, frame * 0.25]).astype(np.uint16)
     cv2.imwrite(str(tmp_path / "colour.png"), colour[..., ::-1])
-    data = run_json(tmp_path / "colour.png", "--roi", ROI, "--pixel-size", "7 um")
+    data = run_json(tmp_path / "colour.png", "--roi", ROI, "--pitch", "7 um")
     assert data["bright_dn"] == pytest.approx(11000 * (0.2126 * 0.5 + 0.7152 + 0.0722 * 0.25), rel=1e-3)
 
 
@@ -144,8 +144,8 @@ def test_pages_are_averaged(tmp_path, imagej):
     path = tmp_path / "pages.tiff"
     pages = np.stack([edge_frame(50.0, seed) for seed in range(16)])
     tifffile.imwrite(path, pages, photometric="minisblack", imagej=imagej)
-    all_pages = run_json(path, "--roi", ROI, "--pixel-size", "7 um")
-    four = run_json(path, "--roi", ROI, "--pixel-size", "7 um", "--frames", 4)
+    all_pages = run_json(path, "--roi", ROI, "--pitch", "7 um")
+    four = run_json(path, "--roi", ROI, "--pitch", "7 um", "--frames", 4)
     # the noise is estimated from some 3000 pixels of each: 2%
     assert four["noise_dark_dn"] == pytest.approx(2 * all_pages["noise_dark_dn"], rel=0.1)
     assert all_pages["noise_dark_dn"] == pytest.approx(50 / 4, rel=0.1)
@@ -158,7 +158,7 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     shift, turned = far * rng.normal(size=6), turn * rng.normal(size=6)
     pages = [edge_frame(30.0, k, shift=s, turn=t) for k, (s, t) in enumerate(zip(shift, turned, strict=True))]
     tifffile.imwrite(tmp_path / "pages.tiff", np.stack(pages), photometric="minisblack")
-    result = run(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um", "--json")
+    result = run(tmp_path / "pages.tiff", "--roi", ROI, "--pitch", "7 um", "--json")
     data = json.loads(result.stdout)
     for f in (0.25, 0.5):
         at = round(64 * f)
@@ -170,9 +170,9 @@ def test_pages_between_which_the_edge_moves_are_laid_over_each_other(tmp_path, f
     assert "were laid over each other" in " ".join(result.stderr.split())
     place = np.array(found["position_px"])
     wanted = shift - 0.5 * np.tan(turned)
-    moved = (place - place.mean() - wanted + wanted.mean()) / np.array(found["position_sigma_px"])
+    moved = (place - place.mean() - wanted + wanted.mean()) / np.array(found["position_px_sigma"])
     assert np.max(np.abs(moved)) < 5.0
-    printed = run(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um")
+    printed = run(tmp_path / "pages.tiff", "--roi", ROI, "--pitch", "7 um")
     assert "laid over each other" in printed.stdout
 
 
@@ -181,8 +181,8 @@ def test_still_pages_are_averaged_to_the_bit(tmp_path):
     pages = np.stack([edge_frame(30.0, k) for k in range(9)])
     tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
     tifffile.imwrite(tmp_path / "mean.tiff", pages.mean(axis=0))
-    several = run_json(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um")
-    mean = run_json(tmp_path / "mean.tiff", "--roi", ROI, "--pixel-size", "7 um")
+    several = run_json(tmp_path / "pages.tiff", "--roi", ROI, "--pitch", "7 um")
+    mean = run_json(tmp_path / "mean.tiff", "--roi", ROI, "--pitch", "7 um")
     for key in ("mtf", "sigma", "noise_bias", "position_px", "angle_deg"):
         assert several[key] == mean[key]
     assert not several["pages"]["aligned"]
@@ -193,7 +193,7 @@ def test_rounding_and_repeated_pages_enter_the_sigma(tmp_path):
     small = [edge_frame(noise, 5, 3.0, 23.0).astype(np.uint8) for noise in (0.0, 0.03)]
     for name, pages in (("one", small[:1]), ("copies", small[:1] * 7)):
         tifffile.imwrite(tmp_path / f"{name}.tiff", np.stack(pages), photometric="minisblack")
-    words = ("--roi", ROI, "--pixel-size", "7 um", "--saturation", 255, "--json")
+    words = ("--roi", ROI, "--pitch", "7 um", "--saturation", 255, "--json")
     one, copies = (run(tmp_path / f"{name}.tiff", *words) for name in ("one", "copies"))
     assert "rounding does not average out" in " ".join(one.stderr.split())
     assert "6 pages repeat another one" in " ".join(copies.stderr.split())
@@ -214,19 +214,19 @@ def test_pages_of_different_size_must_be_chosen(tmp_path):
         file.write(edge_frame(3.0, 1)[:80, :100])
         file.write(edge_frame(3.0, 2))
         file.write(edge_frame(3.0, 3))
-    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    result = run(path, "--roi", ROI, "--pitch", "7 um")
     assert result.exit_code == 2
     assert "80 x 100 uint16 (first: 0), 90 x 110 uint16 (first: 1)" in result.stderr
     assert "--page NUMBER" in result.stderr
     for page in (0, 2):
-        data = run_json(path, "--roi", ROI, "--pixel-size", "7 um", "--page", page)
+        data = run_json(path, "--roi", ROI, "--pitch", "7 um", "--page", page)
         assert data["mtf_nyquist"] == pytest.approx(gaussian_mtf(0.5), abs=5 * data["mtf_nyquist_sigma"] + 5e-4)
-    assert run(path, "--roi", "10,20,80,64", "--pixel-size", "7 um", "--page", 0).exit_code == 2
+    assert run(path, "--roi", "10,20,80,64", "--pitch", "7 um", "--page", 0).exit_code == 2
     # a thumbnail says that it is one
     with tifffile.TiffWriter(path) as file:
         file.write(edge_frame())
         file.write(edge_frame()[::8, ::8], subfiletype=1)
-    assert run(path, "--roi", ROI, "--pixel-size", "7 um").exit_code == 0
+    assert run(path, "--roi", ROI, "--pitch", "7 um").exit_code == 0
 
 
 def srgb(linear):
@@ -240,25 +240,25 @@ def test_tone_curves(tmp_path):
     for gamma, coded in (("srgb", srgb(linear)), ("2.2", linear ** (1 / 2.2))):
         path = tmp_path / f"{gamma}.jpg"
         cv2.imwrite(str(path), np.round(255 * coded).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 100])
-        plain = run(path, "--roi", ROI, "--pixel-size", "7 um", "--json")
+        plain = run(path, "--roi", ROI, "--pitch", "7 um", "--json")
         assert plain.exit_code == 0
         assert "warning: " in plain.stderr
         assert "--gamma srgb" in plain.stderr
         assert abs(json.loads(plain.stdout)["mtf"][16] - gaussian_mtf(0.25)) > 0.02
-        result = run(path, "--roi", ROI, "--pixel-size", "7 um", "--json", "--gamma", gamma)
+        result = run(path, "--roi", ROI, "--pitch", "7 um", "--json", "--gamma", gamma)
         assert result.stderr == ""
         data = json.loads(result.stdout)
         # JPEG's own quantisation at quality 100 is below one grey value
         assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 2e-3)
         assert data["bright_dn"] == pytest.approx(255 * 11000 / 14000, abs=1.0)
-    assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").stderr == ""
+    assert run(path, "--roi", ROI, "--pitch", "7 um", "--gamma", "1").stderr == ""
 
 
 def test_a_tiff_of_8_bits_with_a_colour_profile_gives_a_warning(tmp_path):
     frame = np.round(edge_frame() / 60.0)
     for dtype, profile, warned in ((np.uint8, True, True), (np.uint16, True, False), (np.uint8, False, False)):
         tifffile.imwrite(tmp_path / "one.tiff", frame.astype(dtype), iccprofile=bytes(200) if profile else None)
-        result = run(tmp_path / "one.tiff", "--roi", ROI, "--pixel-size", "7 um")
+        result = run(tmp_path / "one.tiff", "--roi", ROI, "--pitch", "7 um")
         assert result.exit_code == 0
         assert ("its 8-bit pages have a colour profile" in result.stderr) == warned
 
@@ -278,7 +278,7 @@ def test_a_jpeg_may_have_its_tables_before_its_frame(tmp_path):
     assert any(one[1] == 0xC4 for one in tables)
     (tmp_path / "turned.jpg").write_bytes(data[:2] + b"".join(tables + frames) + data[place:])
     plain, turned = (
-        run(tmp_path / name, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1", "--json")
+        run(tmp_path / name, "--roi", ROI, "--pitch", "7 um", "--gamma", "1", "--json")
         for name in ("plain.jpg", "turned.jpg")
     )
     assert plain.exit_code == turned.exit_code == 0
@@ -288,9 +288,9 @@ def test_a_jpeg_may_have_its_tables_before_its_frame(tmp_path):
 def test_real_numbers_have_no_tone_curve(tmp_path):
     path = tmp_path / "real.tiff"
     tifffile.imwrite(path, edge_frame().astype(np.float32))
-    assert run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", "1").exit_code == 0
+    assert run(path, "--roi", ROI, "--pitch", "7 um", "--gamma", "1").exit_code == 0
     for gamma in ("srgb", "2.2"):
-        result = run(path, "--roi", ROI, "--pixel-size", "7 um", "--gamma", gamma)
+        result = run(path, "--roi", ROI, "--pitch", "7 um", "--gamma", gamma)
         assert result.exit_code == 2
         assert "real numbers have no full scale" in result.stderr
 
@@ -302,10 +302,10 @@ def test_a_png_that_names_its_curve_gives_a_warning(tmp_path):
         body = name + (b"\0" if content is None else content.to_bytes(4, "big"))
         chunk = (len(body) - 4).to_bytes(4, "big") + body + zlib.crc32(body).to_bytes(4, "big")
         (tmp_path / "named.png").write_bytes(data[:33] + chunk + data[33:])
-        result = run(tmp_path / "named.png", "--roi", ROI, "--pixel-size", "7 um")
+        result = run(tmp_path / "named.png", "--roi", ROI, "--pitch", "7 um")
         assert result.exit_code == 0, result.stderr
         assert ("warning" in result.stderr) is warned
-    assert run(tmp_path / "plain.png", "--roi", ROI, "--pixel-size", "7 um").stderr == ""
+    assert run(tmp_path / "plain.png", "--roi", ROI, "--pitch", "7 um").stderr == ""
 
 
 def test_a_png_of_no_known_colour_type_is_refused(tmp_path):
@@ -316,7 +316,7 @@ def test_a_png_of_no_known_colour_type_is_refused(tmp_path):
     data[25] = 5
     data[29:33] = zlib.crc32(data[12:29]).to_bytes(4, "big")
     path.write_bytes(bytes(data))
-    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    result = run(path, "--roi", ROI, "--pitch", "7 um")
     assert result.exit_code == 2
     assert "no colour type 5" in " ".join(result.stderr.split())
 
@@ -342,7 +342,7 @@ def test_images_beyond_memory_are_refused_by_their_header(tmp_path):
     small[29:33] = zlib.crc32(small[12:29]).to_bytes(4, "big")
     path.write_bytes(small)
     begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+    result = run(path, "--roi", ROI, "--pitch", "7 um")
     assert result.exit_code == 2
     assert "of 30000 x 30000 pixels fills 0.9 GB when it is decoded, more than 0.5 GB: cut the region" in result.stderr
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begin < 100_000  # kB
@@ -351,10 +351,10 @@ def test_images_beyond_memory_are_refused_by_their_header(tmp_path):
         tmp_path / "huge.tiff", shape=(30_000, 30_000), dtype=np.uint16, compression="zlib", tile=(30_000, 30_000),
         data=iter([b"x"]),
     )  # fmt: skip
-    result = run(tmp_path / "huge.tiff", "--roi", ROI, "--pixel-size", "7 um")
+    result = run(tmp_path / "huge.tiff", "--roi", ROI, "--pitch", "7 um")
     assert result.exit_code == 2
     assert "1.8 GB" in result.stderr
-    assert run(path, "--roi", "0,0,20000,20000", "--pixel-size", "7 um").stderr.count("choose a smaller region") == 1
+    assert run(path, "--roi", "0,0,20000,20000", "--pitch", "7 um").stderr.count("choose a smaller region") == 1
 
 
 def test_of_a_plain_tiff_only_the_region_is_read(tmp_path):
@@ -367,7 +367,7 @@ def test_of_a_plain_tiff_only_the_region_is_read(tmp_path):
         stored.flush()
         del stored
         begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        data = run_json(path, "--roi", "29910,29820,64,64", "--pixel-size", "7 um")
+        data = run_json(path, "--roi", "29910,29820,64,64", "--pitch", "7 um")
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - begin < 200_000
         assert data["mtf"][16] == pytest.approx(gaussian_mtf(0.25), abs=5 * data["sigma"][16] + 5e-4)
 
@@ -380,14 +380,14 @@ def test_numbers_at_the_ends_of_double_precision(tmp_path, scale, what):
     with np.errstate(all="ignore"):
         tifffile.imwrite(tmp_path / "image.tiff", values * scale)
     for more in ((), ("--bars", "0.3 cycles/pixel", "--dark", "0,0,9,9", "--bright", "60,90,9,9")):
-        result = run(tmp_path / "image.tiff", "--roi", ROI, "--pixel-size", "7 um", *more)
+        result = run(tmp_path / "image.tiff", "--roi", ROI, "--pitch", "7 um", *more)
         assert result.exit_code in ({2} if what == "even" or more else {0, 2})
         assert result.stderr.count("\n") == (1 if result.exit_code else 0)
 
 
 @pytest.mark.parametrize("options", [["--json"], []])
 def test_a_result_that_cannot_be_printed(edge_tiff, options):
-    command = [sys.executable, "-m", "analysis.mtf", str(edge_tiff), "--roi", ROI, "--pixel-size", "7 um", *options]
+    command = [sys.executable, "-m", "analysis.mtf", str(edge_tiff), "--roi", ROI, "--pitch", "7 um", *options]
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert done.returncode == 1
@@ -421,7 +421,7 @@ def test_spoilt_files_are_measured_or_refused(tmp_path, kind, seed):
         sound[:place] + bytes(50) + sound[place:],
     ):
         path.write_bytes(data)
-        result = run(path, "--roi", ROI, "--pixel-size", "7 um")
+        result = run(path, "--roi", ROI, "--pitch", "7 um")
         assert result.exit_code in (0, 2)
         assert result.exit_code == 0 or result.stderr.startswith("error: ")
 
@@ -430,7 +430,7 @@ def test_one_saturated_page_is_enough(tmp_path):
     pages = np.stack([edge_frame(50.0, seed) for seed in range(4)])
     pages[2, 40, 80] = 65535
     tifffile.imwrite(tmp_path / "pages.tiff", pages, photometric="minisblack")
-    result = run(tmp_path / "pages.tiff", "--roi", ROI, "--pixel-size", "7 um")
+    result = run(tmp_path / "pages.tiff", "--roi", ROI, "--pitch", "7 um")
     assert result.exit_code == 2
     assert "1 pixels reach the saturation level of 65535" in result.stderr
 
@@ -472,7 +472,7 @@ def bars_tiff(folder):
     return folder / "bars.tiff"
 
 
-BARS = ("--roi", "0,0,64,64", "--pixel-size", "7 um", "--dark", "5,85,50,20", "--bright", "5,115,50,20")
+BARS = ("--roi", "0,0,64,64", "--pitch", "7 um", "--dark", "5,85,50,20", "--bright", "5,115,50,20")
 
 
 @pytest.mark.parametrize("frequency", ["0.5 cycles/pixel", "71.43 cycles/mm", "71.43 lp/mm"])
@@ -490,9 +490,9 @@ def test_bars(tmp_path, frequency):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"--pixel-size": "7"}, 'not a length with its unit: write it as "7 um"'),
-        ({"--pixel-size": "7 furlong"}, "not a length with its unit"),
-        ({"--pixel-size": "-7 um"}, "must lie between 1 nm and 10 mm"),
+        ({"--pitch": "7"}, 'not a length with its unit: write it as "7 um"'),
+        ({"--pitch": "7 furlong"}, "not a length with its unit"),
+        ({"--pitch": "-7 um"}, "must lie between 1 nm and 10 mm"),
         ({"--roi": "10,20,64"}, "four whole numbers ROW,COLUMN,HEIGHT,WIDTH"),
         ({"--roi": "10,20,64,640"}, "does not lie in the image of 90 rows and 110 columns"),
         ({"--roi": "10,20,16,64"}, "too small"),
@@ -511,7 +511,7 @@ def test_bars(tmp_path, frequency):
         ({"--saturation": "nan"}, "--saturation nan must be a number"),
         ({"--roi": "9" * 5000 + ",20,64,64"}, "four whole numbers"),
         ({"--roi": "9999999999,20,64,64"}, "does not lie in the image"),
-        ({"--pixel-size": "1e-300 um"}, "must lie between 1 nm and 10 mm"),
+        ({"--pitch": "1e-300 um"}, "must lie between 1 nm and 10 mm"),
         ({"--gamma": "sgrb"}, "is not a tone curve: write srgb, or an exponent such as 2.2"),
         ({"--gamma": "nan"}, "is not a tone curve"),
         ({"--gamma": "0"}, "is not a tone curve"),
@@ -520,7 +520,7 @@ def test_bars(tmp_path, frequency):
     ],
 )
 def test_bad_input(edge_tiff, tmp_path, changed, message):
-    options = {"--roi": ROI, "--pixel-size": "7 um"} | changed
+    options = {"--roi": ROI, "--pitch": "7 um"} | changed
     if "--plot" in options:
         options["--plot"] = str(tmp_path / options["--plot"])
     result = run(edge_tiff, *[word for pair in options.items() for word in pair])
@@ -540,7 +540,7 @@ def test_unreadable_images(tmp_path):
         ("text.png", "cannot be read as an image"),
         ("text.tiff", "cannot be read as an image"),
     ):
-        result = run(tmp_path / name, "--roi", ROI, "--pixel-size", "7 um")
+        result = run(tmp_path / name, "--roi", ROI, "--pitch", "7 um")
         assert result.exit_code == 2
         assert message in result.stderr
 
@@ -549,7 +549,7 @@ def test_the_image_is_never_overwritten(tmp_path):
     path = tmp_path / "edge.png"
     cv2.imwrite(str(path), edge_frame())
     before = path.read_bytes()
-    result = run(path, "--roi", ROI, "--pixel-size", "7 um", "--plot", path)
+    result = run(path, "--roi", ROI, "--pitch", "7 um", "--plot", path)
     assert result.exit_code == 2
     assert path.read_bytes() == before
 

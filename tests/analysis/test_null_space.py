@@ -19,7 +19,7 @@ from tests.analysis.test_adjustment import BIAS, INNER, LABORATORY, NOISE, PITCH
 from tests.analysis.test_three_line_model import ARCSEC, cameras, field_points, mounting, observe
 
 FREE = Gauge(start=WORST)
-HOLD_SIX = Gauge(held=("nadir x", "forward f", "nadir f", "aft f", "nadir y", "Beijing yaw"))
+HOLD_SIX = Gauge(held=("nadir x", "forward f", "nadir f", "backward f", "nadir y", "Beijing yaw"))
 
 
 def middle(count=3):
@@ -141,7 +141,7 @@ def test_a_gauge_closes_what_data_leave_open_and_nothing_else():
     sigma = np.linalg.eigvalsh(basis.T @ image @ basis) ** -0.5
     assert np.sum(sigma < 3e-6) >= 4
     # no single unknown of these is in the closed space with more than what the data leave of it
-    for line in ("forward", "aft"):
+    for line in ("forward", "backward"):
         vector = np.zeros(len(scale))
         vector[[parameters.names.index(f"{line} x"), parameters.names.index("nadir x")]] = 1.0, -1.0
         # f is counted at the ends of the line, 17 of its own: lines mounted 35 arcsec askew move x by 3e-3 of that
@@ -150,7 +150,7 @@ def test_a_gauge_closes_what_data_leave_open_and_nothing_else():
 
 def test_unknowns_of_another_order_are_adjusted_to_the_same_values():
     field = measured(MIDDLE, np.random.default_rng(3))
-    lines = ("aft", "forward", "nadir")
+    lines = ("backward", "forward", "nadir")
     turned = {k: LABORATORY[k] for k in lines}
     first, second = (adjust([field], c, NOISE, gauge=FREE) for c in (LABORATORY, turned))
     assert first.names != second.names

@@ -25,7 +25,7 @@ FALSE_ALARM = 1e-6
 ARCSEC = np.pi / 648000
 DEG = np.pi / 180
 LOOK = 25 * DEG
-LINES = {"forward": LOOK, "nadir": 0.0, "aft": -LOOK}
+LINES = {"forward": LOOK, "nadir": 0.0, "backward": -LOOK}
 # WGS84, and the Earth's rate (IERS conventions)
 A, F, RATE, GM = 6378137.0, 1 / 298.257223563, 7.292115e-5, 3.986004418e14
 
@@ -212,9 +212,9 @@ def test_sigma_by_hand():
     both = intersection_angles(*planes)
     slope = [SCENE.body @ rotation([0, look, 0])[:, 0] for look in LINES.values()]
     reach = [1 / np.linalg.norm(p - SCENE.station, axis=1).mean() for p in SCENE.points.values()]
-    forward, down, aft = (s * r for s, r in zip(slope, reach, strict=True))
+    forward, down, backward = (s * r for s, r in zip(slope, reach, strict=True))
     assert both.sigma[0] == pytest.approx(np.linalg.norm(forward - down), rel=0.02)
-    assert both.covariance[0, 1] == pytest.approx((forward - down) @ (down - aft), rel=0.05)
+    assert both.covariance[0, 1] == pytest.approx((forward - down) @ (down - backward), rel=0.05)
 
 
 def test_alpha_and_beta_share_the_error_of_the_station():
@@ -279,8 +279,8 @@ def test_both_ways_of_total_least_squares_agree():
     """Isotropic errors by the singular vector; all but isotropic ones by Gauss-Helmert steps."""
     scene = noisy(SCENE, np.random.default_rng(7), 1.5, 0.5)
     nearly = np.diag([2.25, 2.25, 2.25 * (1 + 1e-12)])
-    iterated = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["aft"], nearly))
-    direct = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["aft"], 1.5))
+    iterated = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["backward"], nearly))
+    direct = fit_plane(Station.of(scene.station, 0.5), Strip.of(scene.points["backward"], 1.5))
     assert iterated.normal == pytest.approx(direct.normal, abs=1e-13)
 
 
@@ -406,7 +406,7 @@ def test_arccos_loses_small_angles():
 
 def test_off_axis_angle_of_another_line():
     """The outlook: a high-resolution line 0.3 deg and a multispectral line 2 deg off the nadir line."""
-    looks = {"forward": 0.3 * DEG, "nadir": 0.0, "aft": -2 * DEG}
+    looks = {"forward": 0.3 * DEG, "nadir": 0.0, "backward": -2 * DEG}
     high, nadir, multispectral = fits(descending_pass(looks=looks))
     assert off_axis_angle(high, nadir).values[0] == pytest.approx(0.3 * DEG, abs=1e-13)
     assert off_axis_angle(multispectral, nadir).values[0] == pytest.approx(2 * DEG, abs=1e-13)

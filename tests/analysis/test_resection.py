@@ -15,11 +15,11 @@ from tests.analysis.test_planes import ARCSEC, DEG, LINES, LOOK, SCENE, bounds, 
 FALSE_ALARM = 1e-6
 
 
-PAIRS = (("forward", "nadir"), ("nadir", "aft"))
-NAMES = ("roll", "pitch", "yaw", "forward look", "aft look")
+PAIRS = (("forward", "nadir"), ("nadir", "backward"))
+NAMES = ("roll", "pitch", "yaw", "forward look", "backward look")
 
 
-def observed(scene, noise=1.5, sigma=0.0, lines=("forward", "nadir", "aft")):
+def observed(scene, noise=1.5, sigma=0.0, lines=("forward", "nadir", "backward")):
     return {
         k: ObservedLine.of(Strip.of(scene.points[k], noise), scene.tangents[k], sigma, look=LINES[k]) for k in lines
     }
@@ -45,7 +45,7 @@ def test_exact_geometry_is_recovered(sigma_station):
 
 def test_unequal_look_angles_and_distortion():
     """Look angles of a two-line camera and 3 deg: each line's own. A curved line has tangents across, too."""
-    scene = descending_pass(looks={"forward": 26 * DEG, "nadir": -5 * DEG, "aft": -8 * DEG})
+    scene = descending_pass(looks={"forward": 26 * DEG, "nadir": -5 * DEG, "backward": -8 * DEG})
     lines = {k: ObservedLine.of(Strip.of(p, 1.5), scene.tangents[k]) for k, p in scene.points.items()}
     result = resect(Station.of(scene.station), lines)
     assert result.angles(PAIRS) == pytest.approx([31 * DEG, 3 * DEG], abs=1e-13)
@@ -75,7 +75,7 @@ def test_covariance_is_that_of_a_numerical_jacobian():
                 moved[index] += sign * step
                 lines[name] = ObservedLine.of(Strip.of(moved, 2.0), scene.tangents[name])
                 result = resect(station, lines)
-                looks = [result.looks["forward"], result.looks["aft"]]
+                looks = [result.looks["forward"], result.looks["backward"]]
                 change.append(np.concatenate([turn_error(result, scene.body), looks]))
             slope = (change[0] - change[1]) / (2 * step)
             total += 4.0 * np.outer(slope, slope)
@@ -84,9 +84,9 @@ def test_covariance_is_that_of_a_numerical_jacobian():
     assert np.abs((base.covariance - total) / scale).max() < 1e-5
     assert base.names == NAMES
     assert base.sigma["forward look"] == pytest.approx(np.sqrt(total[3, 3]), rel=1e-5)
-    # alpha is the forward look, beta minus the aft one, and their difference from forward to aft
+    # alpha is the forward look, beta minus the backward one, and their difference from forward to backward
     part, signs = total[3:, 3:], np.array([[1.0, 0.0], [0.0, -1.0], [1.0, -1.0]])
-    found = base.angle_covariance((*PAIRS, ("forward", "aft")))
+    found = base.angle_covariance((*PAIRS, ("forward", "backward")))
     assert found == pytest.approx(signs @ part @ signs.T, rel=1e-4)
 
 
@@ -103,7 +103,7 @@ def test_scatter_agrees_with_covariance(sigma_station, sigma_image):
             lines[name] = ObservedLine.of(Strip.of(points, 1.5), inside, sigma_image)
         result = resect(Station.of(scene.station, sigma_station), lines)
         error = np.concatenate(
-            [turn_error(result, SCENE.body), [result.looks["forward"] - LOOK, result.looks["aft"] + LOOK]]
+            [turn_error(result, SCENE.body), [result.looks["forward"] - LOOK, result.looks["backward"] + LOOK]]
         )
         if sigma_station:
             error = np.concatenate([error, result.station - SCENE.station])
@@ -152,11 +152,11 @@ def test_what_the_points_cannot_tell_is_named():
     alone = resect(station, nadir)
     assert alone.names == ("roll", "pitch", "yaw")
     for method in (alone.angles, alone.angle_covariance):
-        with pytest.raises(ResectionError, match="no aft and no forward line among nadir"):
-            method((("forward", "aft"),))
+        with pytest.raises(ResectionError, match="no backward and no forward line among nadir"):
+            method((("forward", "backward"),))
 
 
-@pytest.mark.parametrize("pair", [("forward", "nadir"), ("forward", "aft"), ("aft", "nadir")])
+@pytest.mark.parametrize("pair", [("forward", "nadir"), ("forward", "backward"), ("backward", "nadir")])
 def test_two_lines_tell_their_angle(pair):
     """One angle, four unknowns; which of the lines is the reference changes neither the angle nor its sigma."""
     station, lines = Station.of(SCENE.station, 0.5), observed(SCENE, lines=pair)
@@ -197,14 +197,14 @@ def test_bad_input():
     lines = observed(SCENE)
     swapped = {
         k: replace(lines[other], look=LINES[k])
-        for k, other in (("forward", "aft"), ("nadir", "nadir"), ("aft", "forward"))
+        for k, other in (("forward", "backward"), ("nadir", "nadir"), ("backward", "forward"))
     }
     with pytest.raises(ResectionError, match="lines exchanged"):
         resect(station, swapped)
     mirrored = {k: replace(v, tangent=-v.tangent) for k, v in lines.items()}
     with pytest.raises(ResectionError, match="counted from the other end"):
         resect(station, mirrored)
-    with pytest.raises(ResectionError, match="reference 'left' is none of the lines forward, nadir, aft"):
+    with pytest.raises(ResectionError, match="reference 'left' is none of the lines forward, nadir, backward"):
         resect(station, lines, reference="left")
     with pytest.raises(ResectionError, match="no lines"):
         resect(station, {})

@@ -8,7 +8,7 @@ from analysis.orbit.planes import METHODS, Station
 from tests.analysis.test_planes import ARCSEC, LOOK, SCENE, noisy, rotation
 
 AXES = "xyz"
-PAIRS = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+PAIRS = {"alpha": ("forward", "nadir"), "beta": ("nadir", "backward")}
 
 
 def table(scene=SCENE, method="tls", **options):
@@ -24,18 +24,20 @@ def test_slopes_by_geometry():
     of all strips together. Normals and ranges from the scene's own axes. Ranges vary by 1% with relief and along the
     line, and are averaged; hence 1%.
     """
-    normal = {k: SCENE.body @ rotation([0, a, 0])[:, 0] for k, a in (("forward", LOOK), ("nadir", 0), ("aft", -LOOK))}
+    normal = {
+        k: SCENE.body @ rotation([0, a, 0])[:, 0] for k, a in (("forward", LOOK), ("nadir", 0), ("backward", -LOOK))
+    }
     turn = {k: n / np.mean(along(SCENE, k)) for k, n in normal.items()}
     expected = {
         ("forward", 0): turn["forward"],
         ("nadir", 0): -turn["nadir"],
         ("nadir", 1): turn["nadir"],
-        ("aft", 1): -turn["aft"],
+        ("backward", 1): -turn["backward"],
         ("forward", 1): np.zeros(3),
-        ("aft", 0): np.zeros(3),
+        ("backward", 0): np.zeros(3),
     }
     expected[("station", 0)] = -expected[("forward", 0)] - expected[("nadir", 0)]
-    expected[("station", 1)] = -expected[("nadir", 1)] - expected[("aft", 1)]
+    expected[("station", 1)] = -expected[("nadir", 1)] - expected[("backward", 1)]
     for (what, angle), vector in expected.items():
         found = np.array([ROWS[what, axis].slope[angle] for axis in AXES])
         assert found == pytest.approx(vector, abs=0.01 * 2e-6)
@@ -43,7 +45,7 @@ def test_slopes_by_geometry():
 
 def along(scene, name):
     """Distance of a strip's points from the station, along the line of sight of the line's centre."""
-    look = {"forward": LOOK, "nadir": 0.0, "aft": -LOOK}[name]
+    look = {"forward": LOOK, "nadir": 0.0, "backward": -LOOK}[name]
     return (scene.points[name] - scene.station) @ scene.body @ [np.sin(look), 0, np.cos(look)]
 
 
@@ -61,12 +63,14 @@ def test_linear_derivative_agrees_with_recomputation(method):
 def test_moving_everything_changes_nothing():
     for angle in (0, 1):
         for axis in AXES:
-            total = sum(ROWS[what, axis].slope[angle] for what in ("station", "forward", "nadir", "aft"))
+            total = sum(ROWS[what, axis].slope[angle] for what in ("station", "forward", "nadir", "backward"))
             assert abs(total) < 1e-18
 
 
 def test_rows_for_the_result():
-    assert [(r.what, r.axis) for r in table()] == [(w, a) for w in ("station", "forward", "nadir", "aft") for a in AXES]
+    assert [(r.what, r.axis) for r in table()] == [
+        (w, a) for w in ("station", "forward", "nadir", "backward") for a in AXES
+    ]
     row = ROWS["nadir", "y"].to_dict()
     assert set(row) == {"what", "axis", "alpha_arcsec_per_10m", "beta_arcsec_per_10m"}
     assert row["alpha_arcsec_per_10m"] == pytest.approx(ROWS["nadir", "y"].change[0, -1] / ARCSEC, rel=1e-3)
@@ -76,9 +80,9 @@ def test_rows_for_the_result():
 def test_any_lines_and_angles():
     """Two lines and one angle have the same numbers as among three; a third line that no angle needs is no matter."""
     strips = dict(zip(SCENE.points, SCENE.strips(1.5), strict=True))
-    two = {name: strips[name] for name in ("aft", "nadir")}
+    two = {name: strips[name] for name in ("backward", "nadir")}
     for given in (two, strips):
-        for row in sensitivity(Station.of(SCENE.station, 0.5), given, {"off_axis": ("aft", "nadir")}):
+        for row in sensitivity(Station.of(SCENE.station, 0.5), given, {"off_axis": ("backward", "nadir")}):
             assert set(row.to_dict()) == {"what", "axis", "off_axis_arcsec_per_10m"}
             among_three = ROWS[row.what, row.axis]
             assert row.slope == pytest.approx(among_three.slope[among_three.angles.index("beta")], abs=1e-20)

@@ -217,10 +217,10 @@ def test_wrong_matches_and_wrong_sigmas_are_found_among_shared_noise():
     for group, factor in (("image", 1.0), ("attitude", 4.0), ("control", 1.0)):
         assert found.factors[group] == pytest.approx(factor, rel=4.5 * np.sqrt(4 / found.redundancy[group]))
     fields, truth = campaign(views, rng)
-    rays = fields[1].rays["aft"]
+    rays = fields[1].rays["backward"]
     rays.image[:5] += 30 * PITCH
     found = solve(fields, robust="igg")
-    assert np.all(found.weight["F1"]["aft"][:5] == 0)
+    assert np.all(found.weight["F1"]["backward"][:5] == 0)
     assert sum(int(np.sum(w == 0)) for one in found.weight.values() for w in one.values()) <= 5 + 3
     assert stats.chi2.sf(*square(found, truth)) > 1e-5
 

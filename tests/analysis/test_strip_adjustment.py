@@ -82,7 +82,7 @@ def test_corrections_take_the_errors_out_of_other_rays():
         squares.append([e.plan_rms**2 + e.height_rms**2 for e in (before, after)])
     assert np.sqrt(np.mean(squares, axis=0)[1] / np.mean(squares, axis=0)[0]) < 0.9
     with pytest.raises(CalibrationError, match="no times"):
-        found.corrected(replace(rays["aft"], time=None))
+        found.corrected(replace(rays["backward"], time=None))
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_wrong_matches_show_in_the_fit():
 
 def test_points_of_one_line_and_bad_input():
     rays = make_rays(strip(7, 30, 5.0), np.random.default_rng(7), WHITE)
-    some = {k: r.taken(r.point != 3) if k != "aft" else r for k, r in rays.items()}
+    some = {k: r.taken(r.point != 3) if k != "backward" else r for k, r in rays.items()}
     found = adjusted(some, WHITE)
     assert np.isnan(found.ground[3]).all()
     assert np.isfinite(np.delete(found.ground, 3, axis=0)).all()

@@ -21,14 +21,14 @@ from twin.orbit.flight.sensor import Sensor
 ARCSEC = np.pi / 648000
 PITCH = 6.5e-6
 RADIUS, RATE, EARTH_RATE, INCLINATION = 6378137.0 + 500e3, 1.1068e-3, 7.292115e-5, np.radians(97.4)
-LOOKS = {"forward": 25.0, "nadir": 0.0, "aft": -25.0}
+LOOKS = {"forward": 25.0, "nadir": 0.0, "backward": -25.0}
 MOUNTED = {
     "forward": (12, -20, 35),
     "nadir": (-8, 15, -10),
-    "aft": (5, 18, -28),
+    "backward": (5, 18, -28),
 }  # arcsec, as scenes/library/payloads/th1.yaml
-DISTORTION = {"forward": 0.045, "nadir": 0.040, "aft": -0.038}
-INTERIOR = {"forward": (0.65, 8e-6, -13e-6), "nadir": (0.65, -5e-6, 10e-6), "aft": (0.65, 12e-6, 6e-6)}
+DISTORTION = {"forward": 0.045, "nadir": 0.040, "backward": -0.038}
+INTERIOR = {"forward": (0.65, 8e-6, -13e-6), "nadir": (0.65, -5e-6, 10e-6), "backward": (0.65, 12e-6, 6e-6)}
 POSITION = (0.3, -0.1, 0.2)
 
 
@@ -184,7 +184,7 @@ def test_signs_are_those_of_the_simulated_sensor(line):
     """Points from the twin's pixel to ground through th1.yaml, 1e-9 m of rounding each: 1e-15 m in the image."""
     spec = load_three_line_camera("th1")
     one = spec.lines[line]
-    model = LineModel.of(mounting(line), (one.focal_length, *one.principal_point), one.position, one.k1, one.k2)
+    model = LineModel.of(mounting(line), (one.principal_distance, *one.principal_point), one.position, one.k1, one.k2)
     platform = CirclePlatform(wobble=5.0 * ARCSEC)
     sensor = Sensor(line_cameras(spec)[line], platform, Earth(), 0.7e-3, -3.0, 10_000, NO_EFFECTS)
     lines, pixels = np.random.default_rng(9).uniform(0, 9999, (2, 30))
@@ -261,7 +261,7 @@ def close(found, expected):
 
 def test_forward_intersection_returns_the_points():
     """A third line adds nothing to exact rays; 1e-14 of a tangent at 500 km is 1e-8 m, rounding of the station 1e-9."""
-    for lines in (("forward", "nadir", "aft"), ("forward", "aft"), ("nadir", "aft")):
+    for lines in (("forward", "nadir", "backward"), ("forward", "backward"), ("nadir", "backward")):
         rays = {k: make_rays(SEEN)[k] for k in lines}
         found = intersect(rays, cameras(), Noise(PITCH), bias=BIAS, offset=OFFSET)
         assert np.abs(found.ground - SEEN.points).max() < 1e-6
@@ -295,14 +295,14 @@ def test_intersection_covariance_holds():
 
 
 def test_one_arcsecond_of_intersection_angle_is_metres_of_height():
-    """Look angles of fore and aft 1 arcsec larger each lower the point by h / (tan a cos^2 a) da on a flat Earth.
+    """Look angles of fore and backward 1 arcsec larger each lower the point by h / (tan a cos^2 a) da on a flat Earth.
 
     That is 6.3 m for 500 km, 3.2 m for each arcsec of the whole angle. The curved Earth makes the rays a few per cent
     flatter than 25 degrees at the ground: the tolerance of a tenth.
     """
     seen = observe(field_points(np.random.default_rng(3), 30, 2.4), 2.4, cameras())
     wrong = cameras()
-    for line, sign in (("forward", 1), ("aft", -1)):
+    for line, sign in (("forward", 1), ("backward", -1)):
         turn = Rotation.from_rotvec([0, sign * ARCSEC, 0]).as_matrix()
         wrong[line] = replace(wrong[line], to_body=turn @ wrong[line].to_body)
     rays = {k: v for k, v in make_rays(seen).items() if k != "nadir"}

@@ -187,13 +187,12 @@ ALL = (
     _job("validate_list", "twin.validate --list --json"),
     _job(
         "mtf_edge",
-        "analysis.mtf {here}/edge.tiff --roi 8,8,80,80 --pixel-size 7um --json"
-        " --csv {out}/curve.csv --plot {out}/curve.svg",
+        "analysis.mtf {here}/edge.tiff --roi 8,8,80,80 --pitch 7um --json --csv {out}/curve.csv --plot {out}/curve.svg",
         prepare=_edge,
     ),
     _job(
         "mtf_bars",
-        "analysis.mtf {here}/bars.tiff --roi 16,16,64,64 --pixel-size 7um --bars 0.25cycles/pixel"
+        "analysis.mtf {here}/bars.tiff --roi 16,16,64,64 --pitch 7um --bars 0.25cycles/pixel"
         " --dark 16,98,64,12 --bright 16,114,64,12",
         prepare=_bars,
     ),

@@ -222,7 +222,7 @@ def test_rugged_sees_the_same_ground_points(orekit: Path, tmp_path: Path) -> Non
     ]
     worst = 0.0
     cameras = line_cameras(load_three_line_camera("th1"))
-    for name, camera in ((name, cameras[name]) for name in ("forward", "nadir", "aft")):
+    for name, camera in ((name, cameras[name]) for name in ("forward", "nadir", "backward")):
         pixels = np.linspace(0.0, camera.pixels - 1.0, 7)
         los = LOSBuilder(list(camera.look(pixels))).build()
         datation = LinearLineDatation(date(bench.EPOCH, 0.0), 0.0, 1.0)

@@ -248,7 +248,9 @@ def _frames() -> Iterator[Case]:
 detector: ./ccd.yaml
 exposure: 10 ms
 geometry:
-  one: {focal_length: 5.5 m, separation: 235 mm, pixel: 12 um, look: 26 deg, field: 1.2 deg, focal_length_across: 5.6 m}
+  one:
+    {principal_distance: 5.5 m, separation: 235 mm, pitch: 12 um, look: 26 deg, field: 1.2 deg,
+     principal_distance_across: 5.6 m}
 bad_pixels: {one/left: bad.fits, one/right: [bad.fits]}
 dark: dark.fits
 flat: {all: [flat.fits]}
@@ -321,7 +323,7 @@ def _pictures() -> Iterator[Case]:
     wave = 0.5 + 0.3 * np.sin(2.0 * np.pi * (columns + 0.05 * rows) / 4.0)
     wave = np.where(columns >= 80, 1.0, np.where(columns >= 64, 0.0, wave))
     bars = np.rint(2000.0 + 40000.0 * wave).astype(np.uint16)
-    words = ("--pixel-size", "7 um", "--roi")
+    words = ("--pitch", "7 um", "--roi")
     of_bars = (*words, "4,4,48,48", "--bars", "0.25 cycles/pixel", "--dark", "4,66,48,12", "--bright", "4,82,48,12")
     curve = ("--csv", "{here}/out/curve.csv", "--plot", "{here}/out/curve.svg")
     for ending, kind in (("tiff", "TIFF image"), ("fits", "FITS image"), ("png", "PNG image"), ("jpg", "JPEG image")):

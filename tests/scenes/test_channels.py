@@ -48,7 +48,7 @@ def test_two_beams_stand_clear(model, backend) -> None:
     assert all(o.body in prisms or o.share < 0.01 for o in found)
     # each 180-deg prism stands where its own channel says
     for channel in model.channels:
-        given = model.spec.channels_of(channel.camera)[channel.side]
+        given = model.spec.channels_of(channel.camera)[channel.name]
         window = model.assembly.nominal_pose(f"{channel.prism_body('prism_180')}/window/entry").translation
         home = model.assembly.nominal_pose(f"base/{channel.camera}")
         assert home.inverse().apply(window)[2] == pytest.approx(given.prism_180.distance, abs=0.01)

@@ -26,13 +26,13 @@ def test_example() -> None:
     assert setup.camera == load_three_line_camera("th1")
     test = setup.test
     assert (test.errors.station, test.errors.points, test.time) == (0.5, 1.5, 0.0)
-    assert test.changes["forward"].rotate[1] == pytest.approx(math.radians(4.0 / 3600.0), rel=1e-15)
+    assert test.perturb["forward"].rotate[1] == pytest.approx(math.radians(4.0 / 3600.0), rel=1e-15)
     assert test.orbit.passing.direction == "descending"
 
 
 def test_what_is_not_written(tmp_path: Path) -> None:
     test = resolve_angle(write(tmp_path, SMALL)).test
-    assert dict(test.changes) == {}
+    assert dict(test.perturb) == {}
     assert (test.errors.station, test.errors.points, test.errors.datum) == (0.5, 1.5, (0.0, 0.0, 0.0))
     effects = test.effects
     assert (effects.light_time, effects.aberration, effects.refraction, effects.corrected) == (True,) * 4
@@ -75,33 +75,33 @@ BAD = {
     "early": ("camera: th1", "camera: th1\ntime: -11 min", "time", ["outside the orbit data", "longer orbit"]),
     "line": (
         "camera: th1",
-        "camera: th1\nchanges: {backward: [0 deg, 0 deg, 0 deg]}",
-        "changes.backward",
+        "camera: th1\nperturb: {rear: [0 deg, 0 deg, 0 deg]}",
+        "perturb.rear",
         ["no such line", "forward, nadir"],
     ),
     "a shifted line": (
         "camera: th1",
-        "camera: th1\nchanges: {aft: {shift: [1 um, 0 um, 0 um]}}",
-        "changes.aft.shift",
+        "camera: th1\nperturb: {backward: {shift: [1 um, 0 um, 0 um]}}",
+        "perturb.backward.shift",
         ["does not allow shift", "an instrument of traced cameras"],
     ),
     "a line's pivot": (
         "camera: th1",
-        "camera: th1\nchanges: {aft: {rotate: [1 arcsec, 0 arcsec, 0 arcsec], pivot: rear_node}}",
-        "changes.aft.pivot",
+        "camera: th1\nperturb: {backward: {rotate: [1 arcsec, 0 arcsec, 0 arcsec], pivot: rear_node}}",
+        "perturb.backward.pivot",
         ["has no pivots"],
     ),
     "a turn without unit": (
         "camera: th1",
-        "camera: th1\nchanges: {aft: [1, 0, 0]}",
-        "changes.aft",
+        "camera: th1\nperturb: {backward: [1, 0, 0]}",
+        "perturb.backward",
         ["without a unit"],
     ),
     "an angle's line": (
         "camera: th1",
         "camera: th1\nangles: {alpha: [forward, nadirr]}",
         "angles.alpha",
-        ["no such line", "forward, nadir, aft, high_resolution, multispectral", "did you mean 'nadir'"],
+        ["no such line", "forward, nadir, backward, high_resolution, multispectral", "did you mean 'nadir'"],
     ),
     "one line twice": (
         "camera: th1",
@@ -121,19 +121,21 @@ def test_mistakes_are_told(case: str, tmp_path: Path) -> None:
 def test_a_camera_without_the_lines(tmp_path: Path) -> None:
     """Other lines are no mistake, but then the file says which angles; and one line has none."""
     text = (LIBRARY / PAYLOADS / "th1.yaml").read_text("utf-8")
-    (tmp_path / "own.yaml").write_text(text.replace("  aft:", "  rear:"), "utf-8")
+    (tmp_path / "own.yaml").write_text(text.replace("  backward:", "  rear:"), "utf-8")
     small = SMALL.replace("th1", "own.yaml")
     with pytest.raises(InputError, match=r"camera: .*not said.*forward, nadir, rear.*`angles:`"):
         resolve_angle(write(tmp_path, small))
     setup = resolve_angle(write(tmp_path, small + "angles: {all: [forward, rear]}\n"))
     assert dict(setup.angles) == {"all": ("forward", "rear")}
-    with pytest.raises(InputError, match=r"changes.aft.*no such line"):
-        resolve_angle(write(tmp_path, small + "angles: {all: [forward, rear]}\nchanges: {aft: [0 deg, 0 deg, 0 deg]}"))
+    with pytest.raises(InputError, match=r"perturb.backward.*no such line"):
+        resolve_angle(
+            write(tmp_path, small + "angles: {all: [forward, rear]}\nperturb: {backward: [0 deg, 0 deg, 0 deg]}")
+        )
     (tmp_path / "own.yaml").write_text(dump_yaml(_with_lines("nadir")), "utf-8")
     with pytest.raises(InputError, match=r"camera: an angle needs two lines.*nadir in th1.*two lines or more"):
         resolve_angle(write(tmp_path, small))
-    (tmp_path / "own.yaml").write_text(dump_yaml(_with_lines("aft", "nadir")), "utf-8")
-    assert dict(resolve_angle(write(tmp_path, small)).angles) == {"alpha": ("aft", "nadir")}
+    (tmp_path / "own.yaml").write_text(dump_yaml(_with_lines("backward", "nadir")), "utf-8")
+    assert dict(resolve_angle(write(tmp_path, small)).angles) == {"alpha": ("backward", "nadir")}
 
 
 def _with_lines(*names: str) -> dict:
@@ -143,7 +145,7 @@ def _with_lines(*names: str) -> dict:
 
 
 def test_usual_angles_are_filled_in() -> None:
-    assert dict(resolve_angle(EXAMPLE).angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
+    assert dict(resolve_angle(EXAMPLE).angles) == {"alpha": ("forward", "nadir"), "beta": ("nadir", "backward")}
     setup = resolve_angle(SCENES / ORBIT / "angle_off_axis.yaml")
     assert setup.angles["multispectral"] == ("multispectral", "nadir")
     assert (setup.pixels["high_resolution"], setup.pixels["multispectral"], setup.usual_pixels) == (30000, 6000, 12000)
@@ -156,7 +158,7 @@ def test_an_instrument_is_a_camera(tmp_path: Path) -> None:
     assert setup.instrument == load_instrument("gf7_pair")
     assert dict(setup.cameras) == {"gf7": load_camera("gf7")}
     assert dict(setup.pixels) == {"forward": 32768, "backward": 32768}
-    assert setup.test.changes["base"].temperature.gradient[2] == pytest.approx(0.4)
+    assert setup.test.perturb["base"].temperature.gradient[2] == pytest.approx(0.4)
     again = resolve_angle(write(tmp_path, setup.to_yaml()))
     assert again == setup
     assert again.to_yaml() == setup.to_yaml()

@@ -28,14 +28,14 @@ def test_example() -> None:
     assert (test.patch.lines, test.patch.pixels, test.oversampling) == (1000, 1000, 3)
     assert test.ground.light.elevation == pytest.approx(math.radians(38.0), rel=1e-15)
     assert test.control.shift == (0.6, -0.4)
-    image = setup.camera.image_of("aft")
+    image = setup.camera.image_of("backward")
     assert image is not None
     assert image.wavefront["Z4"] == 20e-9
 
 
 def test_what_is_not_written(tmp_path: Path) -> None:
     test = resolve_simulate(write(tmp_path, SMALL)).test
-    assert test.lines == ("forward", "nadir", "aft")
+    assert test.lines == ("forward", "nadir", "backward")
     assert (test.ground.terrain.kind, test.ground.terrain.relief) == ("real", None)
     assert (test.patch.line, test.patch.lines, test.seed) == ("nadir", 1000, 0)
     assert math.degrees(test.control.light.elevation) == pytest.approx(60.0)
@@ -71,7 +71,7 @@ BAD = {
     "patch line": (PATCH, "patch: {pixel: 6000, line: fore}", "patch.line", ["no such line", "forward"]),
     "pixel": (PATCH, "patch: {pixel: 12000}", "patch.pixel", ["outside the line", "11999.5"]),
     "time": (PATCH, "patch: {pixel: 6000, time: 11 min}", "patch.time", ["outside the orbit data"]),
-    "change": (PATCH, f"{PATCH}\nchanges: {{back: {{}}}}", "changes.back", ["no such line"]),
+    "change": (PATCH, f"{PATCH}\nperturb: {{back: {{}}}}", "perturb.back", ["no such line"]),
     "relief": (PATCH, f"{PATCH}\nground: {{terrain: {{kind: fractal}}}}", "ground.terrain", ["without relief"]),
     "spacing": (PATCH, f"{PATCH}\nground: {{texture: {{spacing: 0 m}}}}", "ground.texture.spacing", ["0.1 m"]),
 }

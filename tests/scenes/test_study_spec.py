@@ -121,7 +121,7 @@ def test_what_it_refuses(old: str, new: str, key: str, words: str) -> None:
         (("focus", "shims_um", 2), "um"),
         (("monitor", "gradient_K_per_m"), "K/m"),
         (("temperature", "linear_gradient_k_per_m"), "K/m"),
-        (("monitor", "metres_per_arcsec"), "m/arcsec"),
+        (("monitor", "height_m_per_arcsec"), "m/arcsec"),
         (("angle", "height_m_per_arcsec", "alpha"), ""),
         (("optics", "nyquist_per_mm"), "1/mm"),
         (("optics", "plate_scale_arcsec_per_mm_sigma"), "arcsec/mm"),

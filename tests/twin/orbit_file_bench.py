@@ -207,7 +207,7 @@ def measured_points(seed: int, count: int, wrong: float = 0.0) -> tuple[list[lis
     rng = np.random.default_rng(seed)
     cameras = line_cameras(load_three_line_camera("th1"))
     ground, images = [], []
-    for name, start in (("forward", FIRST), ("nadir", FIRST), ("aft", FIRST)):
+    for name, start in (("forward", FIRST), ("nadir", FIRST), ("backward", FIRST)):
         camera = cameras[name]
         sensor = Sensor(camera, Biased(), EARTH, LINE_TIME, start, LINES)
         line, pixel = rng.uniform(50, LINES - 50, count), rng.uniform(50, camera.pixels - 50, count)
@@ -233,11 +233,11 @@ def check_files(
     attitude_csv(folder / "attitude.csv")
     ground, images = measured_points(seed, count, wrong)
     csv(folder / "ground.csv", ("point", "latitude [deg]", "longitude [deg]", "height [m]"), *zip(*ground, strict=True))
-    heads = ("point", "camera", "line", "pixel", "sigma_line", "sigma_pixel")
+    heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma")
     csv(folder / "image_points.csv", heads, *zip(*images, strict=True))
     times = [
         (name, k, calendar(FIRST + k * LINE_TIME, digits=9))
-        for name in ("forward", "nadir", "aft")
+        for name in ("forward", "nadir", "backward")
         for k in (0, LINES - 1)
     ]
     csv(folder / "lines.csv", ("camera", "line", "date_time"), *zip(*times, strict=True))

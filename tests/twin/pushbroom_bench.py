@@ -17,7 +17,7 @@ from twin.orbit.flight.trajectory import Attitude, Trajectory
 from twin.orbit.images.line_optics import LineOptics, optics_of
 from twin.orbit.images.patch import ImagedLine, imaged_lines
 
-LINES = ("forward", "nadir", "aft")
+LINES = ("forward", "nadir", "backward")
 LINE_TIME = 0.7e-3
 PLACE = (np.radians(116.0), np.radians(40.0))
 

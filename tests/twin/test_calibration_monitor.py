@@ -55,11 +55,11 @@ def setup_with(exact: bool = False) -> CalibrationSetup:
 
 def test_the_drifted_camera_is_the_one_of_the_analysis() -> None:
     """To rounding: 1e-15 of f and of a rotation's elements, 1e-9 of the drift."""
-    drift = {"aft": np.array([30 * ARCSEC, -20 * ARCSEC, 50 * ARCSEC, 40e-6])}
-    turned = line_model(drifted_payload(WHOLE.camera, drift), "aft")
-    expected = line_model(WHOLE.camera, "aft").drifted(drift["aft"])
+    drift = {"backward": np.array([30 * ARCSEC, -20 * ARCSEC, 50 * ARCSEC, 40e-6])}
+    turned = line_model(drifted_payload(WHOLE.camera, drift), "backward")
+    expected = line_model(WHOLE.camera, "backward").drifted(drift["backward"])
     np.testing.assert_allclose(turned.to_body, expected.axes, rtol=0, atol=1e-14)
-    assert turned.interior[0] == pytest.approx(expected.focal_length, abs=1e-15)
+    assert turned.interior[0] == pytest.approx(expected.principal_distance, abs=1e-15)
 
 
 @pytest.mark.second
@@ -85,7 +85,7 @@ def test_exact_readings_return_everything() -> None:
 @pytest.mark.second
 def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     """By hand, over a flat Earth: 1 arcsec of one outer line is H / sin(2 look) per radian, 3.2 m; the curved Earth
-    takes 7% off. Heights of a field differ by its d_alpha, forward less aft, against the mean of all, to the same
+    takes 7% off. Heights of a field differ by its d_alpha, forward less backward, against the mean of all, to the same
     few per cent of metres per arcsec over latitudes, and d_beta, d_gamma and d_f act at the ends of the line."""
     setup = setup_with(exact=True)
     campaign = flown(setup, 1.0, SEED)
@@ -93,7 +93,7 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
     by_hand = setup.test.altitude / np.sin(np.radians(50.0)) * ARCSEC
     assert abs(metres) == pytest.approx(by_hand, rel=0.1)
     found = simultaneous(campaign)
-    angle = np.array([(p.truth.drift["forward"] - p.truth.drift["aft"])[0] / ARCSEC for p in campaign.passes])
+    angle = np.array([(p.truth.drift["forward"] - p.truth.drift["backward"])[0] / ARCSEC for p in campaign.passes])
     height = [at_checks(campaign, p, found.cameras, found.bias(p.name)).error[:, 2].mean() for p in campaign.passes]
     # cameras that do not have the drift see the opposite of it
     assert np.array(height) == pytest.approx(-metres * (angle - angle.mean()), abs=0.05 * abs(metres) * np.ptp(angle))
@@ -102,8 +102,8 @@ def test_drift_without_a_monitor_shifts_heights_as_its_angle_says() -> None:
 
 @pytest.mark.second
 def test_a_monitor_brings_errors_back() -> None:
-    """Same noise with and without drift. What a reading leaves is 0.03 arcsec of forward less aft, 0.1 m beside 3 m:
-    0.1% of an RMS; 2% allow for d_gamma and d_f. Drifts of 4 arcsec are 12 m and more."""
+    """Same noise with and without drift. What a reading leaves is 0.03 arcsec of forward less backward, 0.1 m beside 3
+    m: 0.1% of an RMS; 2% allow for d_gamma and d_f. Drifts of 4 arcsec are 12 m and more."""
     setup = setup_with()
     still, moved = (flown(setup, factor, SEED) for factor in (0.0, 4.0))
     base, blind, told = without_monitor(still), without_monitor(moved), with_monitor(moved)
@@ -147,7 +147,7 @@ def test_draws_do_not_change_others() -> None:
     drifted = fly_fields(setup, np.random.SeedSequence(7)).passes[1]
     np.testing.assert_array_equal(plain.control_images["nadir"].line, drifted.control_images["nadir"].line)
     np.testing.assert_array_equal(plain.control_ground, drifted.control_ground)
-    assert np.abs(plain.control_images["aft"].pixel - drifted.control_images["aft"].pixel).max() > 0.01
+    assert np.abs(plain.control_images["backward"].pixel - drifted.control_images["backward"].pixel).max() > 0.01
     assert not plain.readings
 
 
@@ -187,8 +187,13 @@ def test_command(tmp_path: Path) -> None:
 
 
 BAD = {
-    "line": ("  aft: {angles", "  after: {angles", "drift.after", ["no such line", "aft"]),
-    "negative": ("focal_length: 10 um}", "focal_length: -10 um}", "monitor.focal_length", ["outside the limits"]),
+    "line": ("  backward: {angles", "  after: {angles", "drift.after", ["no such line", "backward"]),
+    "negative": (
+        "principal_distance: 10 um}",
+        "principal_distance: -10 um}",
+        "monitor.principal_distance",
+        ["outside the limits"],
+    ),
     "negative drift": ("[1 arcsec, 1 arcsec, 2 arcsec]", "[-1 arcsec, 0 arcsec, 0 arcsec]", "drift", ["outside"]),
 }
 

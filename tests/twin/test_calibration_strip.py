@@ -160,7 +160,7 @@ def test_ties_do_not_change_what_else_is_drawn() -> None:
     none = setup.model_copy(update={"test": setup.test.model_copy(update={"strip": None})})
     plain, tied = (fly_fields(s, np.random.SeedSequence(5)) for s in (none, setup))
     one = tied.passes[0]
-    np.testing.assert_array_equal(plain.passes[0].control_images["aft"].line, one.control_images["aft"].line)
+    np.testing.assert_array_equal(plain.passes[0].control_images["backward"].line, one.control_images["backward"].line)
     assert not plain.passes[0].ties
     assert tied.noise.slow_attitude == 0.0
     field = field_with_ties(tied, one)

@@ -238,10 +238,10 @@ def test_a_refocused_file_finds_its_data_sheets(tmp_path) -> None:
 def test_the_command_refocuses(blurred, monkeypatch) -> None:
     _, out, result = blurred
     told = json.loads((out / "optics.json").read_text("utf-8"))
-    assert told["schema"] == "optics 2"
+    assert told["schema"] == "optics 3"
     moved = told["refocus"]
-    assert moved["worst_before_waves"] == pytest.approx(6.75, abs=0.01)
-    assert moved["worst_after_waves"] == pytest.approx(told["worst_wfe_waves"], rel=1e-3)
+    assert moved["wfe_worst_before_waves"] == pytest.approx(6.75, abs=0.01)
+    assert moved["wfe_worst_after_waves"] == pytest.approx(told["wfe_worst_waves"], rel=1e-3)
     assert 1e3 * (moved["z_after_m"] - moved["z_before_m"]) == pytest.approx(10.61, abs=0.01)
     assert told["verdict"].startswith("Not diffraction limited in ")
     assert "most of it coma" in told["verdict"]

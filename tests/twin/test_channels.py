@@ -105,7 +105,7 @@ def test_the_order_of_channels_is_that_of_the_results(two, backend, tmp_path) ->
     shuffled = experiment(data, tmp_path, backend)
     keys = [c.key for c in two.instrument.channels]
     own = [keys.index(c.key) for c in shuffled.instrument.channels]
-    assert [c.side for c in shuffled.instrument.channels[:4]] == list(order)
+    assert [c.name for c in shuffled.instrument.channels[:4]] == list(order)
     a, b = two.path.coarse_trace(STATES).place[own], shuffled.path.coarse_trace(STATES).place
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-6)
 
@@ -254,7 +254,7 @@ def test_drawings_show_every_channel(two, hollow, backend) -> None:
     for own in (two, hollow):
         paths = trace_light_paths(own.instrument, backend, {})
         names = {(b.camera, b.name) for b in paths.beams if b.is_monitor}
-        assert names == {(c.camera, f"monitor/{c.side}") for c in own.instrument.channels}
+        assert names == {(c.camera, f"monitor/{c.name}") for c in own.instrument.channels}
         scene = build_scene(own.instrument, paths)
         assert {s.path for s in own.instrument.solids} <= set(scene.graph.nodes_geometry)
         reach = max(

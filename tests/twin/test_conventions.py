@@ -111,9 +111,9 @@ def test_look_angle_is_positive_forward(gf7_pair):
 
 def test_left_is_the_plus_y_end(gf7_pair):
     for channel in gf7_pair.channels:
-        assert (channel.ccd[1] > 0) == (channel.side == "left")
+        assert (channel.ccd[1] > 0) == (channel.name == "left")
         assert channel.pinhole[0] - channel.ccd[0] == pytest.approx(-0.003)
-    assert [c.side for c in gf7_pair.channels] == ["left", "right"] * 2
+    assert [c.name for c in gf7_pair.channels] == ["left", "right"] * 2
 
 
 def test_an_image_point_at_plus_y_looks_to_minus_y(gf7_pair, backend):

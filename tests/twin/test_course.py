@@ -114,7 +114,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
         assert data.time.attrs["units"] == "s"
         np.testing.assert_array_equal(data.photons.values, photons.astype(np.float32))
     for i, channel in enumerate(experiment.path.channels):
-        image = tifffile.imread(folder / f"images/{channel.camera}_{channel.side}_course.tiff")
+        image = tifffile.imread(folder / f"images/{channel.camera}_{channel.name}_course.tiff")
         assert image.dtype == np.uint16
         np.testing.assert_array_equal(image, after[:, i, 0])
     for name, change in truth.cameras.items():

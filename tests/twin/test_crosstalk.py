@@ -84,7 +84,7 @@ def test_three_kinds_of_focal_length_change(table):
         looks_like = 1e-6 * aperture / geometry.focal_length_m**2 / ARCSEC
         false = found.readings["model"][0, k] - found.true[0, k]
         assert abs(false) == pytest.approx(looks_like, rel=0.2)
-        statements = found.focal_length_statements()
+        statements = found.principal_distance_statements()
         assert any("whole camera scaled" in s and "the spots see it." in s for s in statements)
         assert any("(piston)" in s and "the spots see it wrongly" in s for s in statements)
 

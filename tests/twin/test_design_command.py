@@ -131,7 +131,7 @@ def test_a_constraint_that_blocks_is_named(tmp_path) -> None:
     assert held["constraint"] == "principal distance"
     assert held["broken_at_start_m"] == 0.0
     # dz / (2 F)^2 / (4 sqrt 3) at F/9.32; a millimetre of focus goes with some micrometres of principal distance
-    off = np.sqrt(np.mean(np.square(told["wavefront_error_waves"]["before"])))
+    off = np.sqrt(np.mean(np.square(told["wfe_rms_waves"]["before"])))
     assert off == pytest.approx(5e-3 / 18.64**2 / (4 * np.sqrt(3)) / 650e-9, rel=0.02)
     assert held["worth_waves_per_mm"] > off
     page = (tmp_path / "out" / "report.html").read_text("utf-8")
@@ -150,7 +150,7 @@ def test_what_a_constraint_is_worth(tmp_path) -> None:
         result = CliRunner().invoke(app, [str(file), "--out", str(out), "--quiet"])
         assert result.exit_code == 0, result.output
         found.append(json.loads((out / "design.json").read_text("utf-8")))
-    errors = [np.sqrt(np.mean(np.square(told["wavefront_error_waves"]["after"]))) for told in found]
+    errors = [np.sqrt(np.mean(np.square(told["wfe_rms_waves"]["after"]))) for told in found]
     first, *_ = found[0]["held_by"]
     assert first["constraint"] == "clearance of the beams from scene to M1 beside M2"
     assert first["broken_at_start_m"] == pytest.approx(2.75e-3, abs=0.01e-3)
@@ -182,7 +182,7 @@ def test_the_example_makes_the_camera_of_the_library(tmp_path) -> None:
     assert result.exit_code == 0, result.output
     made = validate(CameraSpec, read_yaml(tmp_path / "out" / "artefacts" / "gf7_short.yaml"))
     told = json.loads((tmp_path / "out" / "design.json").read_text("utf-8"))
-    reached = [start["wavefront_error_waves"] for start in told["starts"]]
+    reached = [start["wfe_rms_waves"] for start in told["starts"]]
     assert len(reached) == 6
     # growing penalties stopped at 0.0223, scipy's least squares on batoid reach 0.0149
     assert min(reached) == pytest.approx(0.01489, abs=0.00002)

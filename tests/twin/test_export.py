@@ -109,7 +109,7 @@ def test_a_trajectory_that_jitters_takes_more_nodes(flight) -> None:
 
 
 def test_a_window_is_a_part_of_the_line(flight) -> None:
-    sensor = _sensor(flight, "aft", LightEffects())
+    sensor = _sensor(flight, "backward", LightEffects())
     part = replace(sensor, first_line_time=float(sensor.time(np.array([500.0]))[0]), lines=300)
     _, model = _isd(part, (7000, 400))
     line, pixel = np.array([0.0, 120.0, 299.0]), np.array([0.0, 399.0, 250.0])
@@ -190,7 +190,7 @@ def test_the_lines_of_a_mirror_camera() -> None:
 
 
 def test_command(tmp_path: Path) -> None:
-    path = write(tmp_path, ("lines: [forward, nadir, aft]", "lines: [forward, nadir]"))
+    path = write(tmp_path, ("lines: [forward, nadir, backward]", "lines: [forward, nadir]"))
     assert run("simulate", path, "--out", tmp_path / "run", "--seed", 5, "--quiet").exit_code == 0
     result = run("export", tmp_path / "run", "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0, result.stderr
@@ -262,7 +262,7 @@ def test_bad_input(tmp_path: Path, arguments: list[str], words: list[str]) -> No
 
 @pytest.mark.second
 def test_a_spoilt_run_is_refused(tmp_path: Path) -> None:
-    path = write(tmp_path, ("lines: [forward, nadir, aft]", "lines: [nadir]"))
+    path = write(tmp_path, ("lines: [forward, nadir, backward]", "lines: [nadir]"))
     assert run("simulate", path, "--out", tmp_path / "run", "--seed", 5, "--quiet").exit_code == 0
     image = tmp_path / "run" / "images" / "nadir.tiff"
     content = image.read_bytes()

@@ -113,10 +113,10 @@ def test_simulate_lists_its_points(tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     data = json.loads((tmp_path / "run" / "simulate.json").read_text("utf-8"))["points"]
     truth = json.loads((tmp_path / "run" / "artefacts" / "truth.json").read_text("utf-8"))["points"]
-    for line in ("forward", "nadir", "aft"):
+    for line in ("forward", "nadir", "backward"):
         accepted = [r for r in rows if r["line_name"] == line and r["sort"] != "tie" and r["accepted"] == "1"]
         assert len(accepted) == data["control"]["lines"][line]["accepted"] > 5
-        assert all(r["status"] == "accepted" and 0.0 < float(r["sigma_line_px"]) < 0.2 for r in accepted)
+        assert all(r["status"] == "accepted" and 0.0 < float(r["line_sigma"]) < 0.2 for r in accepted)
     assert {r["sort"] for r in rows} == {"control", "check", "tie"}
     assert len(truth["control"]["itrs_m"]) == data["control"]["sought"]
     assert not (tmp_path / "run" / "artefacts" / "points.json").exists()

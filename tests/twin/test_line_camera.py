@@ -32,17 +32,17 @@ TH1 = load_three_line_camera("th1")
 
 def payload(**lines) -> ThreeLineCameraSpec:
     """Lines of 650 mm, otherwise as given in YAML."""
-    text = {name: {"focal_length": "650 mm", **line} for name, line in lines.items()}
+    text = {name: {"principal_distance": "650 mm", **line} for name, line in lines.items()}
     return ThreeLineCameraSpec.model_validate({"name": "own", "pixels": 12000, "pitch": "6.5 um", "lines": text})
 
 
 def test_the_file() -> None:
-    assert list(TH1.lines) == ["forward", "nadir", "aft", "high_resolution", "multispectral"]
+    assert list(TH1.lines) == ["forward", "nadir", "backward", "high_resolution", "multispectral"]
     ground = {"high_resolution": 2.0, "multispectral": 10.0}
     for (name, line), degrees in zip(TH1.lines.items(), (25, 0, -25, 2, 0), strict=True):
         pixels, pitch = TH1.pixels_of(name), TH1.pitch_of(name)
         pixel = ground.get(name, 5.0)
-        assert 500e3 * pitch / line.focal_length == pytest.approx(pixel, rel=1e-12)
+        assert 500e3 * pitch / line.principal_distance == pytest.approx(pixel, rel=1e-12)
         assert pixels * pixel == pytest.approx(60e3)
         assert math.degrees(line.look) == pytest.approx(degrees, abs=1e-12)
         half = 0.5 * pixels * pitch
@@ -75,7 +75,9 @@ def test_ideal_lines_obey_collinearity(name: str) -> None:
     place = np.stack([np.zeros_like(pixel), (pixel - 0.5 * last) * pitch], axis=-1) - np.array(line.principal_point)
     corrected = place * (1.0 + line.k1 * np.sum(place**2, axis=-1, keepdims=True))
     # rounding of a length of 0.65 to 1.6 m
-    np.testing.assert_allclose(-line.focal_length * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=3e-15)
+    np.testing.assert_allclose(
+        -line.principal_distance * np.stack([x / z, y / z], axis=-1), corrected, rtol=0, atol=3e-15
+    )
 
 
 def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:
@@ -85,7 +87,7 @@ def test_first_pixel_sees_the_right_and_forward_is_ahead() -> None:
         assert ends[0, 1] > 0.05
         assert ends[1, 1] < -0.05
     assert cameras["forward"].look(np.array([6000.0]))[0, 0] > 0.42
-    assert cameras["aft"].look(np.array([6000.0]))[0, 0] < -0.42
+    assert cameras["backward"].look(np.array([6000.0]))[0, 0] < -0.42
 
 
 def test_fifth_order_distortion_and_slope() -> None:
@@ -193,7 +195,7 @@ def test_a_turn_within_the_plane_changes_the_look_but_not_the_planes() -> None:
     """A camera rolled by w about its own X keeps its plane; the angle of the looks has cos = cos a cos w exactly."""
     a, w = math.radians(25.0), math.radians(1.5)
     cameras = line_cameras(
-        payload(nadir={"look": "0 deg"}, aft={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
+        payload(nadir={"look": "0 deg"}, backward={"look": "-25 deg", "rotate": ["1.5 deg", "0 deg", "0 deg"]})
     )
     assert dihedral_angle(*cameras.values()) == pytest.approx(a, abs=1e-13)
     assert look_angle(*cameras.values()) == pytest.approx(math.acos(math.cos(a) * math.cos(w)), abs=1e-14)

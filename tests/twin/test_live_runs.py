@@ -227,7 +227,7 @@ def test_a_measurement_opens_its_instrument_as_designed(tmp_path):
 def test_a_measurement_without_an_instrument(tmp_path):
     """One that gives the cameras' geometry alone has nothing to be shown."""
     file = frames_beside(tmp_path)
-    geometry = "{focal_length: 5.5 m, separation: 0.24 m, pixel: 12 um}"
+    geometry = "{principal_distance: 5.5 m, separation: 0.24 m, pitch: 12 um}"
     text = file.read_text().replace(
         "instrument: gf7_pair\n", f"geometry: {{forward: {geometry}, backward: {geometry}}}\ntemplate: measured\n"
     )

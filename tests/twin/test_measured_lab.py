@@ -456,7 +456,7 @@ def test_printed_model_reproduces_the_spots_and_goes_into_a_payload(folder: Path
     spec = load_three_line_camera("th1")
     line = LineCameraSpec(
         look="0 deg",
-        focal_length=f"{f} m",
+        principal_distance=f"{f} m",
         principal_point=("0 mm", f"{point} m"),
         k1=f"{k1} 1/m^2",
         pixels=pixels,
@@ -475,7 +475,7 @@ def test_printed_model_reproduces_the_spots_and_goes_into_a_payload(folder: Path
             rows.append([p, s, repr(100.0 + float(angle[p])), repr(float(place)), 0.01])
     write(folder / "spots.csv", rows)
     (folder / "distortion.yaml").write_text(
-        "name: line\nfocal_length: 0.65 m\nmeasured:\n  spots: spots.csv\n  zero: 100 deg\n"
+        "name: line\nprincipal_distance: 0.65 m\nmeasured:\n  spots: spots.csv\n  zero: 100 deg\n"
         f"  line: {{pitch: 7 um, middle: {middle}}}\n  angle_sigma: 0.001 arcsec\n"
     )
     code, told = run("distortion", folder / "distortion.yaml", "--out", tmp_path / "run")
@@ -495,12 +495,12 @@ def test_printed_model_reproduces_the_spots_and_goes_into_a_payload(folder: Path
     assert missed(terms["principal_distance"]) < 0.3
     assert missed(data["principal_distance_mm"]) > 15.0
     values, covariance = np.array(own["values"]), np.array(own["covariance"])
-    assert own["terms"] == ["axis", "focal_length", "principal_point", "k1"]
+    assert own["terms"] == ["axis", "principal_distance", "principal_point", "k1"]
     away = values - [0.0, 1e3 * f, 1e3 * point, k1]
     # chi-square of three parameters; by chance beyond 30 once in 1e6
     assert away[1:] @ np.linalg.solve(covariance[1:, 1:], away[1:]) < 30.0
-    np.testing.assert_allclose(own["sigma"], np.sqrt(np.diag(covariance)), rtol=1e-12)
-    assert own["sigma"][2] < 0.05
+    np.testing.assert_allclose(own["values_sigma"], np.sqrt(np.diag(covariance)), rtol=1e-12)
+    assert own["values_sigma"][2] < 0.05
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Joint model" in page
     assert "balanced" in page

@@ -176,7 +176,7 @@ FILES = [
         "measured.zero: outside of the calibrated readings; found '150 deg'",
     ),
     ("distortion", "  zero: 102 deg", "  angle_sigma: 1 arcsec\n  zero: 102 deg", "told in one way; found both"),
-    ("distortion", "focal_length: 5.51 m", "focal_length: 0 m", "focal_length"),
+    ("distortion", "principal_distance: 5.51 m", "principal_distance: 0 m", "principal_distance"),
     ("distortion", "held_out: held_out.csv", "held_out: measured", "no such file"),
     ("focus", "moved: image", "moved: target", "how far the image moves with the target is not told; found 'target'"),
     ("focus", "moved: image", "moved: images", "did you mean 'image'?"),

@@ -231,7 +231,7 @@ def test_scipy_finds_the_same_from_the_files(tmp_path) -> None:
     for name in names:
         said = WHOLE.camera.lines[name]
         mounts.append((Rotation.from_rotvec([0.0, said.look, 0.0]) * Rotation.from_rotvec(said.rotate)).as_matrix())
-        start.append([said.focal_length, *said.principal_point])
+        start.append([said.principal_distance, *said.principal_point])
         distortion.append(said.k1)
     mounts, start, distortion = np.array(mounts), np.array(start), np.array(distortion)
     free = [k for k in range(9) if k not in (4, 5)]  # x and y of the nadir line are the gauge
@@ -378,7 +378,7 @@ def test_more_points_never_raise_a_sigma(files) -> None:
 
 
 def test_two_lines_calibrate(campaign, files) -> None:
-    """Forward and aft alone: right to its sigmas, which are larger; the steeper line is held. False alarm 1e-6."""
+    """Forward and backward alone: right to its sigmas, which are larger; the steeper line is held. False alarm 1e-6."""
     for name in FIELDS:
         for table, column in (("image_points", 1), ("lines", 0)):
             edit(
@@ -386,7 +386,7 @@ def test_two_lines_calibrate(campaign, files) -> None:
                 lambda heads, rows, column=column: (heads, [r for r in rows if r[column] != "nadir"]),
             )
     _, pair = read_back(files)
-    assert pair.lines == ("forward", "aft")
+    assert pair.lines == ("forward", "backward")
     three, two = simultaneous(campaign), simultaneous(pair)
     assert set(gauge_of(pair).held) == {f"{pair.reference} x", f"{pair.reference} y"}
     assert two.p_value > 1e-6
@@ -558,14 +558,14 @@ def test_intersection_angles_of_measured_passes(tmp_path) -> None:
 def test_the_angle_command_on_measurements(files) -> None:
     """Other time, other angles; numbers in angle.json; a line without points is refused by its key."""
     folder = files.parent
-    file = angle_file(folder, angles={"wide": ["forward", "aft"]}, time="1 s")
+    file = angle_file(folder, angles={"wide": ["forward", "backward"]}, time="1 s")
     result = run("angle", file, "--out", folder / "run", "--quiet")
     assert result.exit_code == 0, result.output
     numbers = json.loads((folder / "run/angle.json").read_text())["measured"]["Beijing"]
     assert numbers["time_s"] == 1.0
-    assert numbers["points"] == {"forward": 44, "aft": 44}
+    assert numbers["points"] == {"forward": 44, "backward": 44}
     assert numbers["along_track"]["wide_deg"] == pytest.approx(49.98, abs=0.02)
-    assert 0.05 < numbers["along_track"]["wide_sigma_arcsec"] < 1.0
+    assert 0.05 < numbers["along_track"]["wide_arcsec_sigma"] < 1.0
     refused = run("angle", angle_file(folder, angles={"wide": ["forward", "multispectral"]}), "--out", folder / "no")
     assert refused.exit_code == 2
     assert "angles.wide" in refused.stderr
@@ -624,7 +624,7 @@ def test_points_of_simulated_images_are_exported_where_they_were_found(tmp_path)
         (tmp_path / name).write_text(text)
     said = resolve_measured_calibration(tmp_path / "calibrate.yaml")
     (one,) = read_measurements(said.data, said.camera)
-    assert set(one.images) == {"forward", "nadir", "aft"}
+    assert set(one.images) == {"forward", "nadir", "backward"}
     assert set(one.ground.role.tolist()) == {"control", "check", "tie"}
     given = one.ground.role == "control"
     for name, row in one.images.items():

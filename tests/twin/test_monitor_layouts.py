@@ -201,7 +201,7 @@ def test_noise_of_shot_light_alone_is_that_of_an_airy_disk(bench: LayoutBench, p
 def test_spots_that_are_taken_to_be_alike_are(bench: LayoutBench, path: MonitorPath) -> None:
     # left and right of one camera are mirror images but for tilts of the prisms; one of them has less light
     start = path.instrument
-    channels = tuple(replace(c, photons=0.25 * c.photons) if c.side == "left" else c for c in start.channels)
+    channels = tuple(replace(c, photons=0.25 * c.photons) if c.name == "left" else c for c in start.channels)
     uneven = MonitorPath(replace(start, channels=channels), path.backend)
     taken, own = (np.diag(spot_noise(uneven, bench.detector(), alike)[0]) for alike in (True, False))
     assert taken == pytest.approx(own, rel=0.02)

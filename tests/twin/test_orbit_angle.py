@@ -60,8 +60,8 @@ def directions(name: str, pixel: np.ndarray) -> np.ndarray:
     y = (pixel - 0.5 * (camera.pixels - 1)) * camera.pitch - line.principal_point[1]
     x = np.full_like(y, -line.principal_point[0])
     grow = 1.0 + line.k1 * (x**2 + y**2)
-    vectors = np.stack([-x * grow, -y * grow, np.full_like(y, line.focal_length)], axis=-1)
-    change = SETUP.test.changes.get(name)
+    vectors = np.stack([-x * grow, -y * grow, np.full_like(y, line.principal_distance)], axis=-1)
+    change = SETUP.test.perturb.get(name)
     turned = Rotation.from_rotvec(change.rotate if change else (0.0, 0.0, 0.0))
     vectors = (turned * Rotation.from_euler("Y", line.look) * Rotation.from_rotvec(line.rotate)).apply(vectors)
     return vectors / np.linalg.norm(vectors, axis=1)[:, None]
@@ -75,7 +75,7 @@ def true_angles() -> tuple[np.ndarray, np.ndarray]:
     """Look and dihedral angles (alpha, beta) of the turned camera, from the file's numbers alone."""
     centre = {name: directions(name, np.array([5999.5]))[0] for name in LINES}
     normal = {name: np.linalg.svd(directions(name, np.linspace(100.0, 11899.0, 60)))[2][2] for name in LINES}
-    pairs = (("forward", "nadir"), ("nadir", "aft"))
+    pairs = (("forward", "nadir"), ("nadir", "backward"))
     dihedral = [angle(normal[a], normal[b]) for a, b in pairs]
     return (
         np.array([angle(centre[a], centre[b]) for a, b in pairs]),
@@ -116,7 +116,7 @@ def bias(flight: AnglePass, effects: LightEffects) -> np.ndarray:
 
 def test_aberration_by_hand(flight: AnglePass) -> None:
     """The look tilts by v/c times the sine of its angle from the velocity: 1 at nadir, cos 25 deg at the others. A
-    forward point thus lies farther from the nadir point than it seems, an aft point nearer. 3%: at 40 N the normal of
+    forward point thus lies farther from the nadir point than it seems, a backward one nearer. 3%: at 40 N the normal of
     the ellipsoid leaves the radius by d = 0.19 deg, and the velocity leaves X by as much; d sin 25 deg over
     1 - cos 25 deg is 1.5%.
     """
@@ -263,14 +263,14 @@ def test_contract(done) -> None:
     data = json.loads(result.stdout)
     assert result.stderr == ""
     assert data == json.loads((folder / "angle.json").read_text("utf-8"))
-    values = {"alpha_deg", "beta_deg", "alpha_sigma_arcsec", "beta_sigma_arcsec"}
+    values = {"alpha_deg", "beta_deg", "alpha_arcsec_sigma", "beta_arcsec_sigma"}
     assert set(data["planes"]) == {"printed", "corrected", "tls"}
     for method in (*data["planes"].values(), data["resection"]):
         assert values <= set(method)
         assert abs(method["alpha_deg"] - 25.0) < 0.02
-        assert 0.1 < method["alpha_sigma_arcsec"] < 0.2
+        assert 0.1 < method["alpha_arcsec_sigma"] < 0.2
     assert set(data["truth"]) == {"look", "dihedral", "along_track"}
-    assert data["angles"] == {"alpha": ["forward", "nadir"], "beta": ["nadir", "aft"]}
+    assert data["angles"] == {"alpha": ["forward", "nadir"], "beta": ["nadir", "backward"]}
     assert data["folded"] == {"alpha": False, "beta": False}
     assert data["change_arcsec"]["truth"] == pytest.approx({"alpha": 4.0, "beta": -3.0}, abs=0.001)
     assert data["change_arcsec"]["trace"] == {}

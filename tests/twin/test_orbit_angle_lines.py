@@ -107,8 +107,8 @@ def test_height_of_one_arcsecond(changed) -> None:
 @pytest.mark.second
 def test_scatter_of_the_pair(backend) -> None:
     """Chi-square of 100 passes to either side at 1e-4: three statements."""
-    changes = {"base/backward/focal_plane": PAIR.test.changes["base/backward/focal_plane"]}
-    few = PAIR.model_copy(update={"test": PAIR.test.model_copy(update={"passes": 100, "changes": changes})})
+    changes = {"base/backward/focal_plane": PAIR.test.perturb["base/backward/focal_plane"]}
+    few = PAIR.model_copy(update={"test": PAIR.test.model_copy(update={"passes": 100, "perturb": changes})})
     full = run_angle(few, backend, 2)
     for scatter in (full.planes, full.along, full.resection):
         assert scatter.tail[0] > 1e-4
@@ -158,8 +158,8 @@ def test_parallel_lines_are_folded_and_the_report_says_so() -> None:
     camera = LINES.camera
     lines = dict(camera.lines)
     lines["multispectral"] = lines["nadir"].model_copy(update={"pixels": 6000, "pitch": 13e-6})
-    changes = {k: v for k, v in LINES.test.changes.items() if k != "multispectral"}
-    test = LINES.test.model_copy(update={"passes": 2, "changes": changes})
+    changes = {k: v for k, v in LINES.test.perturb.items() if k != "multispectral"}
+    test = LINES.test.model_copy(update={"passes": 2, "perturb": changes})
     setup = LINES.model_copy(update={"test": test, "camera": camera.model_copy(update={"lines": lines})})
     full = run_angle(setup, None, 4)
     few = full.names.index("multispectral")
@@ -193,7 +193,7 @@ def write(folder: Path, old: str, new: str) -> Path:
 
 def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     folder, data = done
-    assert set(data["planes"]["tls"]) == {"alpha_deg", "alpha_sigma_arcsec"}
+    assert set(data["planes"]["tls"]) == {"alpha_deg", "alpha_arcsec_sigma"}
     assert set(data["difference_arcsec"]) == {"alpha"}
     assert [(r["what"], r["axis"]) for r in data["sensitivity"]] == [
         (what, axis) for what in ("station", "forward", "backward") for axis in "xyz"
@@ -201,12 +201,12 @@ def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     assert set(data["sensitivity"][0]) == {"what", "axis", "alpha_arcsec_per_10m"}
     change = data["change_arcsec"]
     # the focal plane alone: warmed as one, the base keeps its angles
-    plane = PAIR.test.changes["base/backward/focal_plane"]
+    plane = PAIR.test.perturb["base/backward/focal_plane"]
     state = {"base/backward/focal_plane": Motion(plane.rotate, plane.shift, plane.pivot)}
     alone = trace_truth(gf7_pair, backend, [state]).angle_change[0] / ARCSEC
     assert change["trace"]["alpha"] == pytest.approx(alone, abs=0.01)
     assert change["truth"]["alpha"] == pytest.approx(change["trace"]["alpha"], abs=1e-6)
-    sigma = data["along_track"]["alpha_sigma_arcsec"]
+    sigma = data["along_track"]["alpha_arcsec_sigma"]
     assert abs(change["ground"]["alpha"] - change["trace"]["alpha"]) < 3.9 * sigma
     text = (folder / "report.html").read_text("utf-8")
     assert "the trace of the instrument says" in text
@@ -227,20 +227,20 @@ BAD = {
     "node": (
         "base/backward/focal_plane: {",
         "base/backward/focal_plan: {",
-        "changes.base/backward/focal_plan",
+        "perturb.base/backward/focal_plan",
         ["no such node", "did you mean 'base/backward/focal_plane'"],
     ),
     "pivot": (
         "pivot: rear_node",
         "pivot: middle",
-        "changes.base/backward/focal_plane.pivot",
+        "perturb.base/backward/focal_plane.pivot",
         ["no such pivot", "rear_node"],
     ),
-    "cold": ("change: 0.5 K", "change: -300 K", "changes.base.temperature", ["absolute zero", "above 0 K"]),
+    "cold": ("change: 0.5 K", "change: -300 K", "perturb.base.temperature", ["absolute zero", "above 0 K"]),
     "off the mirrors": (
         "[1 arcsec, -2 arcsec, 6 arcsec]",
         "[1 arcsec, -4 deg, 6 arcsec]",
-        "changes",
+        "perturb",
         ["smaller changes"],
     ),
     "line": ("[forward, backward]", "[forward, nadir]", "angles.alpha", ["no such line", "forward, backward"]),

@@ -252,7 +252,7 @@ WRONG = [
     ("image_points.csv", "nadir0,nadir", "nowhere,nadir", "no such ground point"),
     ("image_points.csv", "nadir0,nadir", "nadir0,middle", "no such camera"),
     ("image_points.csv", "nadir1,nadir", "nadir0,nadir", "twice in nadir"),
-    ("image_points.csv", "sigma_line", "sigma", "no such column"),
+    ("image_points.csv", "line_sigma", "sigma", "no such column"),
     ("image_points.csv", ",0.2,0.2", ",0,0.2", "out of range"),
     ("lines.csv", "nadir,0,", "nadir,9000,", "lines of nadir do not rise"),
     ("lines.csv", "nadir,0,", "front,0,", "no such camera"),

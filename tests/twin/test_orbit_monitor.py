@@ -336,7 +336,7 @@ def test_command(tmp_path: Path) -> None:
     assert result.exit_code == 0, result.stderr
     data = json.loads(result.stdout)
     assert data == json.loads((tmp_path / "run" / "monitor.json").read_text("utf-8"))
-    numbers = ("height_rms_m", "height_worst_m", "plan_rms_m", "metres_per_arcsec", "interval_s")
+    numbers = ("height_rms_m", "height_worst_m", "plan_rms_m", "height_m_per_arcsec", "interval_s")
     assert all(isinstance(data[key], float) for key in numbers)
     assert data["height_rms_m"] == data["cases"]["interval"]["height_rms_m"]
     assert {"none", "monitored", "interval", "smoothed", "parameters", "true"} == set(data["cases"])
@@ -344,7 +344,7 @@ def test_command(tmp_path: Path) -> None:
     assert smoothing["disturbances"] == "orbit"
     assert [row["interval_s"] for row in smoothing["intervals"]] == [600.0, 1200.0, 2400.0]
     assert [row["measurements"] for row in smoothing["intervals"]] == [5, 3, 2]
-    assert len(smoothing["height_sigma_m"]) == len(data["propagation"]["height_total_sigma_m"]) == len(data["times_s"])
+    assert len(smoothing["height_m_sigma"]) == len(data["propagation"]["height_m_sigma"]) == len(data["times_s"])
     assert [row["interval_s"] for row in data["intervals"]] == [600.0, 1200.0, 2400.0]
     count = len(data["times_s"])
     for name in ("forward", "backward"):

@@ -122,10 +122,10 @@ sigmas = st.floats(1e-9, 1e3)
 
 @given(finite, sigmas)
 def test_stated_readings(value, sigma) -> None:
-    out = stated({"a": {"x": value, "x_sigma": sigma}, "row": value, "sigma_row": sigma, "frames": 3, "text": "ml"})
+    out = stated({"a": {"x": value, "x_sigma": sigma}, "row": value, "row_sigma": sigma, "frames": 3, "text": "ml"})
     assert out["frames"] == 3
     assert out["text"] == "ml"
-    for number, spread in ((out["a"]["x"], out["a"]["x_sigma"]), (out["row"], out["sigma_row"])):
+    for number, spread in ((out["a"]["x"], out["a"]["x_sigma"]), (out["row"], out["row_sigma"])):
         # half a millionth of a sigma, and what float64 leaves of large numbers
         assert abs(number - value) <= 0.5e-6 * 1.001 * sigma + 2.0 * math.ulp(value)
         assert abs(spread - sigma) <= 0.5e-7 * 1.001 * sigma

@@ -117,9 +117,9 @@ def test_an_image_does_not_depend_on_its_window() -> None:
     """Each pixel's value is its own: single-precision transforms of 1e5 samples leave 1e-6 of the brightest."""
     terrain = rough()
     ground = Ground(lambda e, n: 0.2 + 0.1 * np.sin(e / 17.0) * np.cos(n / 23.0))
-    whole = photograph("aft", terrain, ground, 150)
+    whole = photograph("backward", terrain, ground, 150)
     part = Window(whole.window.first_line + 31, whole.window.first_pixel + 12, 57, 90)
-    cut = photograph("aft", terrain, ground, window=part)
+    cut = photograph("backward", terrain, ground, window=part)
     assert cut.photons == pytest.approx(whole.photons[31:88, 12:102], rel=2e-5)
 
 

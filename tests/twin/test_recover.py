@@ -45,7 +45,7 @@ def images(run, tmp_path_factory):
     folder.mkdir()
     for i, channel in enumerate(run.experiment.path.channels):
         for when, frames in (("before", run.before[i]), ("after", run.after[i])):
-            (folder / f"{channel.camera}_{channel.side}_{when}.tiff").write_bytes(tiff(frames, FrameFacts()))
+            (folder / f"{channel.camera}_{channel.name}_{when}.tiff").write_bytes(tiff(frames, FrameFacts()))
     return folder
 
 
@@ -96,7 +96,7 @@ def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     """
     text = HEAD + "times: [0 min, 10 min, 20 min]\nframes:\n"
     for channel in run.experiment.path.channels:
-        key = f"{channel.camera}_{channel.side}"
+        key = f"{channel.camera}_{channel.name}"
         before, after = (tifffile.imread(images / f"{key}_{when}.tiff") for when in ("before", "after"))
         tifffile.imwrite(tmp_path / f"{key}_b.tif", before[:, 10:86, 8:90], photometric="minisblack")
         for name, frames in (("a0", after[:4]), ("a1", before), ("a2", after[4:])):
@@ -125,8 +125,8 @@ def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, imag
         g = camera.geometry
         look = np.degrees(camera.look_rad)
         text += (
-            f"  {name}: {{focal_length: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, pixel: 12 um, "
-            f"look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
+            f"  {name}: {{principal_distance: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, "
+            f"pitch: 12 um, look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
         )
     found = measured(images.parent, text, backend, run, "geometry.yaml")
     whole, r = run.recovery, found.last.recovery
@@ -157,7 +157,7 @@ def test_dark_and_flat_frames_take_the_pattern_off(run, images, backend, tmp_pat
     for what, frames in (("dark", dark), ("flat", flat)):
         text += f"{what}:\n"
         for i, channel in enumerate(run.experiment.path.channels):
-            name = f"{what}_{channel.camera}_{channel.side}.fits"
+            name = f"{what}_{channel.camera}_{channel.name}.fits"
             fits.PrimaryHDU(frames[i]).writeto(tmp_path / name)
             text += f"  {channel.key}: {name}\n"
     found = measured(tmp_path, text, backend, run)
@@ -351,8 +351,11 @@ PLAIN = "forward/left: {before: a.tif, after: b.tif}"
         (HEAD + f"frames:\n  {PLAIN}\n", ["no such file", "a.tif"]),
         (HEAD + "frames:\n  forwad/left: {before: a.tif, after: b.tif}\n", ["no such channel", "did you mean"]),
         (HEAD + f"times: [0 s, 1 s]\nframes:\n  {PLAIN}\n", ["not as many entries as times"]),
-        ("geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["template: measured"]),
-        (HEAD + "geometry: {f: {focal_length: 1 m, separation: 1 m, pixel: 9 um}}\nframes: images\n", ["both"]),
+        (
+            "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n",
+            ["template: measured"],
+        ),
+        (HEAD + "geometry: {f: {principal_distance: 1 m, separation: 1 m, pitch: 9 um}}\nframes: images\n", ["both"]),
         (HEAD + "frames: bad.csv\n", ["bad.csv:2", "no such channel"]),
         (HEAD + "frames: heads.csv\n", ["heads.csv:1", "not the head of a column"]),
     ],

@@ -54,7 +54,7 @@ class Course:
         """A measurement's file; other: channel -> file in place of that of the second time."""
         out = f"instrument: gf7_pair\ndisturbances: orbit\ntimes: [{', '.join(times)}]\nframes:\n"
         for channel in self.experiment.path.channels:
-            stem = f"{channel.camera}_{channel.side}"
+            stem = f"{channel.camera}_{channel.name}"
             files = [f"{stem}_{k}.tiff" for k in (range(len(times)) if which is None else which)]
             if stem in other:
                 files[1] = other[stem]
@@ -72,7 +72,7 @@ def course(experiment, tmp_path_factory) -> Course:
     before = pair.frames_before(FRAMES, SEED)
     after = pair.frames_after(pair.path.expected_photons(states), FRAMES, SEED)
     for i, channel in enumerate(pair.path.channels):
-        stem = f"{channel.camera}_{channel.side}"
+        stem = f"{channel.camera}_{channel.name}"
         for name, frames in (("before", before[i]), *((k, after[k, i]) for k in range(len(states)))):
             tifffile.imwrite(folder / f"{stem}_{name}.tiff", frames, photometric="minisblack", compression="lzw")
     return Course(job, pair, series, states, folder)

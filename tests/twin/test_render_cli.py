@@ -212,7 +212,7 @@ def test_keys_of_recovered(first):
             for spot in recovered["spots"][camera][side].values():
                 squares = {f"{part}_chi_square{end}" for part in ("reduced", "core") for end in ("", "_sigma_noise")}
                 fit = {*squares, "sigma_widened"}
-                assert set(spot) == {"row", "column", "sigma_row", "sigma_column", *fit}
+                assert set(spot) == {"row", "column", "row_sigma", "column_sigma", *fit}
                 assert 0 < spot["row"] < 95
                 assert spot["sigma_widened"] == 1.0
     assert set(recovered["intersection_angle"]) == set(ESTIMATORS)

@@ -97,7 +97,7 @@ def test_every_card_of_every_file_of_frames_is_what_the_run_says(job, run, expor
     seen = 0
     for i, channel in enumerate(job.experiment.path.channels):
         for when, frames in (("before", job.before[i]), ("after", job.after[i])):
-            path = exported["fits"] / f"images/{channel.camera}_{channel.side}_{when}.fits"
+            path = exported["fits"] / f"images/{channel.camera}_{channel.name}_{when}.fits"
             with fits.open(path, checksum=True) as file:
                 file.verify("exception")
                 header = file[0].header
@@ -110,7 +110,7 @@ def test_every_card_of_every_file_of_frames_is_what_the_run_says(job, run, expor
                 "AXIS1": ("column", ""),
                 "AXIS2": ("row", ""),
                 "AXIS3": ("frame", ""),
-                "CAMERA": (f"{channel.camera}, {channel.side} area CCD", ""),
+                "CAMERA": (f"{channel.camera}, {channel.name} area CCD", ""),
                 "NOTE": ("nominal" if when == "before" else "perturbed", ""),
                 "XPIXSZ": (1e6 * ccd.pitch, "um"),
                 "YPIXSZ": (1e6 * ccd.pitch, "um"),
@@ -236,7 +236,7 @@ def test_spots_and_readings_are_those_of_the_run(run, exported, tables) -> None:
     spots = read_back(exported[tables] / f"tables/spots.{tables}")
     assert len(spots["row"]) == 8
     for k in range(8):
-        own = found["spots"][spots["camera"][k]][spots["side"][k]][spots["state"][k]]
+        own = found["spots"][spots["camera"][k]][spots["channel"][k]][spots["state"][k]]
         assert {name: spots[name][k] for name in own} == own
     readings = read_back(exported[tables] / f"tables/readings.{tables}")
     assert len(readings["camera"]) == sum(len(one) for one in found["cameras"].values())

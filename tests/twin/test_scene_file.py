@@ -272,7 +272,7 @@ def test_beams_go_where_they_must(gf7_pair, paths):
             assert np.all(points <= np.array([x1, y1]) + 1e-5)
         if beam.is_monitor:
             assert len(beam.footprints) == 2 * len(model.mirrors)
-            mine = (c for c in gf7_pair.channels if f"{c.camera}/monitor/{c.side}" == f"{beam.camera}/{beam.name}")
+            mine = (c for c in gf7_pair.channels if f"{c.camera}/monitor/{c.name}" == f"{beam.camera}/{beam.name}")
             channel = next(mine)
             ccd = paths.placed.pose(channel.ccd_body).inverse().apply(beam.vertices[:, -1])
             assert np.abs(ccd).max() < 1e-3

@@ -58,7 +58,7 @@ def test_an_aberrated_spot_is_marked_and_its_sigma_widened(pair, blurred) -> Non
     assert numbers["spots"]["backward"]["left"]["after"]["sigma_widened"] == 1.0
     mean = mean_frames(blurred.run.after)
     plain = maximum_likelihood_fit(mean, 2, pair.experiment.calibration.noise, pair.experiment.calibration.template)
-    assert after["sigma_row"] == pytest.approx(plain.sigma_row[0] * after["sigma_widened"])
+    assert after["row_sigma"] == pytest.approx(plain.sigma_row[0] * after["sigma_widened"])
     # sigmas of what is read of it are as much larger
     clean = pair.render(frames=2, seed=1)
     assert "σ does not hold" not in clean.verdict

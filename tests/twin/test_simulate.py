@@ -20,7 +20,7 @@ SIZE = "lines: 1000, pixels: 1000}"
 SMALL = "lines: 64, pixels: 80}"
 # such small images have no room for templates
 POINTS = "points: {control: 200, check: 100, tie: 200, reach: 40, template: 31}"
-LINES = ("forward", "nadir", "aft")
+LINES = ("forward", "nadir", "backward")
 
 
 def write(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -87,7 +87,9 @@ def test_files(folder: Path) -> None:
     # nothing that only the truth knows
     known = "".join((folder / "artefacts" / f"{n}.json").read_text("utf-8") for n in ("camera", "trajectory"))
     assert "0.65009" not in known
-    assert read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["focal_length_m"] == 0.65 + 90e-6
+    assert (
+        read(folder / "artefacts" / "truth.json")["camera"]["lines"]["forward"]["principal_distance_m"] == 0.65 + 90e-6
+    )
 
 
 def test_other_software_finds_the_ground(folder: Path) -> None:
@@ -104,7 +106,7 @@ def test_other_software_finds_the_ground(folder: Path) -> None:
         x0, y0 = line["principal_point_m"]
         y = (np.array(points["pixel"]) - 0.5 * (line["pixels"] - 1)) * line["pitch_m"] - y0
         grown = 1.0 + line["k1_per_m2"] * (x0**2 + y**2)
-        look = np.stack([x0 * grown, -y * grown, np.full_like(y, line["focal_length_m"])], axis=-1)
+        look = np.stack([x0 * grown, -y * grown, np.full_like(y, line["principal_distance_m"])], axis=-1)
         look = look @ np.array(line["camera_to_body"]).T
         look = Rotation.from_quat(turn(seconds)).apply(look / np.linalg.norm(look, axis=-1, keepdims=True))
         arm = np.array(points["itrs_m"]) - position(seconds)
@@ -127,7 +129,7 @@ def test_the_seed_decides(folder: Path, tmp_path: Path) -> None:
 # what is wrong, key, what to do about it
 BAD = {
     "no size": (SMALL, "lines: 0, pixels: 80}", "patch.lines", ["16"]),
-    "line": ("lines: [forward, nadir, aft]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
+    "line": ("lines: [forward, nadir, backward]", "lines: [forward, nadr]", "lines", ["did you mean 'nadir'"]),
     "edge": ("pixel: 6000", "pixel: 40", "patch", ["reaches into", "nadir"]),
     "short before": ("before: 60 s ", "before: 20 s ", "orbit", ["before the orbit data begin", "longer"]),
     "short after": ("after: 60 s", "after: 20 s", "orbit", ["after the orbit data end", "longer"]),

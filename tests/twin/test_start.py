@@ -67,7 +67,7 @@ def test_a_bad_file_is_told_before_anything_that_computes_is_imported(words: tup
 
 @pytest.mark.second
 def test_a_wrong_option_of_the_mtf_is_told_before_anything_is_drawn() -> None:
-    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pixel-size", "7 um")) == (2, set())
+    assert heavy(("analysis.mtf", "none.png", "--roi", "0,0,64,64", "--pitch", "7 um")) == (2, set())
 
 
 @pytest.mark.second

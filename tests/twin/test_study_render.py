@@ -251,7 +251,7 @@ def test_a_name_of_a_file_that_was_read_is_no_factor(tmp_path, key) -> None:
 
 def test_what_is_stated_of_another_instrument_is_told_before_any_run(tmp_path, backend) -> None:
     setup = resolve_study(write_study(tmp_path))
-    causes = {"mine": {"bodies": ["base/aft/M?"], "shift": ["1 um"] * 3, "reason": "r"}}
+    causes = {"mine": {"bodies": ["base/rear/M?"], "shift": ["1 um"] * 3, "reason": "r"}}
     tree = {**setup.tree, "disturbances": {"name": "mine", "causes": causes}}
     with pytest.raises(InputError, match=r"disturbances.causes.mine.bodies\[0\]: small has no body"):
         setup.job.check(tree, backend)

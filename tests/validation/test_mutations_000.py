@@ -167,7 +167,11 @@ def _swapped_xy(what, name, axis):
 
 
 def _swapped_ends(what, name, axis):
-    return ({"forward": "aft", "aft": "forward"}.get(what, what), {"alpha": "beta", "beta": "alpha"}[name], axis), 1.0
+    return (
+        {"forward": "backward", "backward": "forward"}.get(what, what),
+        {"alpha": "beta", "beta": "alpha"}[name],
+        axis,
+    ), 1.0
 
 
 solve = np.linalg.solve
@@ -195,8 +199,8 @@ MUTATIONS = {
     ("000.eq6", "sign"): (angles(lambda n, a: np.array([np.pi - a[0], a[1]])), ["000.eq6"]),
     ("000.eq6", "factor 2"): (angles(lambda n, a: np.array([2 * a[0], a[1]])), ["000.eq6"]),
     ("000.eq6", "sine for cosine"): (angles(lambda n, a: np.array([np.pi / 2 - a[0], a[1]])), ["000.eq6"]),
-    ("000.eq6", "forward and aft swapped"): (angles(lambda n, a: np.array([angle(n[2], n[1]), a[1]])), ["000.eq6"]),
-    ("000.eq6", "aft for nadir"): (angles(lambda n, a: np.array([angle(n[0], n[2]), a[1]])), ["000.eq6"]),
+    ("000.eq6", "ends swapped"): (angles(lambda n, a: np.array([angle(n[2], n[1]), a[1]])), ["000.eq6"]),
+    ("000.eq6", "backward for nadir"): (angles(lambda n, a: np.array([angle(n[0], n[2]), a[1]])), ["000.eq6"]),
     ("000.eq6", "single precision"): (
         angles(lambda n, a: np.arccos(np.cos(a).astype(np.float32)).astype(float)), ["000.eq6.arccos"],
     ),
@@ -206,7 +210,7 @@ MUTATIONS = {
     ("000.eq7", "sign"): (angles(lambda n, a: np.array([a[0], np.pi - a[1]])), ["000.eq7"]),
     ("000.eq7", "factor 2"): (angles(lambda n, a: np.array([a[0], 2 * a[1]])), ["000.eq7"]),
     ("000.eq7", "sine for cosine"): (angles(lambda n, a: np.array([a[0], np.pi / 2 - a[1]])), ["000.eq7"]),
-    ("000.eq7", "forward and aft swapped"): (angles(lambda n, a: np.array([a[0], angle(n[0], n[1])])), ["000.eq7"]),
+    ("000.eq7", "ends swapped"): (angles(lambda n, a: np.array([a[0], angle(n[0], n[1])])), ["000.eq7"]),
     ("000.eq7", "forward for nadir"): (angles(lambda n, a: np.array([a[0], angle(n[0], n[2])])), ["000.eq7"]),
     ("000.fig3", "sign"): (
         curves(lambda *key: (key, -1.0)), ["000.fig3.alpha_signs", "000.fig3.beta_signs", "000.fig3.ordinate"],
@@ -218,7 +222,7 @@ MUTATIONS = {
     ("000.fig4", "ends swapped"): (curves(_swapped_ends), ["000.fig4.forward_signs", "000.fig4.nadir_signs"]),
     ("000.fig5", "sign"): (curves(lambda *key: (key, -1.0)), ["000.fig5.nadir_signs", "000.fig5.aft_signs"]),
     ("000.fig5", "x and y swapped"): (curves(_swapped_xy), ["000.fig5.nadir_signs", "000.fig5.aft_x"]),
-    ("000.fig5", "forward and aft swapped"): (curves(_swapped_ends), ["000.fig5.nadir_signs", "000.fig5.aft_largest"]),
+    ("000.fig5", "ends swapped"): (curves(_swapped_ends), ["000.fig5.nadir_signs", "000.fig5.aft_largest"]),
     ("000.height", "half"): (turn(lambda axis, a: (axis, a / 2)), ["000.height.alpha", "000.height.beta"]),
     ("000.height", "factor 2"): (turn(lambda axis, a: (axis, 2 * a)), ["000.height.size"]),
     ("000.height", "roll for pitch"): (turn(lambda axis, a: (0, a)), ["000.height.alpha", "000.height.beta"]),
@@ -252,5 +256,5 @@ def test_a_broken_formula_turns_a_verdict(formula, mutation, quick):
 def test_the_modulus_of_the_scalar_product_has_nothing_to_do(drawn):
     """In Earth-fixed axes the normals (a0, a1, -1) of the three lines have positive products."""
     for m in drawn["equations"].measured[:5]:
-        forward, nadir, aft = (fit.normal for fit in planes_of(m, "corrected"))
-        assert min(forward @ nadir, nadir @ aft) > 0.8
+        forward, nadir, backward = (fit.normal for fit in planes_of(m, "corrected"))
+        assert min(forward @ nadir, nadir @ backward) > 0.8

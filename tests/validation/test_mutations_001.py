@@ -267,7 +267,7 @@ MUTATIONS = (
             ("sign", f"{sums} {differences}", lambda sound, left, right: tuple(-p for p in sound(left, right))),
         )
     ),
-    Mutation("001.fig4", "forward and aft swapped", "joint", "001.fig4.angle",
+    Mutation("001.fig4", "forward and backward swapped", "joint", "001.fig4.angle",
              formula(recovery.intersection_angle, "exact", lambda sound: lambda f, b, *given: sound(b, f, *given))),
     Mutation("001.fig4", "twice", "joint", "001.fig4.angle",
              formula(intersection_angle, "exact", lambda sound: lambda *given: twice_the(sound(*given)))),

@@ -228,7 +228,7 @@ def scaled_interior(factor):
 
 
 def lines_swapped(campaign, results, names, cameras, bias):
-    pairs = {"forward": "aft", "aft": "forward", "nadir": "nadir"}
+    pairs = {"forward": "backward", "backward": "forward", "nadir": "nadir"}
     return {k: c.with_interior(cameras[pairs[k]].interior) for k, c in cameras.items()}, bias
 
 
@@ -301,7 +301,7 @@ MUTATIONS = {
         "attitude turned back": (
             of_model(lambda c, r, b: (c, replace(r, attitude=np.swapaxes(r.attitude, 1, 2)), b)), MODEL,
         ),
-        "forward and aft swapped": (of_model(lambda c, r, b: (replace(c, to_body=c.to_body.T), r, b)), MODEL),
+        "forward and backward swapped": (of_model(lambda c, r, b: (replace(c, to_body=c.to_body.T), r, b)), MODEL),
     },
     "003.equations": {
         **{
@@ -342,7 +342,7 @@ MUTATIONS = {
         "roll and pitch swapped": (of_mean(lambda *g: (g[3], g[4][[1, 0, 2]])), PLAN),
         "interior sign": (of_mean(scaled_interior(-1.0)), ("003.scheme1.height",)),
         "interior twice": (of_mean(scaled_interior(2.0)), ("003.scheme1.height",)),
-        "forward and aft swapped": (of_mean(lines_swapped), ("003.scheme1.height",)),
+        "forward and backward swapped": (of_mean(lines_swapped), ("003.scheme1.height",)),
     },
     "003.accuracy": {
         "plan and height swapped": (of_errors(lambda p, h: (h, p)), ("003.scheme5.height",)),

@@ -8,7 +8,7 @@ import pytest
 from analysis.orbit.angles import sensitivity
 from analysis.orbit.planes import Station
 from optics.numerics.backend import load_backend
-from scenes.specs.orbit.angle import LINES, THREE_LINE_ANGLES
+from scenes.specs.orbit.angle import LINES, usual_angles
 from tests.analysis.test_planes import DEG, SCENE, Pass, descending_pass
 from tests.validation.undrawn import undrawn
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED
@@ -145,7 +145,7 @@ def test_a_sentence_can_fail():
     """Every one of them turns when the angle answers the other way, or alike along all axes."""
     keys = [
         (what, angle, axis)
-        for what in ("station", "forward", "nadir", "aft")
+        for what in ("station", "forward", "nadir", "backward")
         for angle in ("alpha", "beta")
         for axis in AXES
     ]
@@ -167,7 +167,7 @@ def test_a_sentence_can_fail():
 def false_on(scene: Pass, lines: Sequence[str] = LINES) -> set[Sentence]:
     """Sentences that do not hold for a pass made by hand, without the orbit of the library's test."""
     strips = dict(zip(lines, scene.strips(1.5), strict=True))
-    found = figures.Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, THREE_LINE_ANGLES))
+    found = figures.Answers.of(sensitivity(Station.of(scene.station, 0.5), strips, usual_angles(LINES)))
     return {sentence for sentence in SENTENCES if not sentence.holds(found.rises, found.growth)}
 
 
@@ -186,7 +186,7 @@ def test_farther_to_the_north_east_the_sentence_on_x_and_z_holds_too(lat, lon):
 
 
 def test_sentences_fail_elsewhere():
-    """The southern hemisphere, and forward and aft points exchanged, contradict the paper."""
+    """The southern hemisphere, and forward and backward points exchanged, contradict the paper."""
     assert "signs" in {s.kind for s in false_on(descending_pass(lat=-40 * DEG))}
     assert {s.kind for s in false_on(SCENE, LINES[::-1])} >= {"signs", "largest", "far"}
 

@@ -129,7 +129,7 @@ class Wavefront:
                 "reference_frames": frames_text("optics"),
                 "field": self.field,
                 "wavelength_m": self.wavelength,
-                "rms_waves": self.rms,
+                "wfe_rms_waves": self.rms,
                 "strehl": self.strehl,
             },
         )

@@ -380,10 +380,10 @@ _REFOCUS: Record[Refocus] = Record(
     Quantity("z_after_m", lambda r: r.after.z),
     Quantity("tilt_before_deg", lambda r: r.before.tilt),
     Quantity("tilt_after_deg", lambda r: r.after.tilt),
-    Quantity("worst_before_waves", lambda r: r.errors_before.max(), "of the worst field"),
-    Quantity("worst_after_waves", lambda r: r.errors_after.max(), "of the worst field"),
-    Quantity("rms_before_waves", lambda r: np.sqrt(np.mean(r.errors_before**2)), "over the fields"),
-    Quantity("rms_after_waves", lambda r: np.sqrt(np.mean(r.errors_after**2)), "over the fields"),
+    Quantity("wfe_worst_before_waves", lambda r: r.errors_before.max(), "of the worst field"),
+    Quantity("wfe_worst_after_waves", lambda r: r.errors_after.max(), "of the worst field"),
+    Quantity("wfe_rms_before_waves", lambda r: np.sqrt(np.mean(r.errors_before**2)), "over the fields"),
+    Quantity("wfe_rms_after_waves", lambda r: np.sqrt(np.mean(r.errors_after**2)), "over the fields"),
 )
 
 
@@ -417,11 +417,11 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("instrument", lambda run: run.setup.where or None, "that the camera is mounted in"),
     Quantity("mounted", lambda run: run.setup.mounted, "its name there"),
     Quantity("verdict", verdict),
-    Quantity("worst_wfe_waves", lambda run: run.worst[0], "largest wavefront error over the field, rms"),
+    Quantity("wfe_worst_waves", lambda run: run.worst[0], "largest wavefront error over the field, rms"),
     Quantity("worst_field", lambda run: run.worst[1], "where it is"),
     Quantity(
         "limited_by",
-        lambda run: [{"aberration": kind, "rms_waves": size} for kind, size in run.limits[:4]],
+        lambda run: [{"aberration": kind, "wfe_rms_waves": size} for kind, size in run.limits[:4]],
         "kinds of aberration at the worst field, the largest first",
     ),
     Quantity("wavelength_nm", lambda run: run.camera.wavelength, "of design"),

@@ -270,7 +270,7 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
         "angle per length on the image, along the line",
         converted=False,
     ),
-    Quantity("pixel_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
+    Quantity("pitch_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
     Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.focal_length_line, "angle that a pixel sees"),
     Quantity("nyquist_per_mm", lambda d: 1e-3 * 0.5 / d.spec.line.pitch, "of the line's pixels", converted=False),
     Quantity(

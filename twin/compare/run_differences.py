@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
+from scenes.specs.result_names import by_new_names
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.input_file import why_unreadable
 from scenes.yaml.json_file import read_json
@@ -175,7 +176,7 @@ def read_run(folder: Path) -> RunResults:
     for name in manifest.sha256:
         if name.rpartition(".")[2] not in PLAIN or "/" in name:
             continue
-        data = read_json(folder / name)
+        data = by_new_names(read_json(folder / name), name)
         results = {key: value for key, value in data.items() if key not in TOLD} if isinstance(data, Mapping) else data
         for key, value in leaves(results):
             if isinstance(value, np.ndarray):
@@ -322,7 +323,7 @@ def is_sigma(key: str) -> bool:
 
 def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tuple[str, str]) -> float | None:
     """Sigma of the difference of two numbers by the noise of both runs, from ``x_sigma_noise`` beside them in both
-    runs, else ``x_sigma``, ``sigma_x`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
+    runs, else ``x_sigma`` or ``sigma``. What an estimator makes wrong of the motions is the same in runs
     of the same motions, and does not scatter between them.
 
     Args:
@@ -332,7 +333,7 @@ def sigma_of(reference: Mapping[Any, Leaf], other: Mapping[Any, Leaf], place: tu
     """
     file, key = place
     head, dot, last = key.rpartition(".")
-    names = (f"{last}_sigma_noise", f"{last}_sigma", f"sigma_{last}", *(("sigma",) if last == "value" else ()))
+    names = (f"{last}_sigma_noise", f"{last}_sigma", *(("sigma",) if last == "value" else ()))
     for name in names:
         both = [run.get((file, f"{head}{dot}{name}")) for run in (reference, other)]
         if all(_is_number(value) for value in both):

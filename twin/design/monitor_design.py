@@ -280,7 +280,7 @@ LAYOUT: Record[_Part] = Record(
     Quantity("pupil_share", lambda one: one.of.pupil_share, "share of the imaging pupil that the prisms take"),
     Quantity("mass_kg", lambda one: one.of.mass, "of the prisms"),
     Quantity("glass_path_mm", lambda one: one.of.glass_path, "longest way of a beam in glass, one way"),
-    Quantity("spot_sigma_px", lambda one: one.of.spot_sigma, "largest standard deviation of a spot's place"),
+    Quantity("spot_px_sigma", lambda one: one.of.spot_sigma, "largest standard deviation of a spot's place"),
 )
 SEARCH: Record[Found] = Record(
     "How much was tried.",

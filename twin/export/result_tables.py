@@ -17,6 +17,7 @@ import h5py
 
 from analysis.monitor import parameters
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.result_names import by_new_names
 from scenes.specs.study import unit_of
 from scenes.yaml.json_file import read_json
 from twin.run.data_files import DataColumn, DataTable
@@ -52,7 +53,7 @@ class Nested:
 
 
 NESTED = (
-    Nested("spots", "recovered.json", "spots", ("camera", "side", "state"), "Centres of the spots in the frames"),
+    Nested("spots", "recovered.json", "spots", ("camera", "channel", "state"), "Centres of the spots in the frames"),
     Nested("readings", "recovered.json", "cameras", ("camera", "estimator"), "What every estimator reads of a camera"),
     Nested(
         "angle_readings",
@@ -75,13 +76,13 @@ NESTED = (
 DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
     {
         "camera": ("", "name of the camera in the instrument"),
-        "side": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
+        "channel": ("", "end of the line at which the area CCD stands: left is +Y of the focal plane"),
         "state": ("", "before the disturbance or after it"),
         "estimator": ("", "by which the number is read"),
         "row": ("px", "row of the spot's centre on the area CCD; 0 is the centre of the first"),
         "column": ("px", "column of the spot's centre on the area CCD; 0 is the centre of the first"),
-        "sigma_row": ("px", "standard deviation of row"),
-        "sigma_column": ("px", "standard deviation of column"),
+        "row_sigma": ("px", "standard deviation of row"),
+        "column_sigma": ("px", "standard deviation of column"),
         "reduced_chi_square": ("", "of the fit of the spot's shape to all pixels; 1 for a spot as calibrated"),
         "core_chi_square": ("", "the same of the pixels of the spot's core"),
         "sigma_widened": ("", "factor by which the fit widened the standard deviations; 1 for a spot that fits"),
@@ -103,8 +104,8 @@ DESCRIPTIONS: Mapping[str, tuple[str, str]] = FrozenMap(
             "line at which it was found; 0 is the centre of the pass's first, an image file may begin later",
         ),
         "pixel": ("px", "pixel of the line CCD at which it was found; 0 is the centre of the first"),
-        "sigma_line_px": ("px", "standard deviation of line"),
-        "sigma_pixel_px": ("px", "standard deviation of pixel"),
+        "line_sigma": ("px", "standard deviation of line"),
+        "pixel_sigma": ("px", "standard deviation of pixel"),
         "correlation_of_sigmas": ("", "correlation of the errors of line and pixel"),
         "template_correlation": ("", "correlation of the two windows after matching"),
         "accepted": ("", "1: matched and in agreement with the others"),
@@ -133,7 +134,8 @@ def result_tables(folder: Path, files: Sequence[str]) -> list[DataTable]:
         InputError: a JSON file cannot be read.
         ValueError: a JSON or CSV file is not what runs write.
     """
-    data = {name: read_json(folder / name) for name in files if name.endswith(".json") and name not in _OTHER_FILES}
+    json_files = [name for name in files if name.endswith(".json") and name not in _OTHER_FILES]
+    data = {name: by_new_names(read_json(folder / name), name) for name in json_files}
     tables = [numbers] if (numbers := _numbers(data)) is not None else []
     tables += [table for nested in NESTED if (table := _nested(nested, data.get(nested.file, {}))) is not None]
     taken = {table.name for table in tables}

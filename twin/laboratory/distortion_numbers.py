@@ -28,8 +28,8 @@ POINTS: Record[DistortionRun] = Record(
     Quantity("position_mm", lambda r: r.compensated.fit.position, "L, the spot's place along the line", "L", 4),
     Quantity("distortion_raw_um", lambda r: r.raw.distortion, "D with angles as read"),
     Quantity("distortion_compensated_um", lambda r: r.compensated.distortion, "D", "D", 2),
-    Quantity("sigma_raw_um", lambda r: r.raw.sigma, "standard deviation of D with angles as read"),
-    Quantity("sigma_um", lambda r: r.compensated.sigma, "standard deviation of D", decimals=2),
+    Quantity("distortion_raw_um_sigma", lambda r: r.raw.sigma, "standard deviation of D with angles as read"),
+    Quantity("distortion_compensated_um_sigma", lambda r: r.compensated.sigma, "standard deviation of D", "sigma", 2),
     Quantity("residual_raw_um", lambda r: r.raw.smooth.residual, "from a smooth curve, with angles as read"),
     Quantity("residual_compensated_um", lambda r: r.compensated.smooth.residual, "from a curve", "from smooth", 2),
     Quantity("rms_over_sets_raw_um", lambda r: r.raw.rms_over_sets, "RMS of D of single sets, angles as read"),
@@ -44,10 +44,10 @@ CORRELATIONS: Record[InteriorOrientation] = Record(
 LINE: Record[LineOrientation] = Record(
     "The joint model as a line of a payload's file: tan of the angle from the camera's Z is (y - y0) times "
     "(1 + k1 (y - y0)^2) / f, with y the place along the line. Units: axis, the camera's Z from the zero of the "
-    "angles, arcsec; focal_length and principal_point mm; k1 1/m^2; the covariance in these.",
+    "angles, arcsec; principal_distance and principal_point mm; k1 1/m^2; the covariance in these.",
     Quantity("terms", lambda line: LINE_TERMS, "names of the unknowns"),
     Quantity("values", lambda line: line.values * _LINE_UNIT, "unknowns"),
-    Quantity("sigma", lambda line: line.sigma * _LINE_UNIT, "standard deviations"),
+    Quantity("values_sigma", lambda line: line.sigma * _LINE_UNIT, "standard deviations"),
     Quantity("covariance", lambda line: line.covariance * np.outer(_LINE_UNIT, _LINE_UNIT), "of the unknowns"),
 )
 JOINT: Record[DistortionRun] = Record(
@@ -56,7 +56,7 @@ JOINT: Record[DistortionRun] = Record(
     Quantity("model", lambda r: JOINT_MODEL, "formula"),
     Quantity("terms", lambda r: r.compensated.smooth.terms, "names of the unknowns"),
     Quantity("values_mm", lambda r: r.compensated.smooth.values, "unknowns"),
-    Quantity("sigma_mm", lambda r: np.sqrt(np.diagonal(r.compensated.smooth.covariance)), "standard deviations"),
+    Quantity("values_mm_sigma", lambda r: np.sqrt(np.diagonal(r.compensated.smooth.covariance)), "standard deviations"),
     Quantity("covariance_mm2", lambda r: r.compensated.smooth.covariance, "of the unknowns"),
     Quantity("line", lambda r: r.line, "of a payload's file", record=LINE),
 )

@@ -78,7 +78,7 @@ def _facts(run: DistortionRun, data: Mapping[str, Any]) -> tuple[tuple[str, str]
             angles = f"as read, each good to {format_quantity(files.angle_sigma or 0.0, ANGLE)}"
         facts += [
             ("angles", f"{angles}; the line's middle is imaged at {format_quantity(files.zero, ANGLE)}"),
-            ("focal length, about", format_quantity(run.about, LENGTH)),
+            ("principal distance, about", format_quantity(run.about, LENGTH)),
             *(("file", f"{one['file']}, {one['rows']} rows") for one in data["files"]),
         ]
     if isinstance(run, SimulatedDistortion):
@@ -186,7 +186,7 @@ def _warnings(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, ...]:
         )
     if abs(f / run.about - 1.0) > 0.05:
         out.append(
-            f"the principal distance is {f:.4g} m, but `focal_length` says {run.about:.4g} m: are the "
+            f"the principal distance is {f:.4g} m, but `principal_distance` says {run.about:.4g} m: are the "
             "units of angles and places right?"
         )
     if data["probability"] < DOUBTFUL:
@@ -258,7 +258,14 @@ def _curve(run: DistortionRun, data: Mapping[str, Any]) -> Section:
             f"The errors are {with_it:.2f} sigma rms with compensated angles, {without:.2f} with angles as read."
         )
         caption += " Line: by exact chief rays of the as-built camera."
-    shown = ("point", "reading_deg", "field_deg", "position_mm", "distortion_compensated_um", "sigma_um")
+    shown = (
+        "point",
+        "reading_deg",
+        "field_deg",
+        "position_mm",
+        "distortion_compensated_um",
+        "distortion_compensated_um_sigma",
+    )
     further = ("residual_compensated_um", "sets_kept")
     artefacts: tuple[Artefact, ...] = (
         SvgFigure("distortion-curve", "Distortion over the field", caption, _curve_svg(run)),
@@ -326,7 +333,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
     )
 
     def table(name: str, title: str, caption: str, part: Mapping[str, Any], suffix: str, shown: list[str]) -> Table:
-        size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"sigma{suffix}"])
+        size, sigma = np.array(part[f"values{suffix}"]), np.array(part[f"values{suffix}_sigma"])
         spread = np.array(part["covariance_mm2" if suffix else "covariance"]) / np.outer(sigma, sigma)
         rows: list[tuple[Cell, ...]] = [
             (label, *(OwnDecimals(v, decimals_for(own)) for v in (value, own)), *(float(v) for v in row))
@@ -336,7 +343,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
         return Table(name, title, caption, heads, rows, (None, None, None, *(3 for _ in shown)))
 
     names = [f"{name.replace('_', ' ')} [mm]" for name in joint["terms"]]
-    line = ["axis [arcsec]", "focal_length f [mm]", "principal_point y0 [mm]", "k1 [1/m²]"]
+    line = ["axis [arcsec]", "principal_distance f [mm]", "principal_point y0 [mm]", "k1 [1/m²]"]
     return Section(
         "Joint model",
         text,
@@ -346,7 +353,7 @@ def _joint(joint: Mapping[str, Any]) -> Section:
                 "distortion-line",
                 "The same as a line of a payload's file",
                 "tan θ = (y − y0) (1 + k1 (y − y0)²) / f from the camera's Z, which stands at `axis` from the zero of "
-                "the angles; focal_length, principal_point: [0 mm, y0] and k1 with the signs of a payload's file.",
+                "the angles; principal_distance, principal_point: [0 mm, y0] and k1 as in a payload's file.",
                 joint["line"],
                 "",
                 line,

@@ -301,7 +301,7 @@ def measure_files(spec: MeasuredDistortionSpec, seed: int) -> DistortionRun:
     _check_angles(files, found)
     scatter = files.angle_sigma or 0.0, files.reversed, found.present
     try:
-        reduced = reduce(found.reading, found.spots, files.zero, spec.focal_length, compensation, *scatter)
+        reduced = reduce(found.reading, found.spots, files.zero, spec.principal_distance, compensation, *scatter)
     except OrientationError as error:
         text = str(error).removeprefix("interior orientation: ")
         allowed = "reversed: true, where readings rise as places fall" if "opposite senses" in text else None

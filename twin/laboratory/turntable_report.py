@@ -218,7 +218,7 @@ def _fits(run: TurntableRun, result: Mapping[str, Any]) -> Section:
         "stays unseen"
         if held is None
         else f"ranked at {len(held.angle)} held-out readings, measured in a series of their own with "
-        f"σ = {result['heldout_sigma_arcsec']:.4f} arcsec each"
+        f"σ = {result['heldout_arcsec_sigma']:.4f} arcsec each"
     )
     misses = (
         "" if held is None else f"; it has {fits[chosen]['heldout_rms_arcsec']:.4f} arcsec at the held-out readings"

@@ -149,17 +149,17 @@ class LiveBench:
         }
         if not self.monitored:
             images = [{"path": path, "symbol": name, "unit": unit} for name, (path, unit) in IMAGES.items()]
-            none: dict[str, Any] = {"channels": [], "rows": 0, "columns": 0, "pixel_um": 0.0, "white": 1, "offset": 0.0}
+            none: dict[str, Any] = {"channels": [], "rows": 0, "columns": 0, "pitch_um": 0.0, "white": 1, "offset": 0.0}
             asked_nothing: dict[str, Any] = {"estimators": [], "judged": "", "disturbances": "", "course": None}
             return {**common, **none, **asked_nothing, "images": images, "designed": self._designed}
         run = self._run(self.at_rest, {})[0]
         stated_motion = experiment.disturbances
         return {
             **common,
-            "channels": [{"key": c.key, "camera": c.camera, "side": c.side} for c in experiment.path.channels],
+            "channels": [{"key": c.key, "camera": c.camera, "name": c.name} for c in experiment.path.channels],
             "rows": experiment.path.shape[0],
             "columns": experiment.path.shape[1],
-            "pixel_um": 1e6 * experiment.path.pitch,
+            "pitch_um": 1e6 * experiment.path.pitch,
             "white": experiment.detector.max_dn,
             "offset": float(experiment.expected_frames(np.zeros((1, 1)))[0, 0]),
             "estimators": list(run.estimators),

@@ -25,7 +25,7 @@ UNSEEN = 0.01
 
 
 def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
-    """Moves of the spots by each motion, and three ways to change the focal length."""
+    """Moves of the spots by each motion, and three ways to change the principal distance."""
     caption = (
         "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
@@ -38,8 +38,8 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     for k, (name, table) in enumerate(run.crosstalk.items()):
         labels = {f"{m.label} [{m.unit}]" for m in table.motions} | {m.label for m in table.motions}
         first = _pretty(table.observability.statements[0].split(": ", 1), labels)
-        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.focal_length_statements()]
-        title = f"Three ways to change the focal length of {name}: piston, despace, growth"
+        points = [_pretty(s.split(": ", 1), labels, keep=True) for s in table.principal_distance_statements()]
+        title = f"Three ways to change the principal distance of {name}: piston, despace, growth"
         parts.append(Text(f"focal-{k}", title, first, points, within=IN_PAGE))
     return Section("What a motion does to the spots", (), tuple(parts), len(run.crosstalk), "motions")
 
@@ -84,8 +84,8 @@ def crosstalk_section(run: RenderRun) -> Section:
         "Per unit of motion: the true change of the camera (bold) and the reading of every estimator, to first order. "
         f"Underlined: wrong by more than {round(100 * WRONG)} % of the truth and by more than a hundredth of this "
         "run's "
-        'noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. "printed" is '
-        "eqs. (2), (3), (5) and Table 1, which agree there."
+        "noise, so that a hundred units of the motion would be noticed. 0 stands for less than 10⁻⁶. paper is both "
+        "paper single, eqs. (2), (3), (5), and paper joint, Table 1, which agree there."
     )
     tables = tuple(_crosstalk(run, k) for k in range(len(run.crosstalk)))
     return Section("Crosstalk: what every motion reads as", (about,), tables, name="crosstalk", closed=True)
@@ -130,7 +130,7 @@ def _columns(run: RenderRun, table: CameraCrosstalk, parameter: int) -> list[tup
             continue
         heading = run.estimators[estimator].title
         if (estimator, parameter) in PRINTED:
-            heading = "printed" if same else {"paper_single": "printed (7)", "paper_joint": "Table 1"}[estimator]
+            heading = "paper" if same else f"{heading}, {'(7)' if estimator == 'paper_single' else 'Table 1'}"
         columns.append((heading, estimator))
     return columns
 

@@ -48,7 +48,7 @@ def side_view_svg(instrument: Instrument, paths: LightPaths) -> str:
             Line2D([], [], color=svg.BLUE, lw=1.2, label="imaging beam: chief and marginal rays, field centre"),
             *(
                 Line2D([], [], color=colours[name], lw=1.2, label=f"monitor beam, {name} channel (out and back)")
-                for name in dict.fromkeys(c.side for c in instrument.channels if c in _seen(instrument, c.camera))
+                for name in dict.fromkeys(c.name for c in instrument.channels if c in _seen(instrument, c.camera))
             ),
             Line2D([], [], color=svg.INK, lw=3, label="mirrors, clear apertures"),
             *([Line2D([], [], color=_FACE, lw=1.5, label="faces of lenses")] if _has_lenses(instrument) else []),
@@ -81,7 +81,7 @@ def _channel(beam: Beam) -> str:
 
 def _colours(instrument: Instrument) -> dict[str, str]:
     """Name of a channel -> colour, the same in all cameras."""
-    names = dict.fromkeys(channel.side for channel in instrument.channels)
+    names = dict.fromkeys(channel.name for channel in instrument.channels)
     return {name: _CHANNEL_COLOURS[i % len(_CHANNEL_COLOURS)] for i, name in enumerate(names)}
 
 
@@ -95,7 +95,7 @@ def _camera_side(axes: Axes, instrument: Instrument, paths: LightPaths, camera: 
     model, placed = instrument.cameras[camera], paths.placed
     imaging = next(b for b in paths.of(camera, monitor=False) if b.name.endswith("centre"))
     _fan(axes, imaging, svg.BLUE, 0.09)
-    seen, colours = {c.side for c in _seen(instrument, camera)}, _colours(instrument)
+    seen, colours = {c.name for c in _seen(instrument, camera)}, _colours(instrument)
     for beam in paths.of(camera, monitor=True):
         if _channel(beam) in seen:
             _fan(axes, beam, colours[_channel(beam)], 0.30)
@@ -264,7 +264,7 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
                     axes.set_ylabel("y, in the plane of symmetry [mm]")
         handles = [Line2D([], [], color=svg.INK, lw=1.3, label="clear aperture")]
         handles += [Line2D([], [], color=c, lw=1.3, label=f"imaging, {f}") for f, c in FIELD_COLOURS.items()]
-        ends = {c.side: c.ccd[1] > 0.0 for c in instrument.channels}
+        ends = {c.name: c.ccd[1] > 0.0 for c in instrument.channels}
         marks = [
             Patch(**_style(colour, ends[name]), label=f"monitor, {name}")
             for name, colour in _colours(instrument).items()
@@ -284,7 +284,7 @@ def _footprints(axes: Axes, instrument: Instrument, paths: LightPaths, camera: s
     for beam in paths.of(camera, monitor=False):
         edge = 1e3 * beam.footprints[mirror, 0][1:]
         axes.add_patch(Polygon(edge, closed=True, fill=False, ec=FIELD_COLOURS[beam.name.rpartition("/")[2]], lw=1.2))
-    colours, ends = _colours(instrument), {c.side: c.ccd[1] > 0.0 for c in instrument.channels if c.camera == camera}
+    colours, ends = _colours(instrument), {c.name: c.ccd[1] > 0.0 for c in instrument.channels if c.camera == camera}
     for beam in paths.of(camera, monitor=True):
         style = _style(colours[_channel(beam)], ends[_channel(beam)])
         for (where, _), points in beam.footprints.items():

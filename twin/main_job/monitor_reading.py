@@ -327,16 +327,16 @@ def stated(readings: Mapping[str, Any]) -> dict[str, Any]:
     What comes after says nothing, and it depends on the processor: on the order in which its linear algebra sums.
 
     Args:
-        readings: nested; the sigma of ``x`` is ``x_sigma_noise``, ``x_sigma`` or ``sigma_x`` beside it, the first that
-            is there. Other numbers stay as they are.
+        readings: nested; the sigma of ``x`` is ``x_sigma_noise`` or ``x_sigma`` beside it, the first that is
+            there. Other numbers stay as they are.
     """
     out: dict[str, Any] = {}
     for key, value in readings.items():
-        names = (f"{key}_sigma_noise", f"{key}_sigma", f"sigma_{key}")
+        names = (f"{key}_sigma_noise", f"{key}_sigma")
         sigma = next((readings[name] for name in names if name in readings), None)
         if isinstance(value, Mapping):
             out[key] = stated(value)
-        elif isinstance(value, float) and (key.endswith(_SIGMAS) or key.startswith("sigma_")):
+        elif isinstance(value, float) and key.endswith(_SIGMAS):
             out[key] = _to_digits(value)
         elif isinstance(value, float) and isinstance(sigma, float) and 0.0 < sigma < math.inf:
             # adding 0.0 turns a negative zero into a plain one
@@ -364,6 +364,6 @@ def _spot(position: np.ndarray, sigma: np.ndarray) -> dict[str, float]:
     return {
         "row": float(position[0]),
         "column": float(position[1]),
-        "sigma_row": float(sigma[0]),
-        "sigma_column": float(sigma[1]),
+        "row_sigma": float(sigma[0]),
+        "column_sigma": float(sigma[1]),
     }

@@ -80,7 +80,7 @@ def _write_monitor(run: RenderRun, folder: RunFolder) -> None:
             facts = _spot_facts(run, channel, "nominal" if when == "before" else "perturbed")
             if when == "after" and run.series is not None:
                 facts = replace(facts, times=(float(run.series.times[run.series.shown]),) * len(frames))
-            for file, content in frame_files(f"{channel.camera}_{channel.side}_{when}", frames, facts):
+            for file, content in frame_files(f"{channel.camera}_{channel.name}_{when}", frames, facts):
                 folder.write_bytes(file, content)
     if run.stray is not None:
         _write_numbers(folder, "stray", run.stray.to_dict())
@@ -95,7 +95,7 @@ def _write_numbers(folder: RunFolder, kind: str, data: Mapping[str, Any]) -> Non
 
 def _spot_facts(run: RenderRun, channel: Channel, note: str) -> FrameFacts:
     """What is known of frames of a monitor's area CCD."""
-    camera = f"{channel.camera}, {channel.side} area CCD"
+    camera = f"{channel.camera}, {channel.name} area CCD"
     return FrameFacts(camera, run.experiment.path.pitch, run.experiment.exposure, note=note)
 
 
@@ -106,7 +106,7 @@ def _write_series(run: RenderRun, series: TimeSeries, folder: RunFolder) -> None
         times = tuple(float(time) for time in series.times)
         facts = replace(_spot_facts(run, channel, "first frame at each time of the course"), times=times)
         for ending, contents in FRAME_FORMATS.items():
-            name = f"images/{channel.camera}_{channel.side}_course.{ending}"
+            name = f"images/{channel.camera}_{channel.name}_course.{ending}"
             folder.write_bytes(name, contents(series.frames[:, i], facts))
     time = ("time", series.times, {"units": "s", "long_name": "time of the course"})
     folder.write_bytes("course.nc", netcdf(_images(run, "time", time, series.photons)))

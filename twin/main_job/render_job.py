@@ -398,7 +398,7 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
         own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
         worst = max(own, key=lambda i: focus.error[i])
         if focus.error[worst] > SHARP:
-            side = experiment.path.channels[worst].side
+            side = experiment.path.channels[worst].name
             model = experiment.instrument.cameras[name]
             # image.z counts along the parent axis, +-Z of the focal plane
             shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]

@@ -144,7 +144,7 @@ class RenderRun(JobRun):
         """What the images say, beside the truth."""
         experiment = self.experiment
         return MonitorReading(
-            channels=tuple((channel.camera, channel.side) for channel in experiment.path.channels),
+            channels=tuple((channel.camera, channel.name) for channel in experiment.path.channels),
             cameras=experiment.cameras,
             ground=experiment.ground,
             disturbances=experiment.disturbances,

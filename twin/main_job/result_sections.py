@@ -223,7 +223,7 @@ def course_sections(run: RenderRun, drawn: Mapping[str, str], shown: Table) -> t
     """
     series = run.series
     assert series is not None
-    files = ", ".join(f"`images/{c.camera}_{c.side}_course.tiff`" for c in run.experiment.path.channels)
+    files = ", ".join(f"`images/{c.camera}_{c.name}_course.tiff`" for c in run.experiment.path.channels)
     parts: list[Artefact] = [
         figure(
             drawn,
@@ -306,7 +306,7 @@ def spot_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
                 ("shift_um", _with_sigma(shift * pitch, sigma * pitch, sign=True)),
             )
             cells = [Marked(text, "", "number", f"{channel.key}.{axis}.{what}") for what, text in told]
-            rows.append([f"{channel.camera} {channel.side}", axis, *cells])
+            rows.append([f"{channel.camera} {channel.name}", axis, *cells])
             full.append([channel.key, axis, before, start, after, end, shift, sigma, shift * pitch, sigma * pitch])
     heads = ["channel", "axis", "before [px]", "sigma [px]", "after [px]", "sigma [px]", "shift [px]", "sigma [px]"]
     heads += ["shift [µm]", "sigma [µm]"]

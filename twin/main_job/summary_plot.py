@@ -58,7 +58,7 @@ def _draw(run: RenderRun) -> Figure:
             else:
                 # many pictures are narrow
                 text = "{} camera, {} spot" if columns <= 4 else "{}, {}"
-                axes.set_title(text.format(channel.camera, channel.side), fontsize=13 if columns <= 4 else 10, pad=7)
+                axes.set_title(text.format(channel.camera, channel.name), fontsize=13 if columns <= 4 else 10, pad=7)
     _table(figure, table, 1.0 - top - 0.1 / sum(heights), run)
     return figure
 

@@ -99,10 +99,10 @@ class CameraCrosstalk:
             "motions": rows,
             "factors": [vars(factor) for factor in self.factors],
             "observability": list(self.observability.statements),
-            "focal_length": list(self.focal_length_statements()),
+            "principal_distance": list(self.principal_distance_statements()),
         }
 
-    def focal_length_statements(self) -> tuple[str, ...]:
+    def principal_distance_statements(self) -> tuple[str, ...]:
         """Which changes of focus, spacing and size the spots report as a change of the principal distance."""
         out = []
         for k, motion in enumerate(self.motions):

@@ -246,7 +246,7 @@ class MonitorExperiment:
                 spot_jacobian=spots[own, :, 4 * k : 4 * k + 4].reshape(2 * len(own), 4),
                 parameter_jacobian=self._truth_by_family[name],
                 motions=tuple(motion.label for motion in family),
-                channels=tuple(self.path.channels[i].side for i in own),
+                channels=tuple(self.path.channels[i].name for i in own),
             )
         return cameras
 

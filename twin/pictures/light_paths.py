@@ -161,7 +161,7 @@ def _monitor(instrument: Instrument, backend: Backend, state: State, placed: Pla
             mirror = name.rpartition("/")[2]
             if mirror in instrument.cameras[channel.camera].mirrors:
                 prints[mirror, int((mirror, 0) in prints)] = hits[k][i][:, :2]
-        out.append(Beam(channel.camera, f"monitor/{channel.side}", np.stack(path, axis=1), prints))
+        out.append(Beam(channel.camera, f"monitor/{channel.name}", np.stack(path, axis=1), prints))
     return out
 
 

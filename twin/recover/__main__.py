@@ -43,8 +43,8 @@ def main(
 
         frames: run/images
 
-    A folder holds CAMERA_SIDE_before.tiff and CAMERA_SIDE_after.tiff, as twin.render writes them; or the files are
-    named for each channel, in a CSV table, or as a series with times. TIFF (also packed), FITS and PNG are read.
+    A folder holds CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff, as twin.render writes them; or the files
+    are named for each channel, in a CSV table, or as a series with times. TIFF (also packed), FITS and PNG are read.
 
     Without a model of the instrument its geometry will do: then the shape of the spots is learnt from the frames
     before, and nothing is known of what disturbances do.

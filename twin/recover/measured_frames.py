@@ -157,7 +157,7 @@ class ChannelFrames:
     """All frames of one channel.
 
     Attributes:
-        name: ``CAMERA/SIDE``.
+        name: ``CAMERA/CHANNEL``.
         ccd: rows and columns of its CCD.
         before: of the nominal state.
         after: of each state to be measured.

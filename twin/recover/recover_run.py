@@ -182,11 +182,11 @@ def _formulas(setup: MeasurementSetup) -> _Bench:
     cameras = {}
     for name, given in (setup.test.geometry or {}).items():
         geometry = MonitorGeometry(
-            focal_length_m=given.focal_length,
+            focal_length_m=given.principal_distance,
             separation_m=given.separation,
-            pixel_m=given.pixel,
+            pixel_m=given.pitch,
             field_beta_rad=abs(given.field),
-            focal_length_x_m=given.focal_length_across,
+            focal_length_x_m=given.principal_distance_across,
         )
         by_pixel = coefficients("derived", geometry)
         labels = ("d_alpha", "d_beta", "d_gamma", "d_f")

@@ -17,9 +17,13 @@ __all__ = ["FRAMES", "described", "frames_text", "schema"]
 
 _VERSION = 2
 """Version of the files' keys; 1 had no statement of frames."""
-_LATER: Mapping[str, int] = FrozenMap({"angle": 3, "calibration": 3, "recovered": 3, "course": 3, "monitor": 3})
-"""Kind of file -> version, where keys went or changed their meaning since then: what a paper prints and whether it
-holds; sigmas, which were those of the noise alone."""
+_LATER: Mapping[str, int] = FrozenMap(
+    {"angle": 4, "calibration": 4, "recovered": 4, "course": 3, "monitor": 4}
+    | dict.fromkeys(("camera", "crosstalk", "design", "distortion", "layouts", "match"), 3)
+    | dict.fromkeys(("mtf", "optics", "simulate", "truth", "turntable"), 3)
+)
+"""Kind of file -> version, where keys went, changed their meaning or got another name since then: what a paper prints
+and whether it holds; sigmas, which were those of the noise alone; the names of `scenes.specs.result_names`."""
 _CAMERA = (
     "d_alpha, d_beta and d_gamma turn the camera about Y, X and Z of its own nominal axes (Z the line of sight toward "
     "the scene, Y along the line CCD, X = Y x Z), right-handed; changes are perturbed minus nominal"

@@ -232,7 +232,7 @@ class InstrumentTwin:
         again = experiment.motion_models
         recovery = recover(first, second[None], experiment.calibration, method, disturbances=stated, motions=again)
         reading = MonitorReading(
-            channels=tuple((channel.camera, channel.side) for channel in path.channels),
+            channels=tuple((channel.camera, channel.name) for channel in path.channels),
             cameras=experiment.cameras,
             ground=experiment.ground,
             disturbances=stated,

@@ -16,7 +16,7 @@ from optics.numerics.backend import load_backend
 from scenes.specs.procedures import PROCEDURES
 from scenes.specs.resolved import ExperimentSetup
 from scenes.yaml.errors import InputError, Issue, names_text, nearest
-from scenes.yaml.spec import Source, validate
+from scenes.yaml.spec import Source, Spec, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
 from twin.run.artefact import cell_text
 from twin.run.page import RunFacts, write_test
@@ -97,7 +97,7 @@ def perform(
     setup = procedure.resolve(file)
     if changes:
         tree = setup.plain()
-        tree["test"] = _merged(tree["test"], changes)
+        tree["test"] = _merged(tree["test"], changes, type(setup.test))
         source = setup.test.source
         setup = validate(procedure.model, YamlFile("", tree, {}))
         setup = setup.model_copy(update={"test": setup.test.with_source(Source(source.file))})
@@ -113,10 +113,13 @@ def perform(
     return TestResult(name, numbers, shown, setup, run, facts, procedure.kind)
 
 
-def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any], model: Any) -> dict[str, Any]:
+    """Plain data of a model with other values; changes may have its old keys."""
     out = dict(base)
-    for key, value in changes.items():
+    renamed = model.old_keys if isinstance(model, type) and issubclass(model, Spec) else {}
+    for old, value in changes.items():
+        key = renamed.get(old, old)
         inner = out.get(key)
         both = isinstance(value, Mapping) and isinstance(inner, Mapping)
-        out[key] = _merged(inner, value) if both and isinstance(inner, Mapping) else value
+        out[key] = _merged(inner, value, annotation_at(model, (key,))) if both and isinstance(inner, Mapping) else value
     return out

@@ -210,7 +210,7 @@ class TargetRun:
                 true_places[place] = {"image_shift_um": shift, "light_lost": lost, **_directions(targets, _true)}
             cameras[name] = {
                 "band": camera.band,
-                "pixel_um": 1e6 * camera.pitch,
+                "pitch_um": 1e6 * camera.pitch,
                 "nyquist_per_mm": 1e-3 * NYQUIST / camera.pitch,
                 "places": places,
             }

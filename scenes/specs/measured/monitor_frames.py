@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -21,6 +21,7 @@ from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, reso
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import file_beside, is_file, unusable
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import PositiveLength
 from scenes.yaml.spec import Named, NothingIsEmpty, Paths, Reference, Spec, Whole, one_given, short_for, validate
 from scenes.yaml.units import MOMENT, parse_quantity
@@ -37,7 +38,7 @@ Files = Annotated[tuple[Reference, ...], short_for(None, str, schema=Reference |
 
 
 PerChannel = Annotated[Paths[Files], short_for(ALL, str, list, schema=Files | dict[str, Files]), Field(min_length=1)]
-"""Image files by channel, ``CAMERA/SIDE``, or for all."""
+"""Image files by channel, ``CAMERA/CHANNEL``, or for all."""
 FirstPixel = tuple[Annotated[Whole, Field(ge=0, le=65535)], Annotated[Whole, Field(ge=0, le=65535)]]
 
 
@@ -61,20 +62,26 @@ class GeometrySpec(Spec):
     """What the formulas need of one camera's monitor, where the instrument is not modelled.
 
     Attributes:
-        focal_length: principal distance, metres.
+        principal_distance: along the line, metres.
         separation: distance of the two area CCDs, metres.
-        pixel: pitch of their pixels, metres.
+        pitch: of their pixels, metres.
         look: angle of the camera's line of sight about the base's Y, radians.
         field: angle from the visual axis at which the area CCDs stand, radians.
-        focal_length_across: plate scale across the line, metres; the focal length by default.
+        principal_distance_across: plate scale across the line, metres; the principal distance by default.
     """
 
-    focal_length: PositiveLength
+    old_keys: ClassVar[OldKeys] = {
+        "focal_length": "principal_distance",
+        "focal_length_across": "principal_distance_across",
+        "pixel": "pitch",
+    }
+
+    principal_distance: PositiveLength
     separation: PositiveLength
-    pixel: PixelPitch
+    pitch: PixelPitch
     look: LookAngle = 0.0
     field: FieldPlace = 0.0
-    focal_length_across: PositiveLength | None = None
+    principal_distance_across: PositiveLength | None = None
 
 
 class MeasurementSpec(Spec):
@@ -84,8 +91,8 @@ class MeasurementSpec(Spec):
         instrument: name of an instrument in scenes/library/instruments, or path of an own file: its model gives the
             spots' shape and what moves them.
         geometry: camera -> the few numbers of the formulas, in place of an instrument.
-        frames: folder with CAMERA_SIDE_before.tiff and CAMERA_SIDE_after.tiff (or .fits), a CSV table of files, or
-            CAMERA/SIDE -> files.
+        frames: folder with CAMERA_CHANNEL_before.tiff and CAMERA_CHANNEL_after.tiff (or .fits), a CSV table of files,
+            or CAMERA/CHANNEL -> files.
         times: of a series, of each entry of `after`.
         disturbances: what is expected to move, on which the sigmas rest, as in a job.
         template: where the calibrated shape of the spots is from: `twin`, or `measured` from the frames before.
@@ -155,7 +162,7 @@ class MeasurementSpec(Spec):
         if isinstance(self.frames, str):
             return self
         if not self.frames:
-            raise Problem("no frames", None, "CAMERA/SIDE: {before: FILE, after: FILE}", within=("frames",))
+            raise Problem("no frames", None, "CAMERA/CHANNEL: {before: FILE, after: FILE}", within=("frames",))
         for name, files in self.frames.items():
             where = ("frames", name, "after")
             if self.times is not None and len(files.after) != len(self.times):
@@ -207,7 +214,7 @@ class MeasurementSetup(ExperimentSetup[MeasurementSpec]):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """``CAMERA/SIDE`` of every channel, in the order of the spots."""
+        """``CAMERA/CHANNEL`` of every channel, in the order of the spots."""
         return _channels(self.test, self.model)
 
 
@@ -304,7 +311,7 @@ def _found(
     if is_file(place) and place.suffix.lower() == ".csv":
         return read_frame_table(place, channels)
     if is_file(place):
-        allowed = "a folder of frames, a .csv table of files, or CAMERA/SIDE: {before: FILE, after: FILE}"
+        allowed = "a folder of frames, a .csv table of files, or CAMERA/CHANNEL: {before: FILE, after: FILE}"
         raise spec.error("neither a folder nor a table", ("frames",), found=spec.frames, allowed=allowed)
     try:
         names = sorted(one.name for one in place.iterdir())
@@ -323,7 +330,7 @@ def _found(
                 text, others = f"no frames of {channel} {when} in {place}", ", ".join(ENDINGS[1:])
                 if present:
                     text += f": {present[0]} is a picture with 8 bits to look at, not what was recorded"
-                allowed = f"{stem}.tiff (or {others}), or CAMERA/SIDE: {{before: FILE, after: FILE}}"
+                allowed = f"{stem}.tiff (or {others}), or CAMERA/CHANNEL: {{before: FILE, after: FILE}}"
                 raise spec.error(text, ("frames",), allowed=allowed, suggestion=meant)
             files[when] = (str((place / file).absolute()),)
         frames[channel] = ChannelFramesSpec.model_construct(before=files[BEFORE], after=(files[AFTER],))

@@ -293,7 +293,7 @@ class ImagePointsFileSpec(Spec):
     """Where lines see ground points: a table of point, camera, line, pixel and their sigmas.
 
     Attributes:
-        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `sigma_line`, `sigma_pixel` and perhaps
+        file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
             `correlation`.
         centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
         first_pixel: number of the first pixel of a line.
@@ -313,7 +313,7 @@ class UncertaintySpec(Spec):
         attitude: of the measured attitude with the camera's mounting, about each axis.
         position: of the orbit, along each axis.
         interior: of each line's place in the focal plane, pixels along and across it.
-        scale: of each line's focal length, relative.
+        scale: of each line's principal distance, relative.
         time: of the line times against those of orbit and attitude.
     """
 

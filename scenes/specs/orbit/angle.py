@@ -1,21 +1,24 @@
 """The intersection angle in orbit from ground points (paper 000), as a file in scenes/orbit gives it."""
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, model_validator
 
 from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
 from scenes.yaml.errors import Problem
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector, Wavelength
 from scenes.yaml.spec import Flag, Name, Named, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole, short_for
 from scenes.yaml.units import DISTANCE, LENGTH, MOMENT
 
-LINES = ("forward", "nadir", "aft")
+LINES = ("forward", "nadir", "backward")
 """Lines of a three-line camera."""
-THREE_LINE_ANGLES = {"alpha": ("forward", "nadir"), "beta": ("nadir", "aft")}
-"""Angles of a three-line camera: name -> the two lines that it lies between."""
+OLD_LINES: OldKeys = {"aft": "backward"}
+"""Name of such a line until the last version -> name now. Files that use the old one throughout are read for one
+version: the names of lines are the user's own, so that they stay in results.
+"""
 LEAST_POINTS = 3
 
 Moment = Annotated[float, Quantity(MOMENT, largest="240 h")]
@@ -44,10 +47,23 @@ def _angles(angles: Mapping[str, tuple[str, str]] | None) -> Mapping[str, tuple[
 Angles = Annotated[Named[tuple[Name, Name]] | None, AfterValidator(_angles)]
 
 
+def three_lines(names: Iterable[str]) -> tuple[str, str, str]:
+    """Which of a camera's lines are those of a three-line camera, in the order of `LINES`.
+
+    Args:
+        names: of all its lines; one with its old name stands for one that is not there.
+    """
+    there = set(names)
+    old = {new: before for before, new in OLD_LINES.items() if before in there and new not in there}
+    first, second, third = (old.get(line, line) for line in LINES)
+    return first, second, third
+
+
 def usual_angles(lines: Sequence[str]) -> Mapping[str, tuple[str, str]] | None:
     """Angles of a camera whose test names none: those of three lines, or that of a camera of two; None for others."""
-    if set(LINES) <= set(lines):
-        return THREE_LINE_ANGLES
+    three = three_lines(lines)
+    if set(three) <= set(lines):
+        return {"alpha": three[:2], "beta": three[1:]}
     return {"alpha": (lines[0], lines[1])} if len(lines) == 2 else None
 
 
@@ -151,9 +167,9 @@ class OrbitAngleSpec(TitledSpec):
         description: for people.
         camera: name in scenes/library/payloads or scenes/library/instruments, or path of a file of either sort. The
             lines of a payload are ideal projections, those of an instrument are traced, one for each of its cameras.
-        angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir, aft]
-            where the camera has these lines, or alpha between the lines of a camera that has two.
-        changes: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
+        angles: name -> the two lines that the angle lies between; None for alpha [forward, nadir] and beta [nadir,
+            backward] where the camera has these lines, or alpha between the lines of a camera that has two.
+        perturb: what has changed since the laboratory; the analysis does not know it. For a payload line -> rotation
             vector in body axes, for an instrument node path -> perturbation as in a job.
         earth: its rotation.
         orbit: true orbit.
@@ -167,9 +183,11 @@ class OrbitAngleSpec(TitledSpec):
         seed: of every random number.
     """
 
+    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
+
     camera: Reference
     angles: Angles = None
-    changes: Paths[Change] = Field(default_factory=dict, validate_default=True)
+    perturb: Paths[Change] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     orbit: OrbitSpec
     attitude: AttitudeSpec = AttitudeSpec()

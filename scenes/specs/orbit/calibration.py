@@ -1,14 +1,24 @@
 """In-orbit calibration of a three-line camera over test fields, with cameras that may drift, as its file gives it."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.orbit.angle import LINES, DatumShift, EffectsSpec, GroundSigma, Relief, TerrainHeight, check_ends
+from scenes.specs.orbit.angle import (
+    LINES,
+    OLD_LINES,
+    DatumShift,
+    EffectsSpec,
+    GroundSigma,
+    Relief,
+    TerrainHeight,
+    check_ends,
+)
 from scenes.specs.orbit.flight import Altitude, AttitudeSpec, EarthSpec, ErrorsSpec, Latitude, Longitude, UtcTime
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text, unknown
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import AngleSigmas, LengthSigma, Quantity, Vector
 from scenes.yaml.spec import Flag, Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole, not_empty, one_given
 from scenes.yaml.units import ANGLE, DISTANCE, LENGTH, MOMENT, TIME
@@ -22,11 +32,13 @@ class CameraDriftSpec(Spec):
 
     Attributes:
         angles: d_alpha (about the camera's Y), d_beta (about X) and d_gamma (about the line of sight), radians.
-        focal_length: d_f of the principal distance, metres.
+        principal_distance: d_f, metres.
     """
 
+    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
+
     angles: AngleSigmas = (0.0, 0.0, 0.0)
-    focal_length: LengthSigma = 0.0
+    principal_distance: LengthSigma = 0.0
 
 
 class MonitorReadingSpec(Spec):
@@ -34,11 +46,13 @@ class MonitorReadingSpec(Spec):
 
     Attributes:
         angles: of d_alpha, d_beta and d_gamma, radians.
-        focal_length: of d_f, metres.
+        principal_distance: of d_f, metres.
     """
 
+    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
+
     angles: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, above_zero=True, largest="1 deg"))]
-    focal_length: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
+    principal_distance: Annotated[float, Quantity(LENGTH, above_zero=True, largest="5 mm")]
 
 
 class StripSpec(Spec):
@@ -61,7 +75,7 @@ class StripSpec(Spec):
 
 def _of_lines(drift: Named[CameraDriftSpec]) -> Named[CameraDriftSpec]:
     for name in drift:
-        if name not in LINES:
+        if name not in (*LINES, *OLD_LINES):
             raise unknown("no such line", name, LINES, (name,))
     return drift
 
@@ -87,11 +101,13 @@ class InteriorChangeSpec(Spec):
     """How the interior orientation of a line has changed since the laboratory.
 
     Attributes:
-        focal_length: change of the principal distance, metres.
+        principal_distance: change of the principal distance, metres.
         principal_point: change of x (flight) and y (along the line), metres.
     """
 
-    focal_length: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
+    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
+
+    principal_distance: Annotated[float, Quantity(LENGTH, largest="5 mm")] = 0.0
     principal_point: Annotated[tuple[float, float], Vector(Quantity(LENGTH, largest="5 mm"), 2)] = (0.0, 0.0)
 
 
@@ -174,7 +190,7 @@ class CalibrationImagesSpec(Spec):
     def _are_enough(self) -> "CalibrationImagesSpec":
         if len(self.patches) < LEAST_PATCHES:
             found = f"{len(self.patches)}"
-            problem = "too few patches to tell focal length from attitude"
+            problem = "too few patches to tell principal distance from attitude"
             raise Problem(problem, found, f"{LEAST_PATCHES} or more", within=("patches",))
         if self.points.control < 1 or self.points.check < 1:
             found = f"control {self.points.control}, check {self.points.check}"
@@ -251,8 +267,8 @@ class OrbitCalibrationSpec(TitledSpec):
     Attributes:
         name: as the file is called.
         description: for people.
-        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and aft.
-        changes: line -> how its interior has changed since the laboratory. The nadir line's principal point is the
+        camera: name in scenes/library/payloads or path of a file, with lines forward, nadir and backward.
+        perturb: line -> how its interior has changed since the laboratory. The nadir line's principal point is the
             gauge and does not change: it cannot be told from a turn of the whole camera, `errors.star_tracker.bias`.
         earth: its rotation.
         altitude: of the descending sun-synchronous orbit over each field, metres.
@@ -275,8 +291,10 @@ class OrbitCalibrationSpec(TitledSpec):
         seed: of every random number.
     """
 
+    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
+
     camera: Reference
-    changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
+    perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     altitude: Altitude = 500e3
     span: Annotated[float, Quantity(MOMENT, smallest="1 s", largest="1 h")] = 60.0

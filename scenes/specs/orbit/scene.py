@@ -1,7 +1,7 @@
 """What a line camera in orbit sees, what is known of it, and which points are measured in its images."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
@@ -11,6 +11,7 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.camera import Diffusion, Spectrum, TdiSpec
 from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
 from scenes.yaml.errors import Problem
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Number, Reference, Spec, Whole
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
@@ -138,16 +139,18 @@ class TextureSpec(Spec):
         spacing: of the reflectance's cells, metres; the field is a cubic B-spline of them and holds nothing finer.
         mean: reflectance.
         contrast: rms of the reflectance over its mean.
-        fields: share of the ground that is fields; the rest varies as a fractal.
-        field_size: side of a field of mean area, metres.
+        parcels: share of the ground that is fields of crops; the rest varies as a fractal.
+        parcel_size: side of such a field of mean area, metres.
         roads: metres from one road to the next.
     """
+
+    old_keys: ClassVar[OldKeys] = {"fields": "parcels", "field_size": "parcel_size"}
 
     spacing: Spacing = 2.0
     mean: Annotated[Number, Field(ge=0.01, le=0.9)] = 0.18
     contrast: Annotated[Number, Field(ge=0.0, le=0.6)] = 0.3
-    fields: Share = 0.6
-    field_size: GroundLength = 140.0
+    parcels: Share = 0.6
+    parcel_size: GroundLength = 140.0
     roads: GroundLength = 1500.0
 
 

@@ -14,7 +14,7 @@ from scenes.specs.course import DEFAULT_PIVOT
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.orbit.angle import LINES, OrbitAngleSpec, usual_angles
+from scenes.specs.orbit.angle import OLD_LINES, OrbitAngleSpec, three_lines, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.flight import PayloadTestSpec
 from scenes.specs.orbit.monitor import OrbitMonitorSpec
@@ -23,6 +23,7 @@ from scenes.specs.orbit.simulate import OrbitSimulateSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
 from scenes.yaml.errors import KeyPath, names_text, unknown
+from scenes.yaml.old_keys import tell
 from scenes.yaml.spec import Paths, Spec
 from scenes.yaml.units import ANGLE, format_quantity
 from scenes.yaml.yaml_file import read_yaml
@@ -30,7 +31,12 @@ from scenes.yaml.yaml_file import read_yaml
 
 def load_three_line_camera(name_or_path: str | Path) -> ThreeLineCameraSpec:
     """Read a three-line payload; arguments and errors as `load_instrument`."""
-    return load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
+    camera = load.load_named(ThreeLineCameraSpec, load.PAYLOADS, name_or_path)
+    old: dict[KeyPath, str] = {
+        ("lines", name): new for name, new in OLD_LINES.items() if name in camera.lines and new not in camera.lines
+    }
+    tell(camera.source.file, {key: camera.source.line(key) for key in old}, old)
+    return camera
 
 
 def load_payload(
@@ -160,17 +166,17 @@ def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     """InputError unless every change turns one of a payload's lines. What an instrument's nodes allow is told when it
     is built.
     """
-    _require_lines(test, test.changes, lines)
-    for name, change in test.changes.items():
+    _require_lines(test, test.perturb, lines)
+    for name, change in test.perturb.items():
         for action in change.uses():
             if action != "rotate":
                 allowed = "a rotation, or an instrument of traced cameras instead of a payload"
                 raise test.error(
-                    f"a payload's line does not allow {action}", ("changes", name, action), allowed=allowed
+                    f"a payload's line does not allow {action}", ("perturb", name, action), allowed=allowed
                 )
         if change.pivot != DEFAULT_PIVOT:
             problem = "a payload's line has no pivots"
-            raise test.error(problem, ("changes", name, "pivot"), found=change.pivot, allowed="no pivot")
+            raise test.error(problem, ("perturb", name, "pivot"), found=change.pivot, allowed="no pivot")
 
 
 class CalibrationSetup(ExperimentSetup[OrbitCalibrationSpec]):
@@ -313,12 +319,12 @@ def resolve_simulate(path: str | Path) -> SimulateSetup:
 def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:
     """InputError unless all lines that are named exist and can be rendered, and the patch lies on one of them."""
     names = tuple(camera.lines)
-    named = [(("patch", "line"), test.patch.line), *((("changes", name), name) for name in test.changes)]
+    named = [(("patch", "line"), test.patch.line), *((("perturb", name), name) for name in test.perturb)]
     for key, name in [*((("lines",), name) for name in test.lines), *named]:
         if name not in names:
             allowed = f"{names_text(names)}, the lines of {camera.name}"
             raise test.error(unknown("no such line", name, names, allowed=allowed), key)
-    _require_places(test, test.changes, camera)
+    _require_places(test, test.perturb, camera)
     _require_images_of(test, test.lines, camera)
     line, pixels = f"the line {test.patch.line} of {camera.name}", camera.pixels_of(test.patch.line)
     _require_pixel(test, ("patch", "pixel"), test.patch.pixel, pixels, line)
@@ -328,30 +334,32 @@ def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> Non
 
 def _require_calibration(test: OrbitCalibrationSpec, camera: ThreeLineCameraSpec) -> None:
     """InputError unless the camera has the three lines, and points and changes lie on them."""
-    if missing := [name for name in LINES if name not in camera.lines]:
+    lines = three_lines(camera.lines)
+    if missing := [name for name in lines if name not in camera.lines]:
         found = f"{names_text(tuple(camera.lines))} in {camera.name}"
         problem = f"the camera has no {' and no '.join(missing)} line"
         raise test.error(problem, ("camera",), found=found, allowed=_THREE_LINES)
-    _require_lines(test, test.changes)
-    _require_places(test, (*test.changes, *test.drift), camera)
-    if "nadir" in test.changes and any(test.changes["nadir"].principal_point):
+    _require_lines(test, test.perturb, lines)
+    _require_lines(test, test.drift, lines, "drift")
+    _require_places(test, (*test.perturb, *test.drift), camera)
+    if "nadir" in test.perturb and any(test.perturb["nadir"].principal_point):
         raise test.error(
             "the nadir line's principal point is the gauge",
-            ("changes", "nadir", "principal_point"),
+            ("perturb", "nadir", "principal_point"),
             allowed="no change; turn the whole camera instead, by errors.star_tracker.bias",
         )
-    fewest = min(camera.pixels_of(name) for name in LINES)
+    fewest = min(camera.pixels_of(name) for name in lines)
     if test.points is not None:
         _require_ends(test, "points", (test.points.first, test.points.last), fewest, f"the lines of {camera.name}")
     if test.images is None:
         return
-    _require_images_of(test, LINES, camera)
+    _require_images_of(test, lines, camera)
     for k, place in enumerate(test.images.patches):
         key, pixels = ("images", "patches", k, "pixel"), camera.pixels_of("nadir")
         _require_pixel(test, key, place.pixel, pixels, f"the nadir line of {camera.name}")
 
 
-_THREE_LINES = "a camera with lines forward, nadir and aft"
+_THREE_LINES = "a camera with lines forward, nadir and backward"
 
 
 def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraSpec) -> None:
@@ -359,14 +367,14 @@ def _require_places(test: Spec, changes: Iterable[str], camera: ThreeLineCameraS
     for name in changes:
         if name in camera.lines and camera.lines[name].by_look_angles:
             problem = f"{name} of {camera.name} is known by look angles, which say nothing of a changed lens"
-            raise test.error(problem, ("changes", name), allowed="a line with `shift` and `rotate` of its CCDs")
+            raise test.error(problem, ("perturb", name), allowed="a line with `shift` and `rotate` of its CCDs")
 
 
-def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...] = LINES) -> None:
+def _require_lines(test: Spec, changes: Iterable[str], lines: tuple[str, ...], key: str = "perturb") -> None:
     """InputError unless every change is one of a line."""
     for name in changes:
         if name not in lines:
-            raise test.error(unknown("no such line", name, lines), ("changes", name))
+            raise test.error(unknown("no such line", name, lines), (key, name))
 
 
 def _require_images_of(test: Spec, lines: Iterable[str], camera: ThreeLineCameraSpec) -> None:

@@ -1,6 +1,6 @@
 """Images of a patch of ground by every line of a camera in orbit, as a file in scenes/orbit gives them."""
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field
 
@@ -9,6 +9,7 @@ from scenes.specs.orbit.calibration import InteriorChangeSpec, LineTime, Side
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
 from scenes.specs.orbit.scene import ControlSpec, GroundSpec, ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, TitledSpec, Whole
 
 
@@ -43,7 +44,7 @@ class OrbitSimulateSpec(TitledSpec):
         description: for people.
         camera: name in scenes/library/payloads or path of a file; it needs a section `image`.
         lines: those that are rendered, by name.
-        changes: line -> how its interior has changed since the laboratory.
+        perturb: line -> how its interior has changed since the laboratory.
         earth: its rotation.
         orbit: true orbit.
         attitude: true attitude.
@@ -58,9 +59,11 @@ class OrbitSimulateSpec(TitledSpec):
         seed: of every random number.
     """
 
+    old_keys: ClassVar[OldKeys] = {"changes": "perturb"}
+
     camera: Reference
-    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "aft")
-    changes: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
+    lines: Annotated[tuple[Name, ...], AfterValidator(_each_once)] = ("forward", "nadir", "backward")
+    perturb: Named[InteriorChangeSpec] = Field(default_factory=dict, validate_default=True)
     earth: EarthSpec = EarthSpec()
     orbit: OrbitSpec
     attitude: AttitudeSpec = AttitudeSpec(steering="yaw")

@@ -5,7 +5,7 @@ No prescription is needed: a line is known by its interior orientation (principa
 distortion) and by how it is mounted on the base.
 """
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -14,6 +14,7 @@ from scenes.specs.detector import PixelPitch
 from scenes.specs.instrument import LookAngle
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.yaml.errors import Problem
+from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3
 from scenes.yaml.spec import Named, Spec, TitledSpec, Whole, not_empty
 from scenes.yaml.units import ANGLE, LENGTH, Kind
@@ -31,7 +32,7 @@ class CcdSpec(Spec):
     A place, ``shift`` and ``rotate``, is against that of the same pixels on a straight line of the payload's pitch.
     Look angles, ``psi_x`` and ``psi_y``, are coefficients c0, c1, ... of c0 + c1 s + c2 s^2 + ... of the pixel's number
     s, counted from 0 on the whole line; the look is along (tan psi_x, tan psi_y, 1) in the camera's axes. They hold for
-    the line's focal_length and principal_point, whose changes are counted from there, and contain the distortion.
+    the line's principal_distance and principal_point, whose changes are counted from there, and contain the distortion.
 
     Attributes:
         first, last: its pixels, both included.
@@ -71,7 +72,7 @@ class LineCameraSpec(Spec):
         look: angle of the camera's Z from the base's +Z, about the base's Y, positive forward (toward +X), radians.
         rotate: misalignment, a rotation vector in the camera's own axes after the look, radians.
         position: of the projection centre in the base frame, metres.
-        focal_length: principal distance f, metres.
+        principal_distance: f, metres.
         principal_point: where the camera's Z meets the focal plane, x (flight) and y (along the line) from the line's
             centre, metres.
         k1: radial distortion of third order, 1/m^2.
@@ -82,10 +83,12 @@ class LineCameraSpec(Spec):
         ccds: of which it is made, from pixel 0 on; empty for one straight line.
     """
 
+    old_keys: ClassVar[OldKeys] = {"focal_length": "principal_distance"}
+
     look: LookAngle
     rotate: Rotation = (0.0, 0.0, 0.0)
     position: Vector3 = (0.0, 0.0, 0.0)
-    focal_length: PositiveLength
+    principal_distance: PositiveLength
     principal_point: Vector2 = (0.0, 0.0)
     k1: Annotated[float, Quantity(_PER_LENGTH2, largest="100 1/m^2")] = 0.0
     k2: Annotated[float, Quantity(_PER_LENGTH4, largest="1e5 1/m^4")] = 0.0
@@ -115,7 +118,7 @@ class ThreeLineCameraSpec(TitledSpec):
         description: for people.
         pixels: of each line that does not say its own; pixel 0 is at its -y end.
         pitch: of their pixels, metres.
-        lines: by name; normally forward, nadir and aft, in the order in which they see a point on the ground, then
+        lines: by name; normally forward, nadir and backward, in the order in which they see a point on the ground, then
             others such as a high-resolution and a multispectral one.
         image: how lines that do not say it themselves form and record their images; only rendering needs it.
     """

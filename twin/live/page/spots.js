@@ -16,7 +16,7 @@ export class Spots {
     this.images = {};
     this.told = null;
     const make = (tag, className) => Object.assign(document.createElement(tag), { className });
-    this.figures = hello.channels.map(({ key, camera, side }) => {
+    this.figures = hello.channels.map(({ key, camera, name }) => {
       const figure = document.createElement('figure');
       const stack = make('div', 'stack');
       const image = Object.assign(make('canvas', 'image'), { width: hello.columns, height: hello.rows });
@@ -29,7 +29,7 @@ export class Spots {
       caption.append(Object.assign(document.createElement('b'), { textContent: key.replaceAll('/', ' ') }), told);
       stack.append(image, marks);
       figure.append(stack, caption);
-      return { camera, side, figure, image, marks, told, pixels: new ImageData(hello.columns, hello.rows) };
+      return { camera, name, figure, image, marks, told, pixels: new ImageData(hello.columns, hello.rows) };
     });
     byId('spots').replaceChildren(...this.figures.map(({ figure }) => figure));
   }
@@ -98,8 +98,8 @@ export class Spots {
   }
 
   spot(channel, when) {
-    const { camera, side } = this.figures[channel];
-    return this.told.readings.spots[camera][side][when];
+    const { camera, name } = this.figures[channel];
+    return this.told.readings.spots[camera][name][when];
   }
 
   // one factor for all ellipses, so that they can be compared
@@ -107,7 +107,7 @@ export class Spots {
     if (!byId('marks').checked || this.told.problem) return 0;
     let most = 0;
     this.figures.forEach((_, channel) => {
-      const { sigma_row: row, sigma_column: column } = this.spot(channel, 'after');
+      const { row_sigma: row, column_sigma: column } = this.spot(channel, 'after');
       most = Math.max(most, row, column);
     });
     const cropped = byId('crop').value === 'spot' ? CROP / this.hello.columns : 1;
@@ -146,7 +146,7 @@ export class Spots {
     if (enlarged) {
       pen.strokeStyle = '#ff7f2a';
       pen.beginPath();
-      pen.ellipse(...at(after), enlarged * after.sigma_column * scale, enlarged * after.sigma_row * scale, 0, 0, 2 * Math.PI);
+      pen.ellipse(...at(after), enlarged * after.column_sigma * scale, enlarged * after.row_sigma * scale, 0, 0, 2 * Math.PI);
       pen.stroke();
     }
   }

@@ -71,7 +71,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
     spec = setup.test
     if setup.camera is not None:
         laboratory = line_cameras(setup.camera)
-        turns = {name: rotation_matrix(change.rotate).T for name, change in spec.changes.items()}
+        turns = {name: rotation_matrix(change.rotate).T for name, change in spec.perturb.items()}
         turned = {name: camera.turned(turns[name]) if name in turns else camera for name, camera in laboratory.items()}
         return AngleCamera(FrozenMap(laboratory), FrozenMap(turned), FrozenMap())
     if setup.instrument is None or backend is None:
@@ -83,7 +83,7 @@ def angle_camera(setup: AngleSetup, backend: Backend | None) -> AngleCamera:
         cameras = traced_line_cameras(instrument, backend, state)
         change = float(trace_truth(instrument, backend, [state]).angle_change[0])
     except (AimError, BeamMissedError) as error:
-        raise BenchError(str(error), ("changes",), "smaller changes, which leave the image on the mirrors") from error
+        raise BenchError(str(error), ("perturb",), "smaller changes, which leave the image on the mirrors") from error
     trace = {name: change for name, pair in setup.angles.items() if len(cameras) == 2 and set(pair) == set(cameras)}
     return AngleCamera(FrozenMap(laboratory), FrozenMap(cameras), FrozenMap(trace))
 
@@ -96,18 +96,18 @@ def _changed_state(spec: OrbitAngleSpec, instrument: Instrument) -> State:
     """
     issues = [
         issue
-        for path, what in spec.changes.items()
-        for issue in perturbation_issues(spec, instrument.nodes, path, what, ("changes", path))
+        for path, what in spec.perturb.items()
+        for issue in perturbation_issues(spec, instrument.nodes, path, what, ("perturb", path))
     ]
     if issues:
         raise InputError(*issues)
-    job = JobSpec.model_construct(instrument=spec.camera, perturb=PerturbationSpec.of(spec.changes))
+    job = JobSpec.model_construct(instrument=spec.camera, perturb=PerturbationSpec.of(spec.perturb))
     thermal = ThermalModel(instrument)
     try:
         thermal.check(job.fields())
         return thermal.state(job.fields(), motions_of(job))
     except TemperatureError as error:
-        raise spec.error(str(error), ("changes", error.origin, "temperature"), allowed=error.allowed) from error
+        raise spec.error(str(error), ("perturb", error.origin, "temperature"), allowed=error.allowed) from error
 
 
 _LINE_TIME = 1e-3

@@ -1,6 +1,6 @@
 """The quantities of an intersection-angle test, as angle.json has them.
 
-Keys below those that name a result begin with the name of an angle, such as alpha_deg and alpha_sigma_arcsec.
+Keys below those that name a result begin with the name of an angle, such as alpha_deg and alpha_arcsec_sigma.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def _degrees(names: Iterable[str], values: Iterable[float]) -> ByAngle:
 def _with_sigmas(names: Iterable[str], angles: PlaneAngles | AlongTrackAngles | FrameRow) -> ByAngle:
     """Angles in degrees, then their sigmas in arcseconds."""
     names = tuple(names)
-    return _degrees(names, angles.values) | _by_angle([f"{n}_sigma_arcsec" for n in names], angles.sigma / ARCSEC)
+    return _degrees(names, angles.values) | _by_angle([f"{n}_arcsec_sigma" for n in names], angles.sigma / ARCSEC)
 
 
 def _plane_chances(one: PassAngles) -> dict[str, float]:
@@ -145,7 +145,7 @@ ANGLE: Record[Any] = Record(
     Quantity("change_arcsec", _changes, "change of the look angles since launch: found, true, and by the trace"),
     Quantity("difference_arcsec", lambda run: _by_angle(run.names, run.difference), "planes minus resection"),
     Quantity(
-        "difference_sigma_arcsec",
+        "difference_arcsec_sigma",
         lambda run: _by_angle(run.names, run.difference_sigma),
         "standard deviation of the difference over the passes",
     ),

@@ -203,7 +203,7 @@ def _facts(setup: AngleSetup) -> tuple[tuple[str, str], ...]:
         )
     on = LightEffects.of(effects).names
     state = ("corrected" if effects.corrected else "not corrected") + " in the analysis" if on else ""
-    changed = "; ".join(f"{name} {_change_text(change)}" for name, change in test.changes.items())
+    changed = "; ".join(f"{name} {_change_text(change)}" for name, change in test.perturb.items())
     described = (setup.camera or setup.instrument).description  # type: ignore[union-attr]
     pairs = "; ".join(
         f"{sign} between {a} and {b}" for sign, (a, b) in zip(signs(setup.angles), setup.angles.values(), strict=True)

@@ -79,13 +79,13 @@ TREATMENT: Record[Treatment] = Record(
 CAMERA_DRIFT: Record[tuple[Monitoring, DriftSize]] = Record(
     "One size of the cameras' drift from field to field.",
     Quantity("factor", lambda d: d[1].factor, "size against that of the file"),
-    Quantity("d_alpha_sigma_rad", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
+    Quantity("d_alpha_rad_sigma", lambda d: d[1].factor * d[0].angle, "standard deviation of Δα of an outer line"),
     Quantity("without_monitor", lambda d: d[1].without, "as if no camera drifted", record=TREATMENT),
     Quantity("with_monitor", lambda d: d[1].monitored, "with the monitor's readings", record=TREATMENT),
 )
 MONITORING: Record[Monitoring] = Record(
     "Cameras that drift from field to field, with and without the on-board monitor.",
-    Quantity("d_alpha_sigma_rad", lambda found: found.angle, "standard deviation of Δα of an outer line in the file"),
+    Quantity("d_alpha_rad_sigma", lambda found: found.angle, "standard deviation of Δα of an outer line in the file"),
     Quantity("height_for_1_arcsec_m", lambda found: found.metres, "height change for 1 arcsec of Δα of the first line"),
     Quantity("noise_counts_as", lambda found: "independent", "how the noise of orbit and attitude enters"),
     Quantity("sizes", lambda found: [(found, size) for size in found.sizes], record=CAMERA_DRIFT),
@@ -268,7 +268,7 @@ SIGMAS: Record[CalibrationRun] = Record(
         "sigma_with_gauge",
         lambda run: "with what launch leaves to expect of the held unknowns, and all that follows them",
     ),
-    Quantity("held_start_sigma_m", lambda run: run.setup.test.launch.interior, "of held unknowns after a launch"),
+    Quantity("held_start_m_sigma", lambda run: run.setup.test.launch.interior, "of held unknowns after a launch"),
     Quantity("fields", lambda run: "of each field by itself: without the drift of the biases during the pass"),
 )
 
@@ -412,9 +412,9 @@ def _rejected(measured: tuple[Campaign, FieldPass, Adjustment], what: str, none:
 LATITUDE: Record[LatitudeFit] = Record(
     "Amplitude x sin(latitude - reference) + constant, of one axis of the biases.",
     Quantity("amplitude_rad", lambda fit: fit.amplitude, "of the drift with latitude"),
-    Quantity("amplitude_sigma_rad", lambda fit: fit.amplitude_sigma, "its standard deviation, with what remains"),
+    Quantity("amplitude_rad_sigma", lambda fit: fit.amplitude_sigma, "its standard deviation, with what remains"),
     Quantity("constant_rad", lambda fit: fit.constant, "bias at the reference"),
-    Quantity("constant_sigma_rad", lambda fit: fit.constant_sigma, "its standard deviation, with what remains"),
+    Quantity("constant_rad_sigma", lambda fit: fit.constant_sigma, "its standard deviation, with what remains"),
     Quantity("reference_rad", lambda fit: fit.reference, "latitude in the middle of the fields"),
     Quantity("remainder_rad", lambda fit: fit.remainder, "standard deviation of what remains: the season"),
     Quantity("chi_square", lambda fit: fit.chi_square, "by the biases' own covariance"),

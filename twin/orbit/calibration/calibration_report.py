@@ -83,9 +83,9 @@ def _summary(run: CalibrationRun) -> Table:
 def _facts(setup: CalibrationSetup) -> tuple[tuple[str, str], ...]:
     test, camera, errors = setup.test, setup.camera, setup.test.errors
     changes = "; ".join(
-        f"{name} f {format_quantity(c.focal_length, LENGTH)}, "
+        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
         f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.changes.items()
+        for name, c in test.perturb.items()
     )
     bias = ", ".join(format_quantity(v, ANGLE) for v in errors.star_tracker.bias)
     noise = f"image {errors.image:g} px, control {format_quantity(errors.control, LENGTH)}"

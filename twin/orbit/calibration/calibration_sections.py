@@ -40,7 +40,7 @@ def _monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     """Errors by size of the drift and by scheme."""
     spec = run.campaign.simulated
     drifts = "; ".join(
-        f"{name} {_angles(one.angles)}, Δf {format_quantity(one.focal_length, LENGTH)}"
+        f"{name} {_angles(one.angles)}, Δf {format_quantity(one.principal_distance, LENGTH)}"
         for name, one in spec.drift.items()
     )
     text = [
@@ -55,11 +55,11 @@ def _monitoring_section(run: CalibrationRun, found: Monitoring) -> Section:
     if spec.monitor is not None:
         text.append(
             f"The monitor reads each camera in each pass with {_angles(spec.monitor.angles)} and Δf "
-            f"{format_quantity(spec.monitor.focal_length, LENGTH)}, 1σ. Where a field is calibrated, its readings are "
-            "observations of the drift, so that the interior orientation is that of the reference state; where a field "
-            "is tested, the reference cameras are drifted by its own readings. What a reading has in common in all "
-            "passes, the interior orientation takes up. Biases of the attitude, which act in plan, a monitor of the "
-            "cameras does not read."
+            f"{format_quantity(spec.monitor.principal_distance, LENGTH)}, 1σ. Where a field is calibrated, its "
+            "readings are observations of the drift, so that the interior orientation is that of the reference state; "
+            "where a field is tested, the reference cameras are drifted by its own readings. What a reading has in "
+            "common in all passes, the interior orientation takes up. Biases of the attitude, which act in plan, a "
+            "monitor of the cameras does not read."
         )
     artefacts: list[Artefact] = [
         SvgFigure(

@@ -18,7 +18,6 @@ from analysis.orbit.calibration_parameters import Prior, Unknowns, monitor_prior
 from analysis.orbit.forward_intersection import CheckErrors, check_errors, intersect
 from analysis.units import ARCSEC
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.angle import LINES
 from twin.orbit.calibration.campaign import Campaign, FieldPass
 from twin.orbit.calibration.campaign_adjustment import calibrated_alone, gauge_of, simultaneous
 from twin.orbit.calibration.flown_campaign import fly_fields, reading_sigma
@@ -106,7 +105,7 @@ def monitored(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: Ad
         if factor == 0.0:
             metres = height_per_arcsec(campaign)
         advance("drift", k + 1, len(FACTORS))
-    angles = [one.angles[0] for one in setup.test.drift.values() if any(one.angles) or one.focal_length]
+    angles = [one.angles[0] for one in setup.test.drift.values() if any(one.angles) or one.principal_distance]
     return Monitoring(tuple(sizes), float(np.sqrt(np.mean(np.square(angles or [0.0])))), metres)
 
 
@@ -118,7 +117,10 @@ def flown(setup: CalibrationSetup, factor: float, seed: np.random.SeedSequence) 
     test = setup.test
     drift = {
         name: one.model_copy(
-            update={"angles": tuple(factor * v for v in one.angles), "focal_length": factor * one.focal_length}
+            update={
+                "angles": tuple(factor * v for v in one.angles),
+                "principal_distance": factor * one.principal_distance,
+            }
         )
         for name, one in test.drift.items()
     }
@@ -185,7 +187,7 @@ def height_per_arcsec(campaign: Campaign) -> float:
 
 def _reading_priors(campaign: Campaign, one: FieldPass) -> list[Prior]:
     sigma = reading_sigma(campaign.simulated)
-    return [p for line in LINES for p in monitor_priors(one.name, line, one.readings[line], sigma)]
+    return [p for line, told in one.readings.items() for p in monitor_priors(one.name, line, told, sigma)]
 
 
 def _scheme(campaign: Campaign, alone: Mapping[str, Adjustment], names: tuple[str, ...], one: FieldPass) -> CheckErrors:

@@ -326,7 +326,9 @@ def line_model(payload: ThreeLineCameraSpec, name: str) -> LineModel:
     line = payload.lines[name]
     to_body = about_axis(1, line.look) @ rotation_matrix(np.array(line.rotate))
     half = 0.5 * payload.pixels_of(name) * payload.pitch_of(name)
-    return LineModel.of(to_body, (line.focal_length, *line.principal_point), line.position, line.k1, line.k2, half)
+    return LineModel.of(
+        to_body, (line.principal_distance, *line.principal_point), line.position, line.k1, line.k2, half
+    )
 
 
 def campaign_of(

@@ -8,7 +8,7 @@ out of the image points by the laboratory's camera (`twin.orbit.calibration.obse
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from analysis.orbit.calibration_parameters import level_covariance
 from optics.geometry.pose import rotation_matrix
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.orbit.angle import LINES
+from scenes.specs.orbit.angle import three_lines
 from scenes.specs.orbit.flight import OrbitSpec, PassingSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from twin.orbit.calibration.campaign import Campaign, PassTruth, campaign_of, line_model
@@ -44,43 +44,47 @@ _DRIFT, _READING = 6, 7
 """Streams of a field's seed. What else is drawn of a field does not change with them."""
 
 
-def _sample_drift(spec: OrbitCalibrationSpec, seed: np.random.SeedSequence) -> FrozenMap[str, np.ndarray]:
+def _sample_drift(
+    spec: OrbitCalibrationSpec, lines: Sequence[str], seed: np.random.SeedSequence
+) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) true d_alpha, d_beta, d_gamma (radians) and d_f (metres) during one field; empty for no drift.
 
     The draws of a line are the same whatever their sigmas are.
 
     Args:
         spec: the test.
+        lines: names of the three lines.
         seed: of the field.
     """
     if not spec.drift:
         return FrozenMap({})
-    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(LINES), 4))
-    sigma = {name: np.array([*one.angles, one.focal_length]) for name, one in spec.drift.items()}
-    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(LINES, unit, strict=True)})
+    unit = np.random.default_rng(stream(seed, _DRIFT)).standard_normal((len(lines), 4))
+    sigma = {name: np.array([*one.angles, one.principal_distance]) for name, one in spec.drift.items()}
+    return FrozenMap({name: sigma.get(name, np.zeros(4)) * row for name, row in zip(lines, unit, strict=True)})
 
 
 def _sample_readings(
-    spec: OrbitCalibrationSpec, drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
+    spec: OrbitCalibrationSpec, lines: Sequence[str], drift: Mapping[str, np.ndarray], seed: np.random.SeedSequence
 ) -> FrozenMap[str, np.ndarray]:
     """Line -> (4,) what the monitor reads, in the same units; empty for no monitor.
 
     Args:
         spec: the test.
+        lines: names of the three lines.
         drift: the true one.
         seed: of the field.
     """
     if spec.monitor is None:
         return FrozenMap({})
-    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(LINES), 4))
+    noise = np.random.default_rng(stream(seed, _READING)).standard_normal((len(lines), 4))
     sigma = reading_sigma(spec) * spec.errors.switched_on
-    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(LINES, noise, strict=True)})
+    return FrozenMap({name: drift[name] + sigma * row for name, row in zip(lines, noise, strict=True)})
 
 
 def reading_sigma(spec: OrbitCalibrationSpec) -> np.ndarray:
     """(4,) standard deviation of the monitor's readings of a camera, radians and metres. The test has a monitor."""
     assert spec.monitor is not None
-    return np.array([*spec.monitor.angles, spec.monitor.focal_length])
+    return np.array([*spec.monitor.angles, spec.monitor.principal_distance])
 
 
 _LEAST_IMAGE = 0.02
@@ -115,7 +119,7 @@ def fly_fields(setup: CalibrationSetup, seed: np.random.SeedSequence, advance: A
         replace(p, known_truth=one.truth, readings=one.readings) for p, one in zip(campaign.passes, flown, strict=True)
     )
     images = tuple(one.images for one in flown if one.images is not None)
-    truth = FrozenMap({k: line_model(changed, k) for k in LINES})
+    truth = FrozenMap({k: line_model(changed, k) for k in three_lines(changed.lines)})
     return replace(campaign, passes=passes, images=images or None, known_truth=truth)
 
 
@@ -148,8 +152,9 @@ def _pass(
     imager: Imager | None,
 ) -> _Flown:
     """Fly and measure."""
-    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, seed)
-    readings = _sample_readings(spec, drift, seed)
+    named = three_lines(payload.lines)
+    pictures, drift = stream(seed, _PICTURES), _sample_drift(spec, named, seed)
+    readings = _sample_readings(spec, named, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
     trajectory = _trajectory(name, field, spec, earth)
@@ -164,11 +169,11 @@ def _pass(
     effects = light_effects(spec.effects)
     lines = max(int((trajectory.last - trajectory.first) / spec.line_time) - 1, 1)
     times = LineTimes.even(trajectory.first + 0.5 * spec.line_time, spec.line_time, lines)
-    sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in LINES}
+    sensors = {k: Sensor.of_lines(cameras[k], trajectory, earth, times, effects) for k in named}
     known, path = line_cameras(payload), TabulatedTrajectory(platform)
-    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in LINES}
-    models = FrozenMap({k: line_model(payload, k) for k in LINES})
-    pitch = FrozenMap({k: payload.pitch_of(k) for k in LINES})
+    laboratory = {k: Sensor.of_lines(known[k], path, earth, times, NO_EFFECTS) for k in named}
+    models = FrozenMap({k: line_model(payload, k) for k in named})
+    pitch = FrozenMap({k: payload.pitch_of(k) for k in named})
     pass_data = PassData(name, FrozenMap(laboratory), models, pitch, field.height)
     images = None
     if imager is None:
@@ -201,7 +206,7 @@ def _pass(
         drift,
     )
     datum = errors.datum if errors.switched_on else (0.0, 0.0, 0.0)
-    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(LINES, times)), points, ties, datum)
+    told = _measurements_of(name, platform, FrozenMap(dict.fromkeys(named, times)), points, ties, datum)
     return _Flown(told, readings, images, truth)
 
 

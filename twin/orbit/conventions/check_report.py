@@ -88,7 +88,7 @@ def _facts(run: Check) -> tuple[tuple[str, str], ...]:
         ("Image points", ", ".join(f"{name} {len(raw.line)}" for name, raw in images.items())),
         ("Attitude may be wrong by", f"{np.degrees(size.attitude) * 3600.0:.4g} arcsec about each axis"),
         ("Orbit may be wrong by", f"{size.position:.4g} m"),
-        ("Lines may be wrong by", f"{size.interior:.4g} px in place, {1e6 * size.scale:.4g} ppm in focal length"),
+        ("Lines may be wrong by", f"{size.interior:.4g} px in place, {1e6 * size.scale:.4g} ppm in principal distance"),
         ("Line times may be wrong by", f"{1e3 * size.time:.4g} ms"),
     )
 

@@ -94,16 +94,16 @@ def changed_payload(
     """The camera as it is after launch.
 
     Args:
-        spec: a test, whose ``changes`` name lines.
+        spec: a test, whose ``perturb`` names lines.
         payload: as the laboratory has measured it.
     """
     lines = {}
     for name, line in payload.lines.items():
-        if name in spec.changes:
-            change = spec.changes[name]
+        if name in spec.perturb:
+            change = spec.perturb[name]
             point = tuple(a + b for a, b in zip(line.principal_point, change.principal_point, strict=True))
-            focal = line.focal_length + change.focal_length
-            line = line.model_copy(update={"focal_length": focal, "principal_point": point})
+            focal = line.principal_distance + change.principal_distance
+            line = line.model_copy(update={"principal_distance": focal, "principal_point": point})
         lines[name] = line
     return payload.model_copy(update={"lines": FrozenMap(lines)})
 
@@ -122,7 +122,9 @@ def drifted_payload(payload: ThreeLineCameraSpec, drift: Mapping[str, np.ndarray
             rotation_matrix(np.array(line.rotate)) @ about_axis(0, beta) @ about_axis(1, alpha) @ about_axis(2, gamma)
         )
         rotate = tuple(Rotation.from_matrix(turn).as_rotvec().tolist())
-        lines[name] = line.model_copy(update={"rotate": rotate, "focal_length": line.focal_length + float(longer)})
+        lines[name] = line.model_copy(
+            update={"rotate": rotate, "principal_distance": line.principal_distance + float(longer)}
+        )
     return payload.model_copy(update={"lines": FrozenMap(lines)})
 
 
@@ -242,7 +244,7 @@ def _ideal_line(name: str, line: LineCameraSpec, pixels: int, pitch: float) -> L
         x, y = (_ccd_places(line, ccd, pixel, pixels, pitch) - np.array(line.principal_point)).T
         square = x**2 + y**2
         corrected = 1.0 + line.k1 * square + line.k2 * square**2
-        return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.focal_length)], axis=-1) @ to_body.T
+        return np.stack([-x * corrected, -y * corrected, np.full_like(y, line.principal_distance)], axis=-1) @ to_body.T
 
     pieces = []
     for ccd in line.ccds:
@@ -281,7 +283,7 @@ def _ccd_places(line: LineCameraSpec, ccd: CcdSpec | None, pixel: np.ndarray, pi
         return np.stack([np.zeros_like(straight), straight], axis=-1)
     if ccd.psi_x is not None and ccd.psi_y is not None:
         x, y = (np.tan(np.polynomial.polynomial.polyval(pixel, c)) for c in (ccd.psi_x, ccd.psi_y))
-        return np.array(line.principal_point) - line.focal_length * np.stack([x, y], axis=-1)
+        return np.array(line.principal_point) - line.principal_distance * np.stack([x, y], axis=-1)
     middle = (0.5 * (ccd.first + ccd.last) - 0.5 * (pixels - 1)) * pitch
     along, turn = straight - middle, ccd.rotate
     return np.stack([ccd.shift[0] - along * np.sin(turn), ccd.shift[1] + middle + along * np.cos(turn)], axis=-1)

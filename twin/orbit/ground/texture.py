@@ -92,12 +92,12 @@ def reflectance(extent: Extent, spec: TextureSpec, seed: np.random.SeedSequence,
     wild, plots, mask, ways = (stream(seed, k) for k in range(4))
     east, north = extent.axes(spec.spacing, _SPARE)
     shape = (len(north), len(east))
-    longest = max(0.5 * extent.side, 2.0 * spec.field_size)
-    relative = fractal_field(shape, spec.spacing, _EXPONENT, _WILD * spec.field_size, wild)
-    if spec.fields > 0.0:
+    longest = max(0.5 * extent.side, 2.0 * spec.parcel_size)
+    relative = fractal_field(shape, spec.spacing, _EXPONENT, _WILD * spec.parcel_size, wild)
+    if spec.parcels > 0.0:
         fields, covered = _fields(extent, spec, shape, (east[0], north[0]), plots, changed)
         where = fractal_field(shape, spec.spacing, 2.0, longest, mask)
-        covered &= where < np.quantile(where[::16, ::16], spec.fields)
+        covered &= where < np.quantile(where[::16, ::16], spec.parcels)
         del where
         # a field is even, with a little of the soil's own pattern
         relative[covered] = 0.97 * fields[covered] + 0.25 * relative[covered]
@@ -147,13 +147,13 @@ def _fields(
     """Fields' brightness, of zero mean and unit rms, and where there are any."""
     random = np.random.default_rng(seed)
     fields, covered = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
-    block = _BLOCK * spec.field_size
+    block = _BLOCK * spec.parcel_size
     columns, rows = (int(np.ceil(d / block)) + 1 for d in (extent.east - extent.west, extent.north - extent.south))
     for k in range(rows * columns):
         middle = np.array([extent.west + (k % columns) * block, extent.south + (k // columns) * block])
         turn = random.normal(0.2, 0.25)
         axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        for west, east, south, north in _split(0.5 * block, spec.field_size, random):
+        for west, east, south, north in _split(0.5 * block, spec.parcel_size, random):
             old, new, change = random.standard_normal(), random.standard_normal(), random.random()
             corners = _LANE * np.array([[west, south], [east, south], [east, north], [west, north]])
             corners += (1.0 - _LANE) * 0.5 * np.array([west + east, south + north])

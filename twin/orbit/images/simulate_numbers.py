@@ -95,8 +95,8 @@ MATCHED: Record[MatchedLine] = Record(
     Quantity("not_accepted", lambda line: line.lost, "reason -> number of points, the most frequent first"),
     Quantity("displacement_lines_px", lambda line: line.moved[0], "found minus predicted, along the track"),
     Quantity("displacement_pixels_px", lambda line: line.moved[1], "found minus predicted, along the line"),
-    Quantity("sigma_lines_px", lambda line: line.usual_sigma[0], "standard deviation along the track"),
-    Quantity("sigma_pixels_px", lambda line: line.usual_sigma[1], "standard deviation along the line"),
+    Quantity("displacement_lines_px_sigma", lambda line: line.usual_sigma[0], "standard deviation along the track"),
+    Quantity("displacement_pixels_px_sigma", lambda line: line.usual_sigma[1], "standard deviation along the line"),
     Quantity("consensus_scatter_px", lambda line: line.scatter, "of the displacements beyond their covariances"),
 )
 POINTS: Record[MatchedPoints] = Record(
@@ -126,7 +126,7 @@ def camera_data(camera: ThreeLineCameraSpec) -> dict[str, Any]:
         "Interior orientation of a line and its mounting in the body.",
         Quantity("pixels", camera.pixels_of),
         Quantity("pitch_m", camera.pitch_of),
-        Quantity("focal_length_m", lambda name: camera.lines[name].focal_length),
+        Quantity("principal_distance_m", lambda name: camera.lines[name].principal_distance),
         Quantity("principal_point_m", lambda name: camera.lines[name].principal_point),
         Quantity("k1_per_m2", lambda name: camera.lines[name].k1),
         Quantity("k2_per_m4", lambda name: camera.lines[name].k2),

@@ -269,9 +269,9 @@ def _facts(setup: SimulateSetup) -> tuple[tuple[str, str], ...]:
     )
     sun = f"{format_quantity(light.elevation, ANGLE)} high in {format_quantity(light.azimuth, ANGLE)}"
     changes = "; ".join(
-        f"{name} f {format_quantity(c.focal_length, LENGTH)}, "
+        f"{name} f {format_quantity(c.principal_distance, LENGTH)}, "
         f"x {format_quantity(c.principal_point[0], LENGTH)}, y {format_quantity(c.principal_point[1], LENGTH)}"
-        for name, c in test.changes.items()
+        for name, c in test.perturb.items()
     )
     bias = ", ".join(format_quantity(v, ANGLE) for v in test.errors.star_tracker.bias)
     return (

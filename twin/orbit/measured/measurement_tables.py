@@ -51,7 +51,10 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("role", text=True),
         *_PLACE,
         Column("sigma", LENGTH, needed=False, least=0.0, most=_LARGE),
-        *(Column(f"sigma_{axis}", LENGTH, needed=False, least=0.0, most=_LARGE) for axis in ("plan", "height", *"xyz")),
+        *(
+            Column(f"{axis}_sigma", LENGTH, needed=False, least=0.0, most=_LARGE, old=f"sigma_{axis}")
+            for axis in ("plan", "height", *"xyz")
+        ),
         *(Column(name, needed=False, least=-1.0, most=1.0) for name in _CORRELATIONS),
     ),
     "image_points": (
@@ -59,13 +62,13 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
         Column("camera", text=True),
         Column("line", least=-_MANY, most=_MANY),
         Column("pixel", least=-_MANY, most=_MANY),
-        Column("sigma_line", least=1e-6, most=1e3),
-        Column("sigma_pixel", least=1e-6, most=1e3),
+        Column("line_sigma", least=1e-6, most=1e3, old="sigma_line"),
+        Column("pixel_sigma", least=1e-6, most=1e3, old="sigma_pixel"),
         Column("correlation", needed=False, least=-0.999999, most=0.999999),
     ),
 }
 """Key of a pass -> columns of its table; `tie_points` has those of `image_points`."""
-_SIGMAS = (("sigma",), ("sigma_plan", "sigma_height"), ("sigma_x", "sigma_y", "sigma_z"))
+_SIGMAS = (("sigma",), ("plan_sigma", "height_sigma"), ("x_sigma", "y_sigma", "z_sigma"))
 _EARTH_AXES = np.array([6_378_137.0, 6_378_137.0, 6_356_752.314])
 CALIBRATING: Mapping[str, int] = {"control": 1, "check": 2}
 """Points without which there is no calibration, by role: in how many line cameras one of them must be seen."""
@@ -240,7 +243,7 @@ def _covariance(table: Table, place: Array) -> Array:
         raise InputError(Issue(f"no column {missing[0]!r}", table.file, int(table.lines[0]) - 1, allowed=allowed))
     correlated = [name for name in _CORRELATIONS if name in table]
     if correlated and ways[0] != _SIGMAS[2]:
-        text = "correlations go with sigma_x, sigma_y and sigma_z"
+        text = "correlations go with x_sigma, y_sigma and z_sigma"
         raise InputError(Issue(text, table.file, int(table.lines[0]) - 1, (table.heads[correlated[0]],)))
     for name in ways[0]:
         bad = np.flatnonzero((table[name] == 0.0) & (table["role"] == "control"))
@@ -331,7 +334,7 @@ def _image_points_of(
 
 def image_covariance(table: Table, rows: NDArray[np.intp]) -> Array:
     """Covariances of line and pixel in some rows of a table of image points, (n, 2, 2), pixels squared."""
-    a, b = table["sigma_line"][rows], table["sigma_pixel"][rows]
+    a, b = table["line_sigma"][rows], table["pixel_sigma"][rows]
     c = a * b * (table["correlation"][rows] if "correlation" in table else 0.0)
     return np.stack([np.stack([a * a, c], -1), np.stack([c, b * b], -1)], axis=1)
 
@@ -418,7 +421,7 @@ def _ground(points: GroundPoints) -> dict[str, Any]:
     alike = np.array_equal(points.covariance, sigma[:, 0, None, None] ** 2 * np.eye(3))
     if alike:
         return found | {"sigma [m]": sigma[:, 0]}
-    found |= _columns(("sigma_x [m]", "sigma_y [m]", "sigma_z [m]"), sigma)
+    found |= _columns(("x_sigma [m]", "y_sigma [m]", "z_sigma [m]"), sigma)
     scale = np.where(sigma > 0.0, sigma, 1.0)
     like = points.covariance / scale[:, :, None] / scale[:, None, :]
     pairs = {"correlation_xy": (0, 1), "correlation_xz": (0, 2), "correlation_yz": (1, 2)}
@@ -426,7 +429,7 @@ def _ground(points: GroundPoints) -> dict[str, Any]:
 
 
 def _images(images: Mapping[str, ImagePoints], ground: GroundPoints, chosen: np.ndarray) -> dict[str, Any]:
-    heads = ("point", "camera", "line", "pixel", "sigma_line", "sigma_pixel", "correlation")
+    heads = ("point", "camera", "line", "pixel", "line_sigma", "pixel_sigma", "correlation")
     found: dict[str, Any] = {head: [] for head in heads}
     for name, row in images.items():
         some = row.taken(chosen[row.point])

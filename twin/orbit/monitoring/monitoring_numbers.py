@@ -42,9 +42,9 @@ ANGLE: Record[MonitorRun] = Record(
     Quantity("true_change_arcsec", lambda run: _unsigned(run.angle_change), "true change since the reference"),
     Quantity("monitored_change_arcsec", lambda run: _unsigned(run.angle), "change by the monitor"),
     Quantity(
-        "monitored_change_sigma_arcsec", lambda run: _unsigned(run.angle_sigma), "standard deviation of its error"
+        "monitored_change_arcsec_sigma", lambda run: _unsigned(run.angle_sigma), "standard deviation of its error"
     ),
-    Quantity("monitored_change_sigma_noise_arcsec", lambda run: _unsigned(run.angle_noise), "of that the noise's part"),
+    Quantity("monitored_change_arcsec_sigma_noise", lambda run: _unsigned(run.angle_noise), "of that the noise's part"),
     Quantity("true_change_span_arcsec", lambda run: np.ptp(run.angle_change), "largest less smallest true change"),
 )
 SUMMARY: Record[CaseErrors] = Record(
@@ -103,9 +103,9 @@ SLOPES: Record[Array] = Record(
 )
 PROPAGATION: Record[MonitorRun] = Record(
     "Standard deviation of the mean height, and that of the noise against repeats at one time.",
-    Quantity("height_sigma_m", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
+    Quantity("height_m_sigma_noise", lambda run: _unsigned(run.sigma), "over the times, by the monitor's noise"),
     Quantity(
-        "height_total_sigma_m",
+        "height_m_sigma",
         lambda run: None if run.sigma_total is None else _unsigned(run.sigma_total),
         "over the times, of the whole error; null without a prior on disturbances",
     ),
@@ -146,7 +146,7 @@ SMOOTHING: Record[MonitorRun] = Record(
     Quantity("disturbances", lambda run: run.setup.disturbances and run.setup.disturbances.name, "name of the prior"),
     Quantity("cameras", _readings, "changes at the file's interval, with sigmas"),
     Quantity("height_error_m", lambda run: _unsigned(run.smoothed.error), "mean height error over the times"),
-    Quantity("height_sigma_m", lambda run: _unsigned(run.smoothed.sigma), "its standard deviation by the smoother"),
+    Quantity("height_m_sigma", lambda run: _unsigned(run.smoothed.sigma), "its standard deviation by the smoother"),
     Quantity("intervals", lambda run: [(run, *item) for item in run.smoothing.items()], record=SMOOTHED),
 )
 PART: Record[Array] = Record(
@@ -180,7 +180,7 @@ MONITOR: Record[MonitorRun] = Record(
     Quantity("height_camera_rms_m", lambda run: run.cases["interval"].camera_height_rms, "in height by the cameras"),
     Quantity("plan_rms_m", lambda run: run.cases["interval"].plan_rms, "RMS error in plan"),
     Quantity(
-        "metres_per_arcsec",
+        "height_m_per_arcsec",
         lambda run: run.conversion.of_angle,
         "of height for the intersection angle",
         converted=False,

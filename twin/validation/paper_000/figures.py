@@ -39,12 +39,12 @@ ELSEWHERE = (45.0, 120.0)
 PANELS = {
     "fig3": (("station", "alpha"), ("station", "beta")),
     "fig4": (("forward", "alpha"), ("nadir", "alpha")),
-    "fig5": (("nadir", "beta"), ("aft", "beta")),
+    "fig5": (("nadir", "beta"), ("backward", "beta")),
 }
 TITLES = {
     "fig3": "Fig. 3 again: errors of the station",
     "fig4": "Fig. 4 again: errors of the forward and nadir points in α",
-    "fig5": "Fig. 5 again: errors of the nadir and aft points in β",
+    "fig5": "Fig. 5 again: errors of the nadir and backward points in β",
 }
 
 
@@ -119,9 +119,9 @@ SENTENCES: tuple[Sentence, ...] = (
     Sentence("fig4.nadir_yz", "largest", "nadir", "alpha", YZ, ("x",)),
     Sentence("fig5.nadir_signs", "signs", "nadir", "beta", ("y",), XZ),
     Sentence("fig5.nadir_yz", "far", "nadir", "beta", YZ, ("x",)),
-    Sentence("fig5.aft_signs", "signs", "aft", "beta", ("z",), ("y",)),
-    Sentence("fig5.aft_x", "little", "aft", "beta", ("x",), YZ),
-    Sentence("fig5.aft_largest", "largest", "aft", "beta", ("z",), XY),
+    Sentence("fig5.aft_signs", "signs", "backward", "beta", ("z",), ("y",)),
+    Sentence("fig5.aft_x", "little", "backward", "beta", ("x",), YZ),
+    Sentence("fig5.aft_largest", "largest", "backward", "beta", ("z",), XY),
     Sentence("fig5.opposite", "opposite", "nadir", "alpha", AXES),
 )
 
@@ -407,7 +407,7 @@ def _show(context: Context, shown: Answers, places: Mapping[tuple[float, float],
     )
     rows = [
         (what, axis, *(float(shown.rises[what, angle, axis]) for angle in ("alpha", "beta")))
-        for what in ("station", "forward", "nadir", "aft")
+        for what in ("station", "forward", "nadir", "backward")
         for axis in AXES
     ]
     context.table(

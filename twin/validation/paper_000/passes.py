@@ -24,7 +24,7 @@ from twin.validation.checks.check import mean_of
 TEST = "angle"
 OFF_AXIS = "angle_off_axis"
 TRACED = "angle_gf7"
-PAIRS = (("forward", "nadir"), ("nadir", "aft"))
+PAIRS = (("forward", "nadir"), ("nadir", "backward"))
 """Of alpha and beta."""
 
 

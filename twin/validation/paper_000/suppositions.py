@@ -57,7 +57,7 @@ def _light(context: Context, passes: Passes) -> Iterator[CheckResult]:
     aberration = {"alpha": 1.0 - np.cos(looks["alpha"]), "beta": np.cos(looks["beta"]) - 1.0}
     predicted = {
         name: (speed * aberration[name] / ARCSEC, _refraction(passes, name, line) / ARCSEC)
-        for name, line in (("alpha", "forward"), ("beta", "aft"))
+        for name, line in (("alpha", "forward"), ("beta", "backward"))
     }
 
     def statement(what: str) -> str:
@@ -160,7 +160,7 @@ def _height(context: Context, flight: AnglePass) -> Iterator[CheckResult]:
     above = float(flight.earth.geodetic(flight.station)[2]) - flight.spec.terrain.height
     alpha = flight.look["alpha"]
     flat = above * ARCSEC / (np.sin(alpha) * np.cos(alpha))
-    for name, other in (("alpha", "forward"), ("beta", "aft")):
+    for name, other in (("alpha", "forward"), ("beta", "backward")):
         how = (
             f"The point in the middle of the nadir line is found in the {other} line's image by the rigorous "
             "sensor, that line is turned by 1 arcsec in pitch, and the two rays are intersected again. Over flat "

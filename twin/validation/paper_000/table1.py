@@ -192,8 +192,8 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
     together = _distance(np.array([ALPHA, BETA]) - bias, covariance)
     apart = _distance(np.array([-ALPHA, BETA]) - bias, covariance)
     distance = _distance(np.array([ALPHA, BETA]) - np.mean(own.values, axis=0), np.cov(own.values.T))
-    forward, nadir, aft = (_pitch_variance(data.light, line) for line in LINES)
-    simple = np.array([[forward + nadir, -nadir], [-nadir, nadir + aft]])
+    forward, nadir, backward = (_pitch_variance(data.light, line) for line in LINES)
+    simple = np.array([[forward + nadir, -nadir], [-nadir, nadir + backward]])
     how = (
         "By propagation of the points' errors and the exact effects on the light, as for the rows _own; correlation "
         f"{covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]):+.2f}. By the spread of "

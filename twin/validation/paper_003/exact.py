@@ -166,7 +166,7 @@ def _moved(setup: CalibrationSetup, one: FieldPass, line: str, interior: np.ndar
     point = spec.principal_point[0] + x, spec.principal_point[1] + y
     lines = {
         **payload.lines,
-        line: spec.model_copy(update={"focal_length": spec.focal_length + f, "principal_point": point}),
+        line: spec.model_copy(update={"principal_distance": spec.principal_distance + f, "principal_point": point}),
     }
     camera = line_cameras(payload.model_copy(update={"lines": FrozenMap(lines)}))[line]
     path = Turned(one.trajectory, bias)

@@ -195,7 +195,7 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
     value, sigma = median_of(height[:, 0] / flights.height_floor.mean(axis=1))
     how = (
         f"{_campaigns(flights)}. RMS {float(np.median(height[:, 0])):.2f} m. Below 1, because the thermal turn of "
-        "the star trackers from the forward to the aft image, 0.3″ of pitch or 1 m, goes into the calibrated "
+        "the star trackers from the forward to the backward image, 0.3″ of pitch or 1 m, goes into the calibrated "
         "interior; with the true one it stays in the heights. The numbers of Table 7 are lost."
     )
     yield context.check("003.scheme1.height").evaluate(value, sigma, how, 1.0)
@@ -214,9 +214,9 @@ def _height(context: Context, flights: Flights, setup: CalibrationSetup) -> Iter
 
 
 def _per_shift(setup: CalibrationSetup) -> float:
-    """Error of a height for a shift of the forward line along the track: flat ground, intersected with the aft line."""
+    """Error of a height for a shift of the forward line along the track: flat ground, met with the backward line."""
     line = setup.camera.lines["forward"]
-    turn = np.cos(line.look) ** 2 / line.focal_length
+    turn = np.cos(line.look) ** 2 / line.principal_distance
     return float(height_error(turn, setup.test.altitude / np.cos(line.look), 2.0 * line.look, line.look))
 
 
@@ -321,7 +321,7 @@ def _before(context: Context, flights: Flights) -> Iterator[CheckResult]:
         how = (
             f"{_campaigns(flights)}, with the laboratory's camera. How much a launch changes is not printed; "
             "biases of 25 to 40″ and changes of 50 to 95 µm in the interior, which are usual, are assumed. 100 m "
-            "in plan are 41″ of the look; in height they are 110 µm between x of the forward and the aft line."
+            "in plan are 41″ of the look; in height they are 110 µm between x of the forward and the backward line."
         )
         chosen = Chosen.power("what the launch changes, times", 1.0, "1", value)
         yield context.check(f"003.before.{what}").evaluate(value, sigma, how, inputs=[chosen])

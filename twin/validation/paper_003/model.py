@@ -197,7 +197,7 @@ def _yaw(context: Context, seed: np.random.SeedSequence) -> CheckResult:
         f"{len(ratios)} fields, each calibrated by itself from 60 control points, drawn with 0.3 px: no better than "
         f"003.model.points finds them in images. Largest error {float(np.max(np.abs(ratios))):.1f} sigmas. "
         f"Yaw of one field is known to {float(np.sqrt(np.mean(np.square(sigmas)))) / ARCSEC:.1f}″ only: it goes with y "
-        "of the forward and aft lines. In plan that does not show, for the two cancel."
+        "of the forward and backward lines. In plan that does not show, for the two cancel."
     )
     return context.check("003.model.bias.yaw").evaluate(rms, float(np.sqrt(0.5 / len(ratios))), how, 1.0)
 
