@@ -67,7 +67,9 @@ def _row(name: str, found: Differences) -> list[Cell]:
 
 
 def _warnings(comparison: Comparison) -> tuple[str, ...]:
-    """Of what makes a comparison doubtful: other versions, other warnings of the runs themselves."""
+    """Warnings of differences that make a comparison doubtful: other versions, other warnings of the runs
+    themselves.
+    """
     first = comparison.runs[0]
     out = []
     for name, run in zip(comparison.names[1:], comparison.runs[1:], strict=True):

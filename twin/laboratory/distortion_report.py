@@ -33,7 +33,7 @@ RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Of sigma of the principal point: a zero of the angles that moves it by more is told."""
+"""Share of the principal point's sigma; the report mentions a zero of the angles that moves the point by more."""
 
 
 def distortion_report(run: DistortionRun) -> Report:

@@ -79,7 +79,7 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
 def contradicted(
     stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
 ) -> tuple[str, ...]:
-    """The same of one measurement.
+    """A warning if the shifts of one measurement contradict the prior.
 
     Args:
         stated: what is stated to move, None for nothing.
@@ -165,5 +165,5 @@ def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
 
 
 def share_text(share: float) -> str:
-    """As sentences say it."""
+    """A share in per cent, for sentences."""
     return f"{plain(round(100.0 * share), 3)} %"

@@ -108,7 +108,7 @@ def _every_field(quality: ImageQuality) -> Table:
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
 TITLES = {"edge": "knife edge", "bars": "bars"}
 _DECIMALS = 4
-"""Of an MTF."""
+"""Decimals of an MTF."""
 
 
 def target_section(run: RenderRun, drawn: Mapping[str, str]) -> Section | None:

@@ -50,10 +50,10 @@ PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Fields of which results are named."""
 
 WAVELENGTH = 650e-9
-"""Of the waves in which wavefront errors are told, metres."""
+"""Wavelength that is the unit of wavefront errors, metres."""
 
 RINGS = 7
-"""Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
+"""Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
 _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
@@ -422,4 +422,4 @@ class _Mean:
 
 
 _SOME = 1e-3
-"""Of a stop's area, in units of its radius: what is darker has no mean."""
+"""Smallest lit area of a stop, in units of its radius squared, for which a mean is defined."""

@@ -96,7 +96,7 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
 
 
 def _recorded(state: StateFrames) -> tuple[datetime, ...]:
-    """Of all files; empty where one does not say."""
+    """Recording times of all files; empty if one file gives none."""
     found = [time for time, _ in state.origin if time is not None]
     return tuple(found) if found and len(found) == len(state.origin) else ()
 

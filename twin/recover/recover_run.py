@@ -68,7 +68,7 @@ class RecoverRun:
 
     @property
     def times(self) -> tuple[float, ...] | None:
-        """Of the states after, seconds; None for a single one."""
+        """Times of the states after, seconds; None for a single state."""
         return self.setup.test.times
 
     @property
@@ -78,9 +78,7 @@ class RecoverRun:
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """Of the states the one whose shifts agree least with the stated disturbances, and how they do; None without a
-        statement.
-        """
+        """The state whose shifts agree least with the prior, and its consistency; None without a prior."""
         found = [reading.recovery for reading in self.readings]
         if len(found) == 1:
             return None if self.last.consistency is None else (0, self.last.consistency)
@@ -233,7 +231,7 @@ def _measured(
 def _plain(
     setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """As the main job measures a state and a course, as many states at once as there."""
+    """Recover the states in the same way, and in the same portions, as the main job does."""
     before = np.stack([channel.before.frames for channel in channels])
     states = len(channels[0].after)
     smoother = _smoother(setup, bench)
@@ -256,7 +254,7 @@ def _plain(
 def _corrected(
     setup: MeasurementSetup, bench: _Bench, found: Sequence[ChannelMeasurement]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Of spots that have been measured channel by channel."""
+    """Recover states whose spots have been measured channel by channel."""
     calibration = bench.calibration
     if calibration is None:
         template = found[0].shape
@@ -277,7 +275,7 @@ def _corrected(
 
 
 def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
-    """Of a series of which is stated how it goes on in time."""
+    """Smoother of a series whose prior has time laws; None for a single state or without a prior."""
     times = setup.test.times
     if times is None or bench.disturbances is None:
         return None
@@ -299,7 +297,7 @@ def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
-    """Of spots that are numbered state by state."""
+    """Issues of spots that are numbered state by state."""
     out = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
@@ -328,8 +326,8 @@ def _worst(
     suspect: Callable[[SpotResult], tuple[float, ...] | None],
     first: int = 0,
 ) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Of each channel with suspect spots the worst: where, and what makes it so. `suspect` gives that, largest for the
-    worst, or None for nothing.
+    """The worst state of each channel with suspect spots: its place, and the numbers that make it suspect. `suspect`
+    gives these numbers, largest for the worst, or None.
     """
     for result in results:
         judged = (
@@ -368,7 +366,9 @@ def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, fir
 
 
 def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
-    """Of CCDs whose noise does not spread over the steps of their grey values, by data sheet or as measured."""
+    """Warnings of CCDs whose noise, from the data sheet or measured, is too small for the steps of their grey
+    values.
+    """
     if setup.test.photon_transfer == "stated":
         return told_of_steps(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"

@@ -60,7 +60,7 @@ class _Bench:
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """The same one under other stated disturbances."""
+        """This bench under another prior."""
         return _Bench(resolved, self._name, self)
 
 
@@ -94,7 +94,7 @@ class InstrumentTwin:
 
     @property
     def name(self) -> str:
-        """Of the instrument."""
+        """Name of the instrument."""
         return self.resolved.instrument.name
 
     @property
@@ -139,7 +139,7 @@ class InstrumentTwin:
         return self._bench.experiment.state(self.resolved.job)
 
     def perturbed(self, perturb: Mapping[str, Mapping[str, Any]]) -> InstrumentTwin:
-        """The same instrument with these bodies perturbed.
+        """Return this instrument with the given bodies perturbed.
 
         Args:
             perturb: node -> keys and unit strings of `perturb:` in a job's YAML, such as ``{"shift": "0 0 3 um"}``.
@@ -154,7 +154,7 @@ class InstrumentTwin:
         return twin
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
-        """The same instrument with other motions stated, on which `posterior` and all total sigmas rest.
+        """Return this instrument with another prior, on which `posterior` and all total sigmas rest.
 
         Args:
             disturbances: as `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's

@@ -340,7 +340,7 @@ def _states(coverage: Coverage) -> Section:
 
 
 PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, svg.YELLOW)
-"""Of the bodies that make up most; the others are grey."""
+"""Colours of the bodies with the largest shares; the others are grey."""
 MARKS = "os^vDP*X"
 
 
