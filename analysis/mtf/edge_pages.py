@@ -215,7 +215,7 @@ class _Stack:
         return cls(pages, line, fitted.spread, np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1)))
 
     def moved(self, line: Array) -> _Stack:
-        """This stack with its lines changed by the given amounts."""
+        """Stack of the same pages with its lines changed by the given amounts."""
         return replace(self, line=self.line + line)
 
     @property

@@ -88,7 +88,7 @@ class MonitorExperiment:
         return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
-        """This instrument, with everything computed for it, under the prior of another job.
+        """Experiment on the same instrument, with everything computed for it, under the prior of another job.
 
         Args:
             resolved: the job; its instrument, cameras and detector must be this one's.

@@ -101,7 +101,7 @@ class Reading:
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
-        """This row with its numbers replaced.
+        """Row of the same reading with its numbers replaced.
 
         Args:
             of: array of a number over the states -> what takes its place.

@@ -60,7 +60,7 @@ class _Bench:
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """This bench under another prior."""
+        """Bench of the same instrument under another prior."""
         return _Bench(resolved, self._name, self)
 
 

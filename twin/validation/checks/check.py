@@ -267,7 +267,7 @@ class CheckResult:
         return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
 
     def timed(self, seconds: float) -> CheckResult:
-        """This result with its computing time."""
+        """Result of the same check with its computing time."""
         return replace(self, seconds=seconds)
 
 
