@@ -69,7 +69,8 @@ def _print_result(run: RenderRun, console: Console) -> None:
     told = judge(run)
     print_verdict(console, told.verdict)
     print_whole(console, _table(run, console.width >= _WIDE))
-    console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
+    for line in (*told.more, f"{assumed(run.reading)}."):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:

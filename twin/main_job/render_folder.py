@@ -159,9 +159,9 @@ def render_report(
     )
     return report_page(
         Report(
-            f"{run.resolved.instrument.name}: what its monitor sees, and what it makes of it",
+            f"{run.resolved.instrument.name}: readings of its monitor",
             told.verdict,
-            (),
+            told.more,
             facts(run),
             summary,
             tuple(section for section in parts if section is not None),

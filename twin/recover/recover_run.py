@@ -138,9 +138,9 @@ def run_recover(
     ground = None if bench.calibration is None else bench.calibration.ground
     centroid = setup.test.analysis.centroid
     times = setup.test.times
-    source = f"the data sheet {setup.detector.name} says"
+    source = f"the data sheet {setup.detector.name} gives"
     if setup.test.photon_transfer == "measured":
-        source = "the frames in the dark and in even light say"
+        source = "the frames in the dark and in even light give"
     tables: Mapping[str, CameraCrosstalk] | None = None
     readings: list[MonitorReading] = []
     for k, one in enumerate(recoveries):
@@ -358,9 +358,9 @@ def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, fir
     state after that there is.
     """
     return tuple(
-        f"{where}: the spot has not the calibrated shape, reduced chi-square of its"
-        f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
-        " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        f"{where}: the spot does not have the calibrated shape, reduced chi-square of its"
+        f" core {chi:.2f} over {pixels} pixels; possible causes are defocus, a reflection too near to be separated, and"
+        " vibration (`vibration: fitted` allows for it); sigma does not cover the effect on the position"
         for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core, first)
     )
 
