@@ -296,8 +296,10 @@ def verdict(comparison: Comparison) -> list[str]:
         what = [f"{len(found.numbers)} numbers"] * bool(found.numbers) + [f"{len(found.arrays)} images"] * bool(
             found.arrays
         )
-        text = f"the run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} ({inputs} changed)"
-        parts.append(text)
+        parts.append(
+            f"the run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} "
+            f"({inputs} changed)"
+        )
         far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
             parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma")
