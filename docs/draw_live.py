@@ -19,7 +19,7 @@ from playwright.sync_api import sync_playwright  # noqa: E402
 from tests.twin.live_page import CHROMIUM, FLAGS, Page, running  # noqa: E402
 
 SIZE, SHOWN = (1360, 800), (1020, 600)
-"""Of the window and of the picture, pixels."""
+"""Sizes of the window and of the picture, pixels."""
 FRAME_MS = 110
 DESPACE, TURN = "base/forward/M2 shift z", "base/backward/focal_plane rotate z"
 

@@ -297,15 +297,15 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
 
 
 UNSEEN = 0.1
-"""Of the noise of a shift: a standard deviation of a motion that moves spots by less has next to no derivative."""
+"""Share of the noise of a shift. The derivative by a motion that moves spots by less is nearly zero."""
 SHARE = 0.01
-"""Of the variance of a quantity, from which an unseen body is told of."""
+"""Share of the variance of a quantity from which an unseen body is reported."""
 DEGREES = 4.0
 """Degrees of freedom of Student's distribution, for numbers that nobody measured."""
 _DRAWS = 8_000
 _HALVINGS = 40
 _LEVELS = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
-"""Of 1, 2 and 3 standard deviations of a normal error."""
+"""Levels of 1, 2 and 3 standard deviations of a normal error."""
 
 
 @dataclass(frozen=True, eq=False)

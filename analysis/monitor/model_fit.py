@@ -40,7 +40,7 @@ _ROUNDING = 1e-6
 
 
 class RankError(MeasurementError, ValueError):
-    """The motions cannot be told apart by the spots.
+    """The spots cannot separate the motions.
 
     `null_vectors` (K, P): combinations of motions that move no spot.
     """
@@ -109,7 +109,7 @@ class MotionReport:
 
 @dataclass(frozen=True, eq=False)
 class ObservabilityReport:
-    """What M motions look like to the spots, and which of them can be told apart.
+    """Response of the spots to M motions, and which of the motions are separable.
 
     Attributes:
         rank: of the noise-weighted, unit-scaled signatures of all motions.
@@ -132,7 +132,7 @@ def observability(
     covariance: ArrayLike,
     family: Sequence[int],
 ) -> ObservabilityReport:
-    """What can be told apart.
+    """Which motions are separable.
 
     Raises RankError if the family itself is degenerate.
 
@@ -217,7 +217,7 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
             )
             continue
         if report.explained > 1 - 1e-6:
-            text = "cannot be told from the family"
+            text = "is not separable from the family"
         else:
             text = f"is {100 * report.explained:.3g}% like the family and leaves a residual"
         amounts = [(float(a), other) for a, other in zip(report.imitation, family, strict=True)]
@@ -225,8 +225,9 @@ def _statements(reports: list[MotionReport], family: list[str], rank: int, coord
         mix = _sum(sorted(shown, key=lambda item: -abs(item[0]) * reach[item[1]])) or "nothing"
         floor = _NEGLIGIBLE * float(np.max(np.abs(np.concatenate([_table(report.reported), _table(report.true)]))))
         lines.append(
-            f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model says"
-            f" {_show(report.reported, floor) or 'no change'}; true is {_show(report.true, floor) or 'no change'}."
+            f"{name}: {text}; one unit moves a spot by {reach[name]:.3g} px and reads as {mix}: the model gives"
+            f" {_show(report.reported, floor) or 'no change'}; the true change is "
+            f"{_show(report.true, floor) or 'none'}."
         )
     return lines
 

@@ -1,8 +1,8 @@
 """What the fits of all spots of a measurement say together: does sigma hold, by how much was it widened, and why.
 
-Three things make spots other than fitted, and they are told apart by where it shows: noise that is not the data sheet's
-is in every pixel of every frame, a shape in the core of a spot alone, and a shape that is calibrated wrongly in the
-spots before as in those after.
+Three causes make spots differ from the fit, and the place of the difference separates them. Noise that differs from
+the data sheet is in every pixel of every frame, a changed shape in the core of a spot alone, and a wrongly calibrated
+shape in the spots before as in those after.
 """
 
 from __future__ import annotations
@@ -117,20 +117,21 @@ class SpotEvidence:
         if all(_noisy(one, k) for one, beyond in ((first, off[0]), (last, off[1])) for k in spots if beyond[k]):
             cause = NOISE
             why = (
-                f"the noise of the frames is {np.sqrt(noise):.3g} times what the data sheet says, beside the spots as "
-                "in them: another gain, read-out noise or number of bits, or light that varies"
+                f"the noise of the frames is {np.sqrt(noise):.3g} times that of the data sheet, both beside the spots "
+                "and in them: another gain, read-out noise or number of bits, or light that varies"
             )
         elif np.any(off[0]):
             cause = BEFORE
             why = (
-                "already the spots before have not the calibrated shape: a camera that is blurred or aberrated "
+                "the spots before do not have the calibrated shape either: a camera that is blurred or aberrated "
                 "otherwise than calibrated, a reflection, or stray light"
             )
         else:
             cause = AFTER
             why = (
-                "the spots have another shape than calibrated: what has moved blurs or aberrates them, or a reflection "
-                "or stray light is in them, and a place on a changed spot is not that of the calibrated one"
+                "the shape of the spots differs from the calibration: a motion blurs or aberrates them, or they "
+                "contain a "
+                "reflection or stray light, and a position on a changed spot is not that on the calibrated one"
             )
         named = ", ".join(names[k] if names else str(k) for k in spots)
         limit = float(own.core_limit[0, worst[1]]), float(own.whole_limit[0, worst[1]])
@@ -139,11 +140,11 @@ class SpotEvidence:
             f"(limit {limit[1]:.2f}, false-alarm rate {FALSE_ALARM:g} a fit)"
         )
         text = (
-            f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of their places was "
-            f"widened up to {_number(worst[0])} times, which cannot hold what a changed shape does to the readings"
+            f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of their positions "
+            f"was widened up to {_number(worst[0])} times, which does not cover the effect of a changed shape"
             if cause != NOISE
-            else f"σ does not hold as stated: the fit of the spots {named} is not good, {size}; {why}. The noise of "
-            f"their places was widened up to {_number(worst[0])} times"
+            else f"σ does not hold: the fit of the spots {named} is not good, {size}; {why}. The noise of "
+            f"their positions was widened up to {_number(worst[0])} times"
         )
         return SpotDoubt(cause, spots, worst[0], text)
 

@@ -380,7 +380,7 @@ def _check_filled(
 
 
 FALSE_ALARM = 1e-4
-"""Of pages being refused in which the bars do not move."""
+"""Rate at which pages are refused although the bars do not move in them."""
 _ROUGH = 0.3
 """Noise of a pixel over the step of its grey values below which rounding is no noise: a tenth of it stays."""
 

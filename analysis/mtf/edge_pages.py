@@ -30,9 +30,9 @@ __all__ = ["different_pages", "grey_step", "left_over", "mean_page", "measure_pa
 
 Array = NDArray[np.float64]
 FALSE_ALARM = 1e-4
-"""Of pages being laid over each other although the edge does not move in them."""
+"""Rate at which pages are aligned although the edge does not move in them."""
 MOST_PIXELS = 4_000_000
-"""Of all pages together where they are laid over each other: the fit needs some 250 bytes for each."""
+"""Largest number of pixels of all pages together when they are aligned: the fit needs some 250 bytes for each."""
 _STEPS = 30
 _SETTLED = 2
 """Steps after which the places of pages are near enough to tell whether they turn, too."""
@@ -140,7 +140,7 @@ class _Run:
         shift: _Shift,
         aligned: bool,
     ) -> EdgeMtf:
-        """Of pages (1, H, W), their mean, or (P, H, W), laid over each other; every one is the mean of some frames."""
+        """Result of pages (1, H, W), their mean, or (P, H, W), aligned; each page is the mean of some frames."""
         count = len(stack.line)
         rounded = [left_over(rms, self.step) for rms in shift.page_noise]
         found = slanted_edge.edge_result(
@@ -186,7 +186,7 @@ class _Shift:
 
     @property
     def p_value(self) -> float:
-        """Of chi-square; 1 for a single page."""
+        """Probability of a larger chi-square; 1 for a single page."""
         return float(stats.chi2.sf(self.chi_square, 2 * (len(self.line) - 1))) if len(self.line) > 1 else 1.0
 
     @property
@@ -215,7 +215,7 @@ class _Stack:
         return cls(pages, line, fitted.spread, np.tile([fitted.spread.dark, fitted.spread.contrast], (len(pages), 1)))
 
     def moved(self, line: Array) -> _Stack:
-        """The same with lines that are changed by so much."""
+        """Stack of the same pages with its lines changed by the given amounts."""
         return replace(self, line=self.line + line)
 
     @property
@@ -225,7 +225,7 @@ class _Stack:
         return np.arange(rows) - (rows - 1) / 2.0
 
     def distance(self) -> Array:
-        """Of all pixels from the edge in their page, along its normal, (P, H, W), px."""
+        """Distance of all pixels from the edge in their page, along its normal, (P, H, W), px."""
         offset, slope = self.line[:, :1, None], self.line[:, 1:, None]
         column = np.arange(self.pages.shape[2])
         return np.asarray((column - offset - slope * self.along[:, None]) * np.cos(np.arctan(slope)))

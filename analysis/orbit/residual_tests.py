@@ -36,7 +36,9 @@ _LEAST_REDUNDANCY = 10.0
 _UNCHECKED = 1e-6
 _LARGEST_RATIO = 0.9
 LARGEST_FACTOR = 1e2
-"""Of a variance; its inverse is the smallest. Sigmas that are ten times wrong are no matter of weights any more."""
+"""Largest factor on a variance; the smallest is its inverse. Weights cannot correct sigmas that are wrong by more than
+a factor of ten.
+"""
 
 
 def standardised(equations: Equations, cofactors: Array, weights: Weights) -> Array:
@@ -147,11 +149,11 @@ def extrapolated(factors: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 FALSE_ALARM = 5e-5
-"""Of each of the two tests of a run, rates and courses, over all fields together: 1e-4 a run."""
+"""False-alarm rate of each of the two tests of a run, rates and courses, over all fields together: 1e-4 a run."""
 _WAVES = 4
 _POINTS_PER_WAVE = 4
 _RANK = 1e-9
-"""Of the largest eigenvalue of S: a term that the unknowns imitate is told by no residual."""
+"""Smallest eigenvalue of S that counts, relative to the largest. No residual shows a term that the unknowns imitate."""
 
 
 @dataclass(frozen=True, eq=False)

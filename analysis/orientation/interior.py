@@ -354,7 +354,8 @@ def _model(values: Array, position: Array) -> tuple[Array, Array, Array]:
 
 
 def line_orientation(fit: InteriorOrientation) -> LineOrientation:
-    """The same points and noise in these terms, by least squares in the image, all points alike.
+    """Convert an interior orientation to principal distance, principal point and k1 of a line, by least squares in the
+    image at the same points with equal weights.
 
     Args:
         fit: with constant, principal_distance, principal_point and radial3 and no other terms, which it starts from.

@@ -209,7 +209,7 @@ class Distortion:
 
     @property
     def sigma(self) -> Array:
-        """Of D, (N,), metres."""
+        """Standard deviation of D, (N,), metres."""
         return np.sqrt(np.maximum(np.diagonal(self.fit.residual_covariance), 0.0))
 
     @property

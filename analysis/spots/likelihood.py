@@ -45,7 +45,7 @@ _HALVINGS = 6
 EDGE_PX = 10.0
 """Least distance of a spot's centre from the outermost pixel centres."""
 CORE_SHARE = 0.02
-"""Of a spot's peak, above which a pixel belongs to its core."""
+"""Share of a spot's peak above which a pixel belongs to its core."""
 
 
 def maximum_likelihood_fit(

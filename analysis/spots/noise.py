@@ -40,8 +40,8 @@ class FurtherNoise(Protocol):
         ...
 
     def temporal_variance_e2(self, electrons: Any) -> Any:
-        """Of what is new in every frame, where a pixel holds that many electrons on the average, dark signal
-        included; a number, or an array of the shape of ``electrons``.
+        """Variance of the noise that is new in every frame, electrons squared, for a mean number of electrons per
+        pixel, dark signal included; a number, or an array of the shape of ``electrons``.
         """
         ...
 
@@ -143,7 +143,7 @@ class NoiseModel:
         return self.gain_dn_per_e * self.dark_noise_e < rounding.FINE
 
     def rounding_variance_dn2(self, mean_signal_dn: NDArray[np.float64] | float) -> Any:
-        """Of the variance of a frame what rounding does to every frame of an image alike, DN^2; shape of
+        """Part of the variance of a frame that rounding causes alike in all frames of an image, DN^2; shape of
         mean_signal_dn. It does not fall with the number of frames.
         """
         if not self._rounds_coarsely:

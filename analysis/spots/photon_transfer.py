@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _HOT_SIGMAS = 10.0
 _RESPONSE = (0.5, 1.5)
-"""Of a pixel that can be used, over that of the others."""
+"""Range of the response of a usable pixel, relative to that of the others."""
 _NOTHING = 1e-12
 """DN^2 that rounding may hide and nobody would see."""
 _LEAST_LIGHT = 10.0

@@ -62,8 +62,8 @@ def systematic_variance(electrons: ArrayLike, read_e2: ArrayLike, gain: float) -
 
 
 def temporal_part(variance: float) -> float:
-    """Of a variance of grey values over frames the part that rounding made, DN^2, in the mean over all places between
-    two steps, if the noise before rounding is normal.
+    """Part of the variance of grey values over frames that rounding causes, DN^2. It is the mean over all places
+    between two steps, for normal noise before rounding.
 
     Args:
         variance: DN^2.

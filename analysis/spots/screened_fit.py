@@ -35,12 +35,14 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _REST_PX, _MOST_STEPS = 1e-6, 60
 _REST_SIGMAS = 1e-4
-"""Of other spots, which may be so faint that their places are known to a part of a pixel only."""
+"""Largest last step of other spots, in sigmas. They may be so faint that their positions are uncertain by part of a
+pixel.
+"""
 _FLUX_SIGMAS = 5.0
 _MOST_SMEAR = 25.0
 """Px^2; a spot that is smeared by more is another one."""
 CORE_SHARE = 0.02
-"""Of the peak: where the shape of the spot is judged."""
+"""Share of the peak above which the shape of the spot is judged."""
 
 
 @dataclass(frozen=True)
@@ -259,8 +261,8 @@ def fit_screened(
 
 
 def model_parts(fit: ScreenedFit, template: SpotTemplate) -> tuple[Array, Array, Array]:
-    """Of the fitted image: its derivatives (K, P) by all parameters, what of it is neither the spot nor its level (P,)
-    DN, and the derivatives (K, P) of that.
+    """Parts of the fitted image: its derivatives (K, P) by all parameters; the part (P,), DN, that is neither the spot
+    nor its level; and the derivatives (K, P) of that part.
 
     Args:
         fit: of a spot.

@@ -98,9 +98,11 @@ _BESIDE = np.array([-1.0, 4.0, 0.0, 4.0, -1.0]) / 6.0
 _NEAR_SPOT_PX = 15.0
 """Pixels of a line so near to the spot do not judge it."""
 _LINE_SHARE = 0.4
-"""Of the pixels of a column or row: if so many are bad, all are."""
+"""Share of bad pixels of a column or row from which all its pixels count as bad."""
 _ABOVE_RING = 6.0
-"""Of a reflection over what else is left over at the same distance from the spot, in its own scatter."""
+"""Smallest height of a reflection over the other residuals at the same distance from the spot, in units of their
+scatter.
+"""
 _EDGE_LIGHT_PX = 12.0
 """Radius of what is left out about a light that the shape cannot be fitted to."""
 _LEAST_SHARE = 5.0
@@ -480,5 +482,5 @@ def _told(bad: Mask, edges: Mask, fit: ScreenedFit, first: tuple[int, int]) -> l
 
 
 def _rms(moment: float) -> str:
-    """Of a smear by its second moment, px^2; one that is less than another by so much has a minus."""
+    """RMS width of a smear from its second moment, px^2; negative for a smear that is smaller than another."""
     return f"{math.copysign(math.sqrt(abs(moment)), moment):.2f}"

@@ -42,7 +42,7 @@ from analysis.turntable import angle_fits
 
 Array = NDArray[np.float64]
 FEWEST = 3
-"""Of fewer readings none is rejected: two deviate by the same amount."""
+"""Fewest readings of which one can be rejected: two readings deviate by the same amount."""
 
 
 def limit(n: ArrayLike) -> Array:
@@ -120,7 +120,7 @@ def _scaled(n: int) -> float:
 
 
 FALSE_ALARM = 1e-3
-"""Of `CalibrationSeries.suspect` in a series without gross errors."""
+"""False-alarm rate of `CalibrationSeries.suspect` in a series without gross errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,14 +253,16 @@ class CalibrationSeries:
 
     @property
     def noise_sigma(self) -> Array:
-        """Of each mean by the scatter of the repeats, (N,), radians; of suspect angles by their own RMS."""
+        """Standard deviation of each mean from the scatter of the repeats, (N,), radians; of suspect angles from their
+        own RMS.
+        """
         single = np.where(self.suspect, self.rms_after, self.repeatability)
         return np.asarray(single / np.sqrt(self.keep.sum(axis=1)))
 
     @property
     def sigma(self) -> Array:
-        """Of each mean as a measure of the dividing error: scatter and the reference, (N,), radians; at least the
-        rounding of the angles, which is what is left in a series without noise.
+        """Standard deviation of each mean as a measure of the dividing error, (N,), radians: scatter and the reference.
+        It is at least the rounding of the angles, which remains in a series without noise.
         """
         rounding = np.spacing(np.max(np.abs(self.angle)))
         return np.asarray(np.maximum(np.hypot(self.noise_sigma, self.reference_sigma), rounding))

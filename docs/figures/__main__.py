@@ -23,7 +23,7 @@ def main(
     """Measure the figures that pages quote, write docs/figures/figures.yaml, and put them into the pages.
 
     Those of the papers' checks are read from docs/validation, which a full run of twin.validate makes; the others are
-    measured here, which takes some minutes.
+    measured here; the studies among them take half an hour.
 
     Example: python -m docs.figures --only launch
     """

@@ -13,6 +13,8 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
+from docs.figures.studies import STUDIES, Read
+
 ROOT = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_name("figures.yaml")
 SUMMARY = ROOT / "docs/validation/README.md"
@@ -78,10 +80,6 @@ CHECKS: Mapping[str, tuple[int, float, str]] = {
     "004.table2.reduction": (0, 1.0, "%"),
 }
 """Check of a paper -> decimals, factor from the summary's unit, unit."""
-
-
-Read = Callable[[Path], float]
-"""Run folder -> a number in it."""
 
 
 def _at(file: str, *keys: str, per: float = 1.0) -> Read:
@@ -198,6 +196,7 @@ RUNS: Mapping[tuple[str, ...], Mapping[str, tuple[int, str, Read]]] = {
     ("twin.uncertainty", "gf7_pair", "--disturbances", "launch"): {
         name: one for name, one in _limits("after_launch").items() if not name.endswith("paper_single")
     },
+    **STUDIES,
 }
 """Command that makes a run folder -> its figures: decimals, unit, and how it is read there."""
 
@@ -229,16 +228,25 @@ def of_validation(summary: str) -> dict[str, Figure]:
     return out
 
 
+def _modules() -> dict[str, tuple[Callable[[], Mapping[str, tuple[float, int, str]]], int | None]]:
+    """Beginning of the names of figures that no command writes -> what measures them (value, decimals, unit), and the
+    seed of its random numbers. The modules are imported here, since they need what ``setup.sh --test`` installs.
+    """
+    from docs.figures import ccd_growth, libraries
+
+    return {"ccd": (ccd_growth.measured, ccd_growth.SEED), "libraries": (libraries.measured, libraries.SEED)}
+
+
 def measure(known: Mapping[str, Figure], only: str = "") -> dict[str, Figure]:
     """All figures, those anew whose names begin with ``only``."""
     out = dict(known) | {k: v for k, v in of_validation(SUMMARY.read_text("utf-8")).items() if k.startswith(only)}
-    if "libraries".startswith(only) or only.startswith("libraries"):
-        from docs.figures.libraries import SEED, measured
-
-        for name, (value, digits, unit) in measured().items():
-            out[name] = Figure(
-                float(f"{value:.3g}"), None, unit, digits, "python -m docs.figures --only libraries", SEED
-            )
+    for name, (find, seed) in _modules().items():
+        if name.startswith(only) or only.startswith(name):
+            command = f"python -m docs.figures --only {name}"
+            for key, (value, digits, unit) in find().items():
+                out[key] = Figure(
+                    float(f"{value:.{3 if name == 'libraries' else 6}g}"), None, unit, digits, command, seed
+                )
     for words, wanted in RUNS.items():
         if not any(name.startswith(only) for name in wanted):
             continue

@@ -153,9 +153,12 @@ def index_page() -> str:
     ]
     return f"""# Space camera twin
 
-A physically rendered digital twin of space mapping cameras and of the autocollimation monitor that watches them in
-orbit. Begin with the [overview](README.md): two commands and what they show. Then a guide to what you want to do, and
-the reference, where every command, key, node and file is said.
+This digital twin simulates space mapping cameras, the autocollimation monitor that watches them in orbit, the
+laboratory that calibrates them and the passes over test fields that check them.
+
+- **New here**: the [overview](README.md) has two commands, a first job and the main results.
+- **Guides** explain one task each. The notebooks show the same tasks in Python.
+- **Reference** lists every command, every key of every file, every node and every file of a run folder.
 
 {chr(10).join(trees)}
 """

@@ -59,7 +59,7 @@ def file_pages() -> dict[str, str]:
 
 
 def title(kind: str) -> str:
-    """Of a sort of file."""
+    """Title of a kind of file."""
     return kind.replace("_", " ").capitalize()
 
 

@@ -18,7 +18,7 @@ from twin.run.lock_file import FOLDER, Locked, normal, read_lock
 TABLE = Path(__file__).with_name("licences.csv")
 CARRIED = Path(__file__).with_name("carried.csv")
 BY_HAND = "its licence file, read by a person"
-"""Of rows that no rule below gives; they stay while the version does."""
+"""Source of rows that no rule below gives; such rows stay while the version does."""
 OTHER_NAMES = {
     "apache 2": "Apache-2.0",
     "apache 2.0": "Apache-2.0",

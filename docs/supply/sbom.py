@@ -23,7 +23,7 @@ from docs.supply.make_lock import ROOT, SupplyError
 from twin.run.lock_file import FOLDER, LAYERS, read_lock
 
 EPOCH = datetime(1980, 1, 1, tzinfo=UTC)
-"""Of every bill: the same lock gives the same bytes. When it was made is the lock's own history."""
+"""Time stamp of every bill: the same lock gives the same bytes. The history of the lock gives the real date."""
 
 
 def bill(layers: Iterable[str] = LAYERS, folder: Path = FOLDER) -> str:

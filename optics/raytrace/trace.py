@@ -133,8 +133,9 @@ below 1e-3, so that each step gains at least six digits; three reach rounding. A
 invalid."""
 
 FURTHER_STEPS = 2
-"""As many further Newton steps for a surface with further terms of its sag, and for an aspheric face of a lens, which
-may depart by millimetres."""
+"""Additional Newton steps for a surface with further terms of its sag, and for an aspheric face of a lens, which may
+depart by millimetres.
+"""
 
 SECTION = 6
 """Elements that one kernel traces, and differentiates: the time to compile it grows faster than its length, and

@@ -21,17 +21,17 @@ from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate, without
 from optics.waves.pupil_stack import products, to_terms
 
 DEGREE = 10
-"""Of the polynomials from the stop to a surface."""
+"""Degree of the polynomials that map the stop to a surface."""
 
 ROUND_SIDES = 48
-"""Of the polygon that stands for a round edge and has its area."""
+"""Sides of the polygon that approximates a round edge and has its area."""
 
 _ANGLE = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
 _DISK = np.sqrt(_ANGLE[1] / np.sin(_ANGLE[1])) * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
 """The polygon of a disk of radius 1, (ROUND_SIDES, 2)."""
 
 MOST_PIECES = 120
-"""Of a shadow: the time of a transfer function grows with the square of their number."""
+"""Most pieces of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
 """Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
@@ -214,7 +214,7 @@ def _divided(corners: np.ndarray) -> np.ndarray:
 
 
 _PARTS = 8
-"""Of each side of a rectangle."""
+"""Parts into which each side of a rectangle is divided."""
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -136,7 +136,7 @@ def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
     if references is None:
         owner, references = start, () if start.disturbances in (None, NONE) else (str(start.disturbances),)
     if not references:
-        problem = f"nothing is stated to move in {start.name}"
+        problem = f"there is no prior on disturbances in {start.name}"
         raise design.error(problem, ("disturbances",), allowed="disturbances files, by name or path")
     stated = {}
     for k, reference in enumerate(references):

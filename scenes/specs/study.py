@@ -363,7 +363,7 @@ class ResponseSpec(Spec):
         key: where in the results: the run folder's JSON file without .json, then its keys and list indices.
         unit: of the number; read from the ending of its key if it is not given.
         sigma: where its standard deviation stands, if the results have one: of all that is stated, for readings of the
-            monitor noise and what may have moved and cannot be told apart.
+            monitor noise and motions that the spots cannot separate.
         noise: where its standard deviation by the noise of the run alone stands, which differs from run to run; for
             readings of the monitor the key that ends in ``_sigma_noise``.
         minus: where a number stands that is subtracted: an error is what is recovered minus what is true.

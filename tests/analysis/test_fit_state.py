@@ -76,7 +76,7 @@ def test_another_shape_is_found_and_widened(fit, good, clean) -> None:
     assert told.cause == AFTER
     assert told.spots == (0, 1, 2, 3)
     assert "a, b, c, d" in told.text
-    assert "another shape" in told.text
+    assert "differs from the calibration" in told.text
     told = SpotEvidence(states.reshaped(4), before).doubt(0)
     assert told.cause == BEFORE
 

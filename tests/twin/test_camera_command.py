@@ -270,7 +270,7 @@ def test_the_command_refocuses(blurred, monkeypatch) -> None:
 
 def test_a_diffraction_limited_camera_says_so(backend) -> None:
     run = run_camera(resolve_camera("gf7"), backend)
-    text = verdict(run)
+    text = " ".join(verdict(run))
     assert text.startswith("Diffraction limited over the whole field: the worst wavefront error is 0.0363 waves rms")
     assert "at field (1.25, 0.15) deg, most of it astigmatism (0.0345)" in text
     numbers = CAMERA(run)

@@ -30,7 +30,7 @@ from twin.run.cli import heartbeat
 from twin.run.command import add_test
 from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, BenchError
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 
 FILE = "name: levels\nreadings: 5\nsigma_arcsec: 0.5\nseed: 3\n"
@@ -98,16 +98,19 @@ def report(run: LevelRun) -> Report:
     )
 
 
-@pytest.mark.parametrize("verdict", ["", "No full stop", "One sentence. And another.", "Is it? No."])
-def test_a_verdict_is_one_sentence(verdict: str) -> None:
+@pytest.mark.parametrize("verdict", ["", "No full stop", "One sentence. And another. And more.", "Is it? No. Yes."])
+def test_a_verdict_is_two_sentences_at_most(verdict: str) -> None:
     table = Table("readings", "Readings", "", ("number",), [])
-    with pytest.raises(ValueError, match="not one sentence"):
+    with pytest.raises(ValueError, match="not one or two sentences"):
         Report("Level", verdict, (), (), table, ())
 
 
-def test_statements_become_one_sentence() -> None:
-    assert one_sentence("Heights err by 3 m.", "", "The rest is 0.5 m") == "Heights err by 3 m; the rest is 0.5 m."
-    assert one_sentence("It is.", "MTF falls", "Δα is read") == "It is; MTF falls; Δα is read."
+def test_statements_become_a_verdict_and_what_follows_it() -> None:
+    assert answer("Heights err by 3 m.", "", "the rest is 0.5 m") == ("Heights err by 3 m. The rest is 0.5 m.", ())
+    assert answer("it is", "MTF falls", "Δα is read", "base/forward moves") == (
+        "It is. MTF falls.",
+        ("Δα is read.", "base/forward moves."),
+    )
 
 
 LEVEL = Procedure("level", LevelSetup, resolve, measure, numbers, report, about="Read a level.", varied=True)

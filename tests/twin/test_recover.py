@@ -63,7 +63,7 @@ def test_rendered_frames_give_the_main_jobs_numbers_to_the_last_digit(run, image
     assert {key: numbers[key] for key in expected} == expected
     assert found.last.recovered_dict() == run.recovered_dict()
     report = recover_report(found)
-    assert "the frames are clean" in report.verdict
+    assert "The frames are clean." in report.lead
     assert "truth" not in report.verdict
 
 

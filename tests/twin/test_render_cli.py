@@ -328,7 +328,7 @@ def test_the_table_is_readable_in_a_narrow_terminal(repeated):
     assert len(table) == 2 * 4 + 1 + 3
     assert max(len(line) for line in table) <= 80
     # what the sigmas assume stands below it
-    assert "σ: noise and the stated disturbances launch; the shifts agree with them (chi-square" in other.stdout
+    assert "σ: noise and the prior launch; the shifts agree with it (chi-square" in other.stdout
 
 
 @pytest.mark.slow

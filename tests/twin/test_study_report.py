@@ -9,7 +9,6 @@ import pytest
 
 from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
-from twin.run.report import one_sentence
 from twin.study.report import study_plots
 from twin.study.report.study_report import report_files
 from twin.study.report.study_statistics import StudyRuns
@@ -33,7 +32,7 @@ def page(folder, study, values, failed=None) -> str:
     first = re.search(r"<p[^>]*>(.*?)</p>", text, re.DOTALL)
     assert first is not None
     assert html.unescape(first[1]) == verdict
-    assert one_sentence(*verdict.split(". ")) == verdict
+    assert len(re.findall(r"\.\s+[A-Z]", verdict)) <= 1
     words = re.sub(r"<svg.*?</svg>|<style>.*?</style>", "", text, flags=re.DOTALL)
     words = re.sub(r"<[^>]+>", " ", words)
     for wrong in ("nan", "None", "inf", "np.float"):
@@ -116,7 +115,7 @@ def test_texts(tmp_path) -> None:
 
 
 CASES = {
-    "all failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 30, "no run has a number"),
+    "all failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 30, "the value is NaN in all runs"),
     "all but one failed": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: x, 29, "29 of 30 runs failed"),
     "constant": ("{kind: monte_carlo, runs: 30, seed: 1}", lambda x: 0.0 * x + 2.5, 0, "is the same in all 30 runs"),
     "few": ("{kind: monte_carlo, runs: 8, seed: 1}", lambda x: x**2, 0, "8 runs are few"),

@@ -273,7 +273,7 @@ def test_the_command_says_what_limits(tmp_path):
         (("gf7_pair", "--disturbances", "none"), r"no such name in disturbances"),
         (("gf7_pair", "--disturbances", "orbt"), r"no such name in disturbances.*orbit"),
         (("missing.yaml",), r"missing\.yaml"),
-        (("{job}",), r"nothing is stated to move.*--disturbances"),
+        (("{job}",), r"there is no prior on disturbances.*--disturbances"),
     ],
 )
 def test_bad_input_is_one_message(tmp_path, words, found):

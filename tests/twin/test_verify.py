@@ -386,7 +386,7 @@ def test_options_that_do_not_go_together_are_refused(folder) -> None:
 
 def test_the_files_alone_take_no_computing(folder) -> None:
     result = invoke(app, folder, "--files")
-    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them; it was not made again.\n")
+    assert (result.exit_code, result.stdout) == (0, "All 3 files are as the run wrote them. It was not made again.\n")
     flip(folder / "numbers.json", 12)
     result = invoke(app, folder, "--files", "--json")
     assert result.exit_code == 1

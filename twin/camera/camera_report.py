@@ -16,7 +16,7 @@ from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verd
 from twin.camera.first_order_data import FIRST_ORDER
 from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import look, to_svg
 
 _TOLD_TERMS = 15
@@ -31,12 +31,13 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
         warnings: what is wrong with it, to be told before all else.
     """
     moved, done = refocus_text(run), perturbed_text(run)
+    told, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [_layout(run), *([_refocus(run)] if moved else []), _wavefronts(run), _spots(run), _mtf(run)]
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
-        one_sentence(*verdict(run).split(". "), "see the wavefronts and the layout"),
-        (*(text for text in (moved, done) if text), _first_order_text(run)),
+        told,
+        (*more, *(text for text in (moved, done) if text), _first_order_text(run)),
         _facts(run),
         first_order_table(run),
         tuple(sections),
@@ -200,7 +201,7 @@ def _spots(run: CameraRun) -> Section:
 
 def _mtf(run: CameraRun) -> Section:
     if not run.mtfs:
-        return Section("MTF", (f"No MTF is told {run.without_mtf}.",))
+        return Section("MTF", (f"No MTF is given {run.without_mtf}.",))
     rows: list[list[Cell]] = []
     for mtf in run.mtfs:
         values = mtf.at(mtf.nyquist)

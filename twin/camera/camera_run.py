@@ -285,26 +285,26 @@ def find_focus(camera: CameraSpec, backend: Backend, tilt: bool) -> Refocus:
     return Refocus(own, best, beams.errors(own), beams.errors(best), tilt)
 
 
-def verdict(run: CameraRun) -> str:
-    """How good the camera is, where it is worst and what limits it."""
+def verdict(run: CameraRun) -> tuple[str, ...]:
+    """Sentences: how good the camera is, where it is worst and what limits it; then its MTF."""
     worst, where = run.worst
     place = field_text(run.camera, where)
     (kind, size), *_ = run.limits
     lead = f"{worst:.3g} waves rms at field {place}, most of it {kind} ({size:.3g})"
     if worst <= SHARP:
         text = f"Diffraction limited over the whole field: the worst wavefront error is {lead}"
-        text += f"; Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}."
+        text += f" (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     elif worst <= BLURRED:
         share = float(np.mean(run.errors <= SHARP))
         text = f"Not diffraction limited in {100.0 * (1.0 - share):.0f}% of the field: the worst wavefront error is "
-        text += f"{lead}; Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f}."
+        text += f"{lead} (Mar\N{LATIN SMALL LETTER E WITH ACUTE}chal's limit is {SHARP:.3f})."
     else:
-        text = f"Blurred: the worst wavefront error is {lead}; beyond {BLURRED:g} an image has next to no contrast."
+        text = f"Blurred: the worst wavefront error is {lead}, and beyond {BLURRED:g} an image has almost no contrast."
     if run.mtfs:
         low = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         limit = max(float(np.interp(mtf.nyquist, mtf.frequency, row)) for mtf in run.mtfs for row in mtf.limit)
-        text += f" The MTF of the optics at Nyquist goes down to {low:.2g}; diffraction would allow {limit:.2f}."
-    return text
+        return text, f"The lowest MTF of the optics at Nyquist is {low:.2g}; diffraction would allow {limit:.2f}."
+    return (text,)
 
 
 def perturbed_text(run: CameraRun) -> str:

@@ -21,7 +21,7 @@ from twin.compare.run_differences import (
     read_run,
 )
 from twin.run.artefact import Artefact, Cell, PngFigure, SvgFigure, Table, significant
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, look, new_figure, plain_axes, signed_map, to_png, to_svg
 
 MOST_BARS = 30
@@ -33,6 +33,7 @@ _MOST_IMAGES = 8
 def compare_report(comparison: Comparison) -> Report:
     """Report of a comparison."""
     names = comparison.names
+    told, more = answer(*verdict(comparison))
     summary = Table(
         "summary",
         "What differs",
@@ -52,8 +53,8 @@ def compare_report(comparison: Comparison) -> Report:
             sections.append(Section(name, (), artefacts))
     return Report(
         title=f"{', '.join(names[1:])} against {names[0]}",
-        verdict=one_sentence(*verdict(comparison).split(". ")),
-        lead=(),
+        verdict=told,
+        lead=more,
         facts=tuple((name, str(run.folder)) for name, run in zip(names, comparison.runs, strict=True)),
         summary=summary,
         sections=tuple(sections),
@@ -67,7 +68,9 @@ def _row(name: str, found: Differences) -> list[Cell]:
 
 
 def _warnings(comparison: Comparison) -> tuple[str, ...]:
-    """Of what makes a comparison doubtful: other versions, other warnings of the runs themselves."""
+    """Warnings of differences that make a comparison doubtful: other versions, other warnings of the runs
+    themselves.
+    """
     first = comparison.runs[0]
     out = []
     for name, run in zip(comparison.names[1:], comparison.runs[1:], strict=True):
@@ -280,24 +283,24 @@ def _finite(value: float | None) -> float | None:
     return value if value is not None and abs(value) < float("inf") else None
 
 
-def verdict(comparison: Comparison) -> str:
-    """The answer in a sentence or two."""
+def verdict(comparison: Comparison) -> list[str]:
+    """A sentence for each run beside the first, and one for its largest change."""
     parts = []
     for name, found in zip(comparison.names[1:], comparison.found, strict=True):
         inputs = f"{len(found.inputs)} input{'s' * (len(found.inputs) != 1)}" if found.inputs else "no input"
         if found.same:
             parts.append(
-                f"{name} gave the same as {comparison.names[0]} ({inputs} changed, {found.compared} compared)."
+                f"the run {name} gave the same as {comparison.names[0]} ({inputs} changed, {found.compared} compared)"
             )
             continue
         what = [f"{len(found.numbers)} numbers"] * bool(found.numbers) + [f"{len(found.arrays)} images"] * bool(
             found.arrays
         )
-        text = (
-            f"{name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared}; {inputs} changed"
+        parts.append(
+            f"the run {name} differs from {comparison.names[0]} in {' and '.join(what)} of {found.compared} "
+            f"({inputs} changed)"
         )
         far = max(found.numbers, key=lambda one: abs(one.in_sigma or 0.0), default=None)
         if far is not None and far.in_sigma is not None:
-            text += f"; the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma"
-        parts.append(text + ".")
-    return " ".join(parts)
+            parts.append(f"the largest change for its sigma is {far.key}, {far.in_sigma:+.3g} sigma")
+    return parts

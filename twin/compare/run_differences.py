@@ -153,7 +153,7 @@ class RunResults:
 
     @property
     def kind(self) -> str:
-        """Of the run: the program, and of a test its kind."""
+        """Kind of the run: its program, and the kind of a test."""
         return " ".join(filter(None, (self.manifest.program, self.manifest.test)))
 
     def array_files(self) -> list[str]:

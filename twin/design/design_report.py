@@ -16,7 +16,7 @@ from optics.design.starts import Attempt
 from scenes.models.camera_design import prescription_of
 from twin.design.design_run import DesignRun, agreement, verdict
 from twin.run.artefact import CameraFile, SvgFigure, Table
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, look, new_figure, plain_axes, to_svg
 
 
@@ -25,7 +25,7 @@ def design_report(run: DesignRun) -> Report:
     setup, found = run.setup, run.found
     before, after = found.before, found.after
     worst = float(after.errors.max())
-    told = one_sentence(
+    told, more = answer(
         *verdict(run).split(". "),
         agreement(run),
         f"The worst field of {setup.test.name} has a wavefront error of {worst:.4f} waves rms "
@@ -102,7 +102,7 @@ def design_report(run: DesignRun) -> Report:
         ("variables", str(len(found.variables))),
         ("starts", str(len(run.searched.attempts))),
     )
-    return Report(f"Design of {setup.test.name}", told, (), facts, summary, sections, warnings=run.warnings)
+    return Report(f"Design of {setup.test.name}", told, more, facts, summary, sections, warnings=run.warnings)
 
 
 def _start_row(number: int, attempt: Attempt) -> list[str | float]:

@@ -176,7 +176,7 @@ def agreement(run: DesignRun) -> str:
     failed = sum(attempt.design is None for attempt in searched.attempts)
     unheld = f", {failed} cannot hold the constraints" if failed else ""
     if not searched.local:
-        return f"All {count} starts end within {100 * SAME:g} % of it"
+        return f"All {count} starts end within {100 * SAME:g} % of the best"
     worst = max(attempt.error for attempt in searched.attempts if attempt.design is not None)
     return (
         f"A local optimum: of {count} starts {searched.agreeing} "

@@ -185,8 +185,8 @@ def _front(layouts: tuple[LayoutFacts, ...], bench: LayoutBench) -> list[LayoutF
     return [front[round(k * step)] for k in range(MOST_POINTS)]
 
 
-def verdict(run: MonitorDesignRun) -> str:
-    """Whether the best layout reaches what is wanted, at what cost, and what limits it; one sentence."""
+def verdict(run: MonitorDesignRun) -> tuple[str, ...]:
+    """Statements: whether the best layout reaches its goal, at what cost, and what limits it."""
     best, start, test = run.points[0].facts, run.found.start, run.setup.test
     parts = []
     for goal, wanted in test.goal.wanted.items():
@@ -201,8 +201,10 @@ def verdict(run: MonitorDesignRun) -> str:
     mass = f"{best.mass:.3g} kg of prisms ({start.mass:.3g} kg)"
     cause, share = _limiting(run, best)
     return (
-        f"{test.name} {head} with {count}: {', '.join(parts)}, for {cost} and {mass}, and what is left is for "
-        f"{100.0 * share:.0f} % {cause.replace('_', ' ')}: see the causes and the front."
+        f"the layout {test.name} {head} with {count}: {', '.join(parts)}",
+        f"it costs {cost} and {mass}",
+        f"{cause.replace('_', ' ')} causes {100.0 * share:.0f} % of the remaining variance: see the causes and "
+        "the front",
     )
 
 

@@ -17,7 +17,7 @@ from twin.design.monitor_design import GOAL_NAMES, UNITS, MonitorDesignRun, Poin
 from twin.main_job.light_path_plots import side_view_svg
 from twin.pictures.light_paths import trace_light_paths
 from twin.run.artefact import CameraFile, Cell, SvgFigure, Table, decimals_for, shown_unit
-from twin.run.report import Report, Section
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.sensors.area_detector import coarse_warnings
 
@@ -66,7 +66,8 @@ def monitor_design_report(run: MonitorDesignRun) -> Report:
     facts = (("start", start), ("disturbances", stated), ("best", best.name))
     lead = (f"The instrument of the best layout is artefacts/{best.name.lower()}.yaml.",)
     title = f"Layout of {test.name}"
-    return Report(title, verdict(run), lead, facts, summary, sections, warnings=coarse_warnings(run.setup))
+    told, more = answer(*verdict(run))
+    return Report(title, told, (*more, *lead), facts, summary, sections, warnings=coarse_warnings(run.setup))
 
 
 _FRONT = (

@@ -75,7 +75,7 @@ class Exported:
 
     @property
     def kind(self) -> str:
-        """Of the run."""
+        """Kind of the run."""
         return " ".join(filter(None, (self.manifest.program, self.manifest.test)))
 
     def numbers(self) -> dict[str, Any]:
@@ -201,7 +201,7 @@ def _what(page: Mapping[str, Any]) -> str:
 
 
 def _detector(source: Path, manifest: Manifest) -> list[Card]:
-    """Of the monitor's area CCDs, where the run is a job of the monitor."""
+    """FITS cards of the monitor's area CCDs, if the run is a job of the monitor."""
     config = source / "config.yaml"
     if manifest.program != "twin.render" or "config.yaml" not in manifest.sha256:
         return []

@@ -310,12 +310,12 @@ class DistortionBench:
 
     @property
     def noise(self) -> NoiseModel:
-        """Of one frame."""
+        """Noise of one frame."""
         return self.ccd.noise
 
     @property
     def radius(self) -> float:
-        """Of the centroid's window, pixels."""
+        """Radius of the centroid's window, pixels."""
         return 0.5 * self.setup.test.window - MARGIN
 
     @property

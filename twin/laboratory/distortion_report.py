@@ -23,7 +23,7 @@ from twin.laboratory.turntable_report import DOUBTFUL, FIT_NAMES
 from twin.laboratory.turntable_run import rms
 from twin.run.artefact import FAR, Artefact, Cell, OwnDecimals, SvgFigure, Table, decimals_for
 from twin.run.data_files import FrameFacts
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, LIGHT, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
@@ -33,12 +33,13 @@ RAW, COMPENSATED = "angles as read", "compensated angles"
 SHOWN = 3
 """Points whose frames are kept: first, middle, last."""
 ZERO_SHARE = 0.3
-"""Of sigma of the principal point: a zero of the angles that moves it by more is told."""
+"""Share of the principal point's sigma; the report mentions a zero of the angles that moves the point by more."""
 
 
 def distortion_report(run: DistortionRun) -> Report:
     """Report of a distortion test."""
     data = DISTORTION(run)
+    verdict, more = _verdict(run, data)
     simulated = run if isinstance(run, SimulatedDistortion) else None
     frames, facts = _frames(simulated) if simulated is not None else ({}, {})
     sections = [_curve(run, data), _joint(data["joint"]), _estimates(run, data), _noise(run, data)]
@@ -46,8 +47,8 @@ def distortion_report(run: DistortionRun) -> Report:
         sections.insert(1, _compensation(run))
     return Report(
         title="Interior orientation and distortion",
-        verdict=_verdict(run, data),
-        lead=(_typeset(run.compensated.fit.point.statement),),
+        verdict=verdict,
+        lead=(*more, _typeset(run.compensated.fit.point.statement)),
         facts=_facts(run, data),
         summary=_summary(run, data),
         sections=tuple(sections),
@@ -123,7 +124,7 @@ def _shares(run: DistortionRun) -> dict[str, float]:
     }
 
 
-def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> str:
+def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
     noise, f, sigma = data["noise"], data["principal_distance_mm"], data["principal_distance_mm_sigma"]
     expected, truth = noise["rejected_expected_of_good"], data.get("truth")
     known = f"distortion is known to {1e6 * float(np.sqrt(np.mean(run.compensated.sigma**2))):.2f} µm"
@@ -134,13 +135,14 @@ def _verdict(run: DistortionRun, data: Mapping[str, Any]) -> str:
         beside = f", {well} {FAR:g} σ of the truth ({truth['principal_distance_mm']:.4f} mm, {ratio:.1f} σ)"
         with_it, without = truth["error_rms_compensated_um"], truth["error_rms_raw_um"]
         gain = "compensating them helps" if with_it < without else "compensating them does not help"
-        known += f" and wrong by {with_it:.2f} µm rms, with angles as read by {without:.2f} µm: {gain}"
-    return one_sentence(
+        known += f" and wrong by {with_it:.2f} µm rms, with uncompensated angles by {without:.2f} µm: {gain}"
+    return answer(
         f"The balanced principal distance is {f:.4f} ± {sigma:.4f} mm{beside}, limited by {_limit(run)}",
-        f"{known}, and points lie within {data['rms_compensated_um']:.2f} µm rms of a smooth curve",
-        f"chi-square {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise, "
-        f"{noise['rejected']} of {int(np.sum(run.present))} spots rejected where {expected:.0f} are expected of good "
-        "ones, see the noise",
+        known,
+        f"points lie within {data['rms_compensated_um']:.2f} µm rms of a smooth curve",
+        f"chi-square is {data['chi_square']:.1f} for {data['degrees_of_freedom']} degrees of freedom with stated noise",
+        f"of {int(np.sum(run.present))} spots {noise['rejected']} were rejected, where {expected:.0f} are expected "
+        "without gross errors: see the noise",
     )
 
 

@@ -136,7 +136,7 @@ class SimulatedDistortion(DistortionRun):
         return self.bench.setup
 
     def true_fit(self, terms: Sequence[str] = measurement.CALIBRATED) -> interior.InteriorOrientation:
-        """The same fit of the exact chief rays at the true angles, averaged over the same exposures."""
+        """Fit of the exact chief rays at the true angles, with the terms and exposures of the measurement."""
         where, turned = self.means.mean(self.truth.place[..., 0]), self.means.mean(self.truth.turn)
         return interior.fit_interior_orientation(where, turned, _EXACT, terms)
 
@@ -151,7 +151,7 @@ class SimulatedDistortion(DistortionRun):
 
     @cached_property
     def true_estimates(self) -> Mapping[str, Estimate]:
-        """The same `estimates` from exact chief rays at the true angles."""
+        """Values of `estimates` from exact chief rays at the true angles."""
         return _estimates(self.true_fit(), self.true_fit(measurement.SMOOTH), 0.0)
 
 

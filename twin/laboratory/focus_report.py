@@ -19,7 +19,7 @@ from twin.laboratory.focus_numbers import NO_EDGE, PLACES, SHIMS, focus_numbers
 from twin.laboratory.focus_run import FocusRun, FocusState, Shimming, SimulatedFocus
 from twin.laboratory.turntable_report import DOUBTFUL
 from twin.run.artefact import Artefact, Cell, SvgFigure, Table, fixed
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.targets.target_images import ALONG, DIRECTION_NAMES, DIRECTIONS, TRACK
 
 MOVED = {
@@ -36,8 +36,7 @@ def focus_report(run: FocusRun) -> Report:
     if isinstance(run, SimulatedFocus):
         return Report(
             f"Focal-plane alignment of {run.bench.setup.camera.name}",
-            _alignment_verdict(run, data),
-            (),
+            *_alignment_verdict(run, data),
             _bench_facts(run),
             _rounds(data),
             (*sections, _mtf_section(run, data)),
@@ -46,20 +45,20 @@ def focus_report(run: FocusRun) -> Report:
     assert isinstance(run.test, MeasuredFocusSpec)
     summary, warnings = _summary(data), _warnings(run, data)
     return Report(
-        "Focal-plane alignment", _verdict(run, data), (), _facts(run, run.test), summary, sections, warnings=warnings
+        "Focal-plane alignment", *_verdict(run, data), _facts(run, run.test), summary, sections, warnings=warnings
     )
 
 
-def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> str:
+def _alignment_verdict(run: SimulatedFocus, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
     end = data["rounds"][-1]
     true, chips = data["truth"]["rounds"][-1]["confocal_um_max"], end["chips_um_rms"]
     rounds = len(run.shimmings)
-    return one_sentence(
+    return answer(
         f"{'One round' if rounds == 1 else f'{rounds} rounds'} of shims brought the CCDs from "
         f"{data['initial']['confocal_um_max']:.0f} µm to {end['confocal_um_max']:.1f} ± "
         f"{end['confocal_um_sigma']:.1f} µm from best focus (truly {true:.1f} µm), in every "
         f"field and band, and the line to {abs(end['line_level_arcmin']):.2f} arcmin of level",
-        f"the CCDs do not stand in one plane, by {chips:.1f} µm rms, which no shim takes away" if chips > 0.0 else "",
+        f"the CCDs depart from one plane by {chips:.1f} µm rms, which no shim corrects" if chips > 0.0 else "",
         "see the rounds of the alignment and the MTF",
     )
 
@@ -155,22 +154,22 @@ def _rounds(data: Mapping[str, Any]) -> Table:
     )
 
 
-def _verdict(run: FocusRun, data: Mapping[str, Any]) -> str:
+def _verdict(run: FocusRun, data: Mapping[str, Any]) -> tuple[str, tuple[str, ...]]:
     plane = data["plane"]
     chips, noise = plane["chips_um_rms"], UM_PER_M * float(np.sqrt(np.mean(run.states[0].defocus_sigma ** 2)))
     limit = (
-        f"by the CCDs, which do not stand in one plane by {chips:.1f} µm rms, and no shim takes that away"
+        f"by the CCDs' departure from one plane, {chips:.1f} µm rms, which no shim corrects"
         if chips > noise
         else f"by the noise of each place, {noise:.1f} µm rms"
     )
     gone = len(data["images_without_edge"])
-    return one_sentence(
-        f"The CCDs stand up to {data['confocal_um_max']:.1f} ± {data['confocal_um_sigma']:.1f} µm from best focus",
+    return answer(
+        f"The CCDs are up to {data['confocal_um_max']:.1f} ± {data['confocal_um_sigma']:.1f} µm from best focus",
         f"new shims will bring them within {data['expected_confocal_um_max']:.1f} ± "
         f"{data['expected_confocal_um_sigma']:.1f} µm, limited {limit}",
-        f"chi-square of the plane {plane['chi_square']:.1f} for {plane['degrees_of_freedom']} degrees of freedom, of "
-        f"the curves through focus {data['curves_chi_square']:.0f} for {data['curves_degrees_of_freedom']}",
-        f"{gone} images without a measurable edge" if gone else "",
+        f"chi-square of the plane is {plane['chi_square']:.1f} for {plane['degrees_of_freedom']} degrees of freedom, "
+        f"of the curves through focus {data['curves_chi_square']:.0f} for {data['curves_degrees_of_freedom']}",
+        f"{gone} {'image has' if gone == 1 else 'images have'} no measurable edge" if gone else "",
         "see the shims",
     )
 

@@ -422,7 +422,7 @@ def recorder_of(
 
 
 def _patterns(bench: FocusBench, seed: int) -> dict[str, FixedPattern]:
-    """Of each band's columns."""
+    """Fixed pattern of the columns of each band."""
     return {name: ccd.pattern(stream(seed, _PATTERNS, k)) for k, (name, ccd) in enumerate(bench.ccds.items())}
 
 

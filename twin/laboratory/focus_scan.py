@@ -78,7 +78,7 @@ class SiteScan:
 
     @property
     def defocus_sigma(self) -> float:
-        """Its sigma from noise, metres; ``VERTEX_ERROR`` comes on top of it, the same for all sites."""
+        """Standard deviation of `defocus` from noise, metres; ``VERTEX_ERROR``, the same for all sites, adds to it."""
         return float(np.sqrt(sum(v.sigma**2 for v in self.vertex.values())) / len(self.vertex))
 
 
@@ -143,8 +143,8 @@ class Recorder:
         return *edge_mtf(frames, ccd.noise), frames
 
     def attempt(self, number: int, edge: str, shift: float, take: int) -> tuple[float, float, np.ndarray, str]:
-        """As ``measure``; where the image is too blurred, or otherwise not good for it, MTF 0 with an infinite sigma,
-        and the reason.
+        """Measure like ``measure``, but give MTF 0 with infinite sigma, and the reason, for an image that is too
+        blurred or otherwise unusable.
         """
         try:
             return *self.measure(number, edge, shift, take), ""

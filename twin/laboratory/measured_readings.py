@@ -63,7 +63,7 @@ class DataFile:
 
     @classmethod
     def of(cls, table: Table) -> DataFile:
-        """Of a table."""
+        """The file of a table that was read."""
         return cls(table.file, len(table), digest_of(Path(table.file)))
 
 
@@ -322,7 +322,7 @@ class _Cells:
         self.present[self.group, self.slot] = True
 
     def at(self, slot: Places) -> _Cells:
-        """The same with other places among the columns."""
+        """The cells of this matrix in other columns."""
         return _Cells(self.table, self.group, self.order, slot)
 
     def matrix(self, value: Array | Places, empty: float | None = 0.0) -> np.ndarray:

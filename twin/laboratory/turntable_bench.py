@@ -107,7 +107,7 @@ class TurntableModel:
 
     @cached_property
     def error(self) -> DividingError:
-        """Of this table; unknown to the analysis."""
+        """True dividing error of this table; the analysis does not get it."""
         return DividingError.draw(self.spec.dividing_error, self.seed)
 
     def stand(self, reading: ArrayLike, rng: np.random.Generator | None = None) -> Array:

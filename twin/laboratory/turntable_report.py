@@ -18,7 +18,7 @@ from twin.laboratory.turntable_bench import TurntableModel
 from twin.laboratory.turntable_numbers import REJECTED, TURNTABLE
 from twin.laboratory.turntable_run import TurntableRun
 from twin.run.artefact import Artefact, SvgFigure, Table, fixed
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREEN, GREY, INK, LIGHT, ORANGE, PURPLE, VERMILION, look, new_figure, plain_axes, to_svg
 
 if TYPE_CHECKING:
@@ -342,12 +342,13 @@ def turntable_report(run: TurntableRun) -> Report:
     missed = data["fits"][chosen]["heldout_rms_arcsec"]
     judged = "" if missed is None else f" and misses held-out angles by {missed:.3f} arcsec RMS"
     judged += "" if truth is None else f" and the truth by {truth['fits'][chosen]['true_rms_arcsec']:.3f} arcsec"
-    verdict = one_sentence(
-        f"The dividing error spans {span:.2f} arcsec; the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec"
-        f"{judged}, limited by {limit}",
-        f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec, {data['rejected']} of "
-        f"{int(np.sum(run.series.taken))} comparisons rejected where "
-        f"{data['rejected_expected_of_good']:.0f} are expected of good ones, see what is left of a compensated angle",
+    verdict, more = answer(
+        f"The dividing error spans {span:.2f} arcsec",
+        f"the {FIT_NAMES[chosen]} compensates it to σ = {sigma:.3f} arcsec{judged}, limited by {limit}",
+        f"repeats scatter by {data['repeatability_arcsec']:.3f} arcsec",
+        f"of {int(np.sum(run.series.taken))} comparisons {data['rejected']} were rejected, where "
+        f"{data['rejected_expected_of_good']:.0f} are expected without gross errors: see what is left of a compensated "
+        "angle",
     )
     rows = [
         ("repeats, largest RMS of an angle", fixed(data["repeat_rms_arcsec"], 3)),
@@ -366,7 +367,7 @@ def turntable_report(run: TurntableRun) -> Report:
     return Report(
         "Dividing error of the turntable",
         verdict,
-        (),
+        more,
         (
             ("Calibration", _readings(run)),
             ("Reference", f"its certificate: {format_quantity(certified, ANGLE)} at each position"),

@@ -118,7 +118,7 @@ class LiveBench:
         experiment.nominal_focus  # noqa: B018
         advance("calibrate its spots")
         experiment.calibration  # noqa: B018
-        advance("what is stated to move")
+        advance("prior on disturbances")
         experiment.disturbances  # noqa: B018
         self._crosstalk  # noqa: B018
         self.clearances  # noqa: B018

@@ -40,9 +40,9 @@ def assumed(reading: MonitorReading) -> str:
     stated, found = reading.disturbances, reading.consistency
     if stated is None or found is None:
         return _NOISE_ALONE
-    agree = "agree with them" if found.agrees else "contradict them"
+    agree = "agree with it" if found.agrees else "contradict it"
     return (
-        f"σ: noise and the stated disturbances {stated.name}; the shifts {agree} (chi-square "
+        f"σ: noise and the prior {stated.name}; the shifts {agree} (chi-square "
         f"{significant(found.chi_square)} of {found.degrees} coordinates, limit {found.limit:.1f}, false-alarm rate "
         f"{found.false_alarm:g}){_from_statement(reading)}"
     )
@@ -54,7 +54,7 @@ def _from_statement(reading: MonitorReading) -> str:
     if not shares:
         return ""
     ends = list(dict.fromkeys(plain(math.floor(1e3 * end) / 10.0, 4) for end in (min(shares), max(shares))))
-    return f"; {' to '.join(ends)} % of the variances are from the statement, not from the spots"
+    return f"; {' to '.join(ends)} % of the variances come from the prior, not from the spots"
 
 
 def contradiction(run: RenderRun) -> tuple[str, ...]:
@@ -79,7 +79,7 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
 def contradicted(
     stated: Disturbances | None, found: Consistency | None, when: str = "", rate: str = f"{FALSE_ALARM:g}"
 ) -> tuple[str, ...]:
-    """The same of one measurement.
+    """A warning if the shifts of one measurement contradict the prior.
 
     Args:
         stated: what is stated to move, None for nothing.
@@ -90,7 +90,7 @@ def contradicted(
     if stated is None or found is None or found.agrees:
         return ()
     return (
-        f"the shifts of the spots contradict the stated disturbances {stated.name}{when}: chi-square "
+        f"the shifts of the spots contradict the prior {stated.name}{when}: chi-square "
         f"{significant(found.chi_square)} of {found.degrees} coordinates where {found.limit:.1f} is exceeded with a "
         f"chance of {rate}{_suspected(found, stated.bodies)}; σ does not hold for this measurement",
     )
@@ -106,15 +106,18 @@ def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     found = together.consistency
     what = f"Chi-square of all {len(times)} measurements is {found.chi_square:.4g}"
     if found.chance > 1.0 - FALSE_ALARM:
-        return f"{what} where {found.degrees} are expected: less moves than is stated, and the sigmas are too large."
+        return (
+            f"{what} where {found.degrees} are expected: the motions are smaller than the "
+            "prior, and the sigmas are too large."
+        )
     if found.agrees:
         expected = f"{found.degrees} are expected, {found.limit:.4g} are the limit (chance {FALSE_ALARM:g})"
-        return f"{what}, as stated: {expected}."
+        return f"{what}, in agreement with the prior: {expected}."
     worst = int(np.argmax(together.innovations))
     return (
         f"{what} where {found.degrees} are expected and {found.limit:.4g} are the limit (chance {FALSE_ALARM:g}): "
-        "the measurements contradict what was stated, and the sigmas cannot be relied on. The first to look at is "
-        f"the one at {moment(float(times[worst]))}, which those before it leave {together.innovations[worst]:.3g} of."
+        "the measurements contradict the prior, and the sigmas are not reliable. Look first at the measurement at "
+        f"{moment(float(times[worst]))}, which contributes {together.innovations[worst]:.3g} given those before it."
     )
 
 
@@ -125,12 +128,12 @@ def _suspected(found: Consistency, stated: Sequence[str]) -> str:
     times = significant(first.times, 2)
     if first.body in stated:
         return (
-            f"; motions of {first.body} would explain them best, if the standard deviations stated for it were "
-            f"{times} times as large"
+            f"; motions of {first.body} would explain them best, with {times} times the standard deviations of the "
+            "prior"
         )
     return (
-        f"; motions of {first.body}, of which nothing is stated, would explain them best, with standard deviations of "
-        f"some {times} µm, arcsec, ppm and nm"
+        f"; motions of {first.body}, which the prior does not contain, would explain them best, with standard "
+        f"deviations of some {times} µm, arcsec, ppm and nm"
     )
 
 
@@ -165,5 +168,5 @@ def limits(reading: MonitorReading, one: Reading) -> tuple[str, float]:
 
 
 def share_text(share: float) -> str:
-    """As sentences say it."""
+    """A share in per cent, for sentences."""
     return f"{plain(round(100.0 * share), 3)} %"

@@ -29,10 +29,11 @@ def motion_section(run: RenderRun, drawn: Mapping[str, str]) -> Section:
     caption = (
         "Move of each spot on its area CCD in µm per unit of each motion (1 µm, 1 arcsec, 1 ppm, or 1 nm rms of a "
         "figure term), of one body alone, to first order; x is along the flight direction, y along the line. Colours "
-        "are logarithmic over three decades, red is positive. 0 stands for less than 10⁻⁶. The CSV also has what is "
-        "true and what each estimator reads. Four coordinates for each camera cannot tell these motions apart; the "
-        "first four are the family that the papers' estimators assume. `crosstalk.json` says of every motion in words "
-        "what the spots make of it."
+        "are logarithmic over three decades, red is positive. 0 stands for less than 10⁻⁶. The CSV also has the "
+        "true change and the reading of each estimator. Four coordinates for each camera cannot separate these "
+        "motions. "
+        "The first four are the family that the papers' estimators assume. `crosstalk.json` describes in words how the "
+        "spots respond to every motion."
     )
     parts: list[Artefact] = [figure(drawn, "motions", caption, full=_motions(run))]
     for k, (name, table) in enumerate(run.crosstalk.items()):

@@ -19,7 +19,7 @@ from twin.run import svg
 
 FIELD_COLOURS = {"left edge": svg.SKY, "centre": svg.BLUE, "right edge": svg.PURPLE}
 _CHANNEL_COLOURS = (svg.VERMILION, svg.ORANGE, svg.BROWN, svg.GREY, svg.YELLOW, svg.INK)
-"""Of a camera's monitor beams, in the order of its channels; they begin again where there are more."""
+"""Colours of a camera's monitor beams, in the order of its channels; they repeat if there are more channels."""
 ARROW = 0.3
 """Length of the arrow along a line of sight, metres."""
 # fills: red, green, blue and opacity
@@ -187,7 +187,7 @@ def _focal_plane(axes: Axes, paths: LightPaths, camera: str) -> None:
 
 
 def _widest(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of two diameters of a disk, the one that the side view sees longer: x and z of its ends."""
+    """Ends of the diameter of a disk, of two, that is longer in the side view: their x and z."""
     pairs = ends.reshape(2, 2, 3)[..., [0, 2]]
     best = int(np.argmax(np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=-1)))
     return pairs[best, :, 0], pairs[best, :, 1]
@@ -274,7 +274,9 @@ def footprints_svg(instrument: Instrument, paths: LightPaths) -> str:
 
 
 def _style(colour: str, filled: bool) -> dict[str, Any]:
-    """Of a beam's footprint; those of both ends may coincide, so that those at +Y are filled, the others outlines."""
+    """Line style of a beam's footprint. Footprints of both ends may coincide: those at +Y are filled, the others
+    outlines.
+    """
     return {"fc": colour, "ec": colour, "alpha": 0.5} if filled else {"fill": False, "ec": colour, "lw": 1.4}
 
 

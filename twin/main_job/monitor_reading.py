@@ -182,8 +182,8 @@ class MonitorReading:
         return {b: np.stack([c for (body, _, _), c in columns.items() if body == b], axis=1) for b in bodies}
 
     def worst_of(self, shifts: np.ndarray, covariance: np.ndarray) -> tuple[int, Consistency] | None:
-        """Of the times of a series the one whose shifts agree least with the stated disturbances, and how they do: its
-        limit is that of the largest of all times, at the same chance of a false alarm. None without a statement.
+        """The state of a series whose shifts agree least with the prior, and its consistency. The limit is that of the
+        largest value of all times, at the same false-alarm rate. None without a prior.
 
         Args:
             shifts: (T, 2 C) px.
@@ -295,7 +295,7 @@ def stated_check(name: str, told: Consistency) -> SelfCheck:
 
 
 def worst_checks(readings: Iterable[MonitorReading]) -> tuple[SelfCheck, ...]:
-    """Of several readings the check that comes out worst, of each name.
+    """The worst check of each name among several readings.
 
     Args:
         readings: of states or times.

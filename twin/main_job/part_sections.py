@@ -108,7 +108,7 @@ def _every_field(quality: ImageQuality) -> Table:
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}
 TITLES = {"edge": "knife edge", "bars": "bars"}
 _DECIMALS = 4
-"""Of an MTF."""
+"""Decimals of an MTF."""
 
 
 def target_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
@@ -293,8 +293,10 @@ def stray_section(run: RenderRun) -> Section | None:
         parts.append(Table("stray_prisms", title, "", heads, taken, (None, None, 1, 1), within=IN_PAGE))
     paths = f"{after.paths:,}".replace(",", "\N{THIN SPACE}")
     about = (
-        f"{paths} paths from every pinhole through the perturbed instrument, each told apart by the surfaces it met. "
-        "The nominal way is the spot itself; all else is part of the images and listed here, relative to the spot."
+        f"{paths} paths from every pinhole through the perturbed instrument, each identified by the surfaces that it "
+        "met. "
+        "The nominal path is the spot itself. All other light is part of the images and listed here, relative to the "
+        "spot."
     )
     return Section("Ghosts and stray light", (about,), tuple(parts), len(parts) - 2, "stray")
 

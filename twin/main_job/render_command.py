@@ -74,11 +74,14 @@ def _print_result(run: JobRun, console: Console) -> None:
     """The verdict, the result table and what to bear in mind."""
     told = judge(run)
     print_verdict(console, told.verdict)
+    after = list(told.more)
     if isinstance(run, RenderRun):
         print_whole(console, _table(run, console.width >= _WIDE))
-        console.print(f"{assumed(run.reading)}.", markup=False, highlight=False, soft_wrap=True)
+        after.append(f"{assumed(run.reading)}.")
     else:
         print_whole(console, _changes(run))
+    for line in after:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
     if run.targets is not None:
         lines = _mtf_table(run.targets)
         if lines is not None:

@@ -41,7 +41,7 @@ def irradiance_file(run: RenderRun) -> bytes:
 
 
 def write_results(run: JobRun, folder: RunFolder) -> None:
-    """The same without irradiance.nc.
+    """Write everything that a run computed except irradiance.nc.
 
     Args:
         run: what to write.

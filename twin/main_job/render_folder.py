@@ -157,12 +157,12 @@ def render_report(
         _light(drawn, read is not None),
         *sections,
     )
-    about = "what its monitor sees, and what it makes of it" if read else "what changes, and what its images lose"
+    about = "readings of its monitor" if read else "changes of geometry and images"
     return report_page(
         Report(
             f"{run.resolved.instrument.name}: {about}",
             told.verdict,
-            (),
+            told.more,
             facts(run),
             summary,
             tuple(section for section in parts if section is not None),

@@ -157,22 +157,22 @@ class RenderRun(JobRun):
 
     @property
     def estimators(self) -> dict[str, Estimator]:
-        """As the reading's."""
+        """Estimators of the reading."""
         return self.reading.estimators
 
     @property
     def judged(self) -> str:
-        """As the reading's."""
+        """Name of the estimator that the report judges."""
         return self.reading.judged
 
     @property
     def gains(self) -> dict[str, np.ndarray]:
-        """As the reading's."""
+        """Gain of each estimator of the reading."""
         return self.reading.gains
 
     @property
     def consistency(self) -> Consistency | None:
-        """As the reading's."""
+        """Agreement of the reading's shifts with the prior; None without a prior."""
         return self.reading.consistency
 
     @property
@@ -185,8 +185,8 @@ class RenderRun(JobRun):
 
     @cached_property
     def worst_of_course(self) -> tuple[int, Consistency] | None:
-        """Of the times of a course the one whose shifts agree least with the stated disturbances, and how they do (see
-        `MonitorReading.worst_of`). None without course or statement.
+        """The time of a course whose shifts agree least with the prior, and its consistency (see
+        `MonitorReading.worst_of`). None without a course or a prior.
         """
         series = self.series
         return None if series is None else self.reading.worst_of(series.shift, series.shift_covariance)

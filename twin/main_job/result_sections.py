@@ -116,7 +116,7 @@ def _all_digits(run: RenderRun, name: str, found: ReadingTable, over: bool) -> T
 
 
 def _value_and_sigma(run: RenderRun, label: str) -> list[str]:
-    """Of each estimator its value, the total sigma and that of the noise."""
+    """Value, total sigma and noise sigma of each estimator."""
     said = (label, " sigma", " sigma noise")
     return [f"{estimator.title}{what}" for estimator in run.estimators.values() for what in said]
 

@@ -16,9 +16,9 @@ from twin.run import svg
 from twin.run.artefact import MINUS
 
 COLOURS = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.SKY, svg.PURPLE, svg.INK, svg.GREY)
-"""Of the nodes; after the last one they begin again, with the next line style."""
+"""Colours of the nodes; after the last one they repeat with the next line style."""
 STYLES = ("-", "--", ":")
-"""Of the first nodes, and of those whose colour has been used before."""
+"""Line styles: of the first nodes, and of nodes whose colour has been used before."""
 _BESIDE = 0.12
 """Distance of the marks of two estimators at one time, part of the distance of two times."""
 UNITS = ((2.0 * 86400.0, 86400.0, "d"), (6.0 * 3600.0, 3600.0, "h"), (180.0, 60.0, "min"), (0.0, 1.0, "s"))

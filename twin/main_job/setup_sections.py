@@ -23,7 +23,9 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, stated = resolved.instrument, run.experiment.stated is not None
     own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
-    free = "Structures expand freely and carry what stands on them, mirrors and prisms bend (finite elements), glass "
+    free = (
+        "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and glass "
+    )
     free += "changes its index."
     if not isinstance(run, RenderRun):
         without = "The instrument has no monitor: changes are those of the exact trace, and nothing is measured."
@@ -33,10 +35,14 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
     judged = run.estimators[run.judged].title
     about = (
-        f"Only shifts of the line CCD along X and Y, its turn about Z and a scale of the whole optics are assumed by: "
-        f"{family}. Any other motion is read as a mixture of these, an error that no number of frames reduces "
-        f"(Residuals, Crosstalk){'; σ holds it, as far as it is by stated disturbances' if stated else ''}. "
-        + (f"The {judged} weighs all stated motions against the noise. " if stated else "")
+        "These estimators assume shifts of the line CCD along X and Y, its turn about Z and a scale of the whole "
+        f"optics: {family}. They read any other motion as a mixture of these, an error that more frames do not reduce "
+        "(Residuals, Crosstalk). "
+        + (
+            f"σ covers this error for motions of the prior. The {judged} weighs them against the noise. "
+            if stated
+            else ""
+        )
         + free
     )
     return (
@@ -93,7 +99,7 @@ def setup_section(run: JobRun) -> Section:
     decimals = (None, None, 2, 4, 1, None, None, 1, 2)[: len(heads)]
     cameras = Table("cameras", "Cameras", "", heads, rows, decimals, within=IN_PAGE)
     stated = () if run.experiment.stated is None else (_stated(run),)
-    title = "Cameras, and what is stated to move" if stated else "Cameras"
+    title = "Cameras, and the prior on disturbances" if stated else "Cameras"
     return Section(title, (), (*stated, cameras), closed=True)
 
 
@@ -126,7 +132,7 @@ def _stated(run: JobRun) -> Table:
     heads = ["cause", "body", "motion", "sigma", "unit", "in time", "reason"]
     return Table(
         "disturbances",
-        f"What is stated to move: disturbances {spec.name}, one standard deviation of each component of each body",
+        f"Prior on disturbances, {spec.name}: one standard deviation of each component of each body",
         f"{spec.description.strip()} Component by component." if spec.description else "Component by component.",
         ("Cause", "Bodies", "One standard deviation", "In time", "Reason"),
         rows,

@@ -207,7 +207,7 @@ def _panel(axes: Axes, title: str, panel: dict[str, dict[str, float | None]], na
 ROW = 0.168
 """Height of a row, inches."""
 _DECADES = 3
-"""Of the colours' logarithmic part, below the largest number."""
+"""Decades of the logarithmic part of the colour scale, below the largest number."""
 _MOST_LEVEL = 4
 """Names of columns that have room beside one another."""
 _STRONG = 0.55

@@ -11,6 +11,7 @@ from twin.main_job.result_sections import result_tables
 from twin.main_job.spot_plots import airy_radius, core_window, cross, mean_images, stretch
 from twin.main_job.verdict import limited
 from twin.run.artefact import FAR, Marked, Table
+from twin.run.report import sentence
 from twin.run.svg import AFTER, BEFORE, BLUE, GRAY, GREY, INK, LIGHT, VERMILION, look, to_png
 
 WIDTH, DPI = 14.0, 100
@@ -100,7 +101,7 @@ def _table(figure: Figure, table: Table, top: float, run: RenderRun) -> None:
             mark, colour = ("▲", VERMILION) if cell.look == "far" else ("●", BLUE)
             axes.text(x, y, mark, fontsize=10, ha="right", va="center", color=colour)
     y = count + 0.7
-    limit = f" {limited(run)}." if limited(run) else ""
+    limit = f" {sentence(limited(run))}" if limited(run) else ""
     for line in (f"{assumed(run.reading)}.", f"± is one σ; ● within {FAR:g} σ of the truth, ▲ beyond.{limit}"):
         axes.text(0.01, y, line, fontsize=10.5, ha="left", va="center", color=GREY)
         y += 0.85

@@ -67,7 +67,7 @@ def systematics(run: RenderRun, camera: str) -> Systematics:
 
 
 def _parts(run: RenderRun, camera: str, amounts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Of each motion that the judged estimator does not read as it is."""
+    """Error that each motion contributes, for motions that the judged estimator does not read as they are."""
     names = list(run.crosstalk)
     k = names.index(camera)
     gain = rows_of(run.reading.cameras[camera]) @ run.gains[run.judged][4 * k : 4 * k + 4]

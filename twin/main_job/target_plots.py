@@ -29,8 +29,8 @@ _IMAGE_NAMES = {
     "star": "star",
     "pinhole": "pinhole, asinh stretch,\nmiddle 24 px",
 }
-"""Of the images that are shown, with the direction of their MTF; other targets are shown by their names, even fields
-are not.
+"""Titles of the images shown, with the direction of their MTF. Other targets have their own names; uniform fields are
+not shown.
 """
 _CROPS = {"knife_edge_along": 40, "knife_edge_track": 40, "pinhole": 24}
 """Side of what is shown, pixels; the others are shown whole."""

@@ -1,4 +1,4 @@
-"""What a run found, in one sentence worked out from its numbers, and the readings that mislead, as warnings."""
+"""What a run found, in sentences computed from its numbers, and the readings that mislead, as warnings."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from twin.monitor.image_quality import ImageQuality
 from twin.monitor.reading_table import Reading
 from twin.monitor.time_series import TimeSeries
 from twin.run.artefact import FAR, SAME, plain, residual_text, significant
+from twin.run.report import answer
 
 __all__ = [
     "FALSE_ALARM",
@@ -50,9 +51,10 @@ _DIMMED = 0.5
 
 @dataclass(frozen=True)
 class Judgement:
-    """A run in one sentence, and all its warnings, those of misreadings last."""
+    """A run in two sentences at most, what follows them, and all its warnings, those of misreadings last."""
 
     verdict: str
+    more: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
@@ -66,27 +68,27 @@ def readings(run: RenderRun, estimator: str) -> tuple[Reading, ...]:
 def judge(run: JobRun) -> Judgement:
     """Judge a run by its readings, sigmas, truth and crosstalk; without a monitor by the truth and the images."""
     if not isinstance(run, RenderRun):
-        return Judgement(_changed(run), run.warnings)
+        return Judgement(*answer(*_changed(run)), run.warnings)
     found = readings(run, run.judged)
     off = [r for r in found if r.far]
     if run.series is not None:
-        verdict = _series_verdict(run, run.series, found, off)
+        first, *others = _series_verdict(run, run.series, found, off)
     elif not any(_moves(motion) for motion in run.state.values()):
-        verdict = _nothing(run, found, off)
+        first, *others = _nothing(run, found, off)
     elif off:
-        verdict = _misled(run, found, off)
+        first, *others = _misled(run, found, off)
     else:
-        verdict = _recovered(run, found)
+        first, *others = _recovered(run, found)
     unseen = _unseen(run)
     given = (*run.warnings, *doubted(run), *contradiction(run), *unseen)
     warnings = (*given, *_unstated(run, found, unseen), *_misreadings(run))
-    limit = f"; {limited(run)}" if limited(run) else ""
-    doubt = "; σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
-    return Judgement(f"{verdict}{limit}{_dimmed(run)}{_blurred(run)}{doubt}.", warnings)
+    doubt = "σ does not hold for this measurement: see the warnings" if not run.sigma_holds else ""
+    verdict, more = answer(first, doubt, *others, limited(run), _dimmed(run), _blurred(run))
+    return Judgement(verdict, more, warnings)
 
 
-def _changed(run: JobRun) -> str:
-    """What the perturbation of an instrument without a monitor does."""
+def _changed(run: JobRun) -> tuple[str, str]:
+    """What the perturbation of an instrument without a monitor does, to its geometry and to its images."""
     moved = any(_moves(motion) for motion in run.state.values())
     cameras = len(run.truth.cameras) > 1
     parts = [
@@ -102,7 +104,7 @@ def _changed(run: JobRun) -> str:
     else:
         text = "The perturbation does not change the geometry"
     if run.quality is None:
-        return f"{text}."
+        return text, ""
     worst: list[str] = []
     for name, camera in run.quality.cameras.items():
         before, after = (float(np.max(errors)) for errors in camera.wfe)
@@ -120,7 +122,7 @@ def _changed(run: JobRun) -> str:
             worst.append(f"the worst wavefront error{who} is {significant(before, 3)} waves rms")
     share, _, change = sharpness_lost(run.quality)
     told = f", the MTF at Nyquist at worst {change}" if moved and share > 0.0 else ""
-    return f"{text}; {', '.join(worst)}{told}."
+    return text, f"{', '.join(worst)}{told}"
 
 
 def _unseen(run: RenderRun) -> tuple[str, ...]:
@@ -166,16 +168,17 @@ def _within(run: RenderRun, found: tuple[Reading, ...], of: str, how: str = "") 
     return f"all {len(found)} readings of the {_told(run)} are within {FAR:g} σ of {of} ({how}σ: {basis})"
 
 
-def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> str:
+def _nothing(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> tuple[str, ...]:
     if not off:
-        return f"Nothing was perturbed and nothing is read: {_within(run, found, 'zero')}; {_hidden(run, found)}"
+        return f"Nothing was perturbed, and {_within(run, found, 'zero')}", _hidden(run, found)
     worst = max(off, key=lambda r: abs(r.ratio))
     chance = _chance(worst.ratio, len(found))
-    why = "look at the warnings and at the spots" if chance < FALSE_ALARM else "which is chance"
+    why = "look at the warnings and at the spots" if chance < FALSE_ALARM else "it is a chance event"
     return (
         f"Nothing was perturbed, but {len(off)} of {len(found)} readings of the {_told(run)} {_are(off)} beyond "
-        f"{FAR:g} σ, the worst {worst.name}, {worst.read}; by chance that happens in {100.0 * chance:.2g} % of such "
-        f"runs: {why}"
+        f"{FAR:g} σ",
+        f"the worst is {worst.name}, {worst.read}, which chance alone causes in {100.0 * chance:.2g} % of such runs: "
+        f"{why}",
     )
 
 
@@ -193,43 +196,43 @@ def _changes(found: tuple[Reading, ...]) -> list[Reading]:
     return [r for r in found if r.group != GROUND_GROUP]
 
 
-def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> str:
+def _recovered(run: RenderRun, found: tuple[Reading, ...]) -> tuple[str, ...]:
     seen = [r for r in found if abs(r.true) > FAR * r.sigma]
     clear = _changes(found)
     largest = max(clear, key=lambda r: abs(r.true) / r.sigma if r.sigma else abs(r.true))
     if seen:
-        hidden = len(found) - len(seen)
-        others = f" and {hidden} {'do' if hidden > 1 else 'does'} not" if hidden else ""
         return (
-            f"Recovered: {_within(run, found, 'the truth')}, {len(seen)} of the changes stand{'s' * (len(seen) == 1)} "
-            f"out of σ{others}; the clearest, {largest.name}, is read as {largest.read} and is "
-            f"{largest.shown(largest.true)}; {_hidden(run, found)}{_frames(run, found)}"
+            _within(run, found, "the truth"),
+            f"{len(seen)} of the changes exceed{'s' * (len(seen) == 1)} {FAR:g} σ; the clearest is {largest.name}, "
+            f"with a reading of {largest.read} and a true value of {largest.shown(largest.true)}",
+            f"{_hidden(run, found)}{_frames(run, found)}",
         )
     if not any(abs(r.true) > SAME * r.sigma for r in found):
-        nothing = "What was perturbed changes no camera, and nothing is read"
-        return f"{nothing}: {_within(run, found, 'zero')}; {_hidden(run, found)}"
+        return f"The perturbation changes no camera, and {_within(run, found, 'zero')}", _hidden(run, found)
     times = abs(largest.true) / largest.sigma if largest.sigma else 0.0
     size = f"{significant(abs(largest.true), 2)} {largest.parameter.unit}, {significant(times, 2)} σ"
-    beneath = "the noise" if _noise_only(run) else "what noise and disturbances do"
+    beneath = "the noise" if _noise_only(run) else "the effect of noise and disturbances"
     return (
-        f"The perturbation stays beneath {beneath}: no true change reaches {FAR:g} σ, the clearest is that of "
-        f"{largest.name} ({size}), and {_within(run, found, 'the truth')}; {_hidden(run, found)}"
-        f"{_needed(run, largest)}"
+        f"The perturbation is below {beneath}: no true change reaches {FAR:g} σ, and the clearest is that of "
+        f"{largest.name} ({size})",
+        _within(run, found, "the truth"),
+        _hidden(run, found),
+        _needed(run, largest),
     )
 
 
 def _frames(run: RenderRun, found: tuple[Reading, ...]) -> str:
     """Whether more frames help: they do against the noise alone."""
     if any(r.noise**2 > 0.5 * r.sigma**2 for r in _changes(found)):
-        return ", more frames or light would show more"
-    return ", and more frames do not change that"
+        return "; more frames or more light would reveal smaller changes"
+    return "; more frames do not lower this limit"
 
 
 def _needed(run: RenderRun, clearest: Reading) -> str:
     """How many frames would show a change, where any number does: they lower the noise and nothing else."""
     allowed = (clearest.true / FAR) ** 2 - (clearest.sigma**2 - clearest.noise**2)
     need = math.ceil(run.frames * clearest.noise**2 / allowed) if allowed > 0.0 else math.inf
-    return f"; about {need} frames would show it" if need <= MOST_FRAMES else ""
+    return f"about {need} frames would reveal the clearest change" if need <= MOST_FRAMES else ""
 
 
 def limited(run: RenderRun) -> str:
@@ -241,19 +244,21 @@ def limited(run: RenderRun) -> str:
     found = readings(run, run.judged)
     about = next((r for r in found if r.group == ANGLE_GROUP), max(found, key=lambda r: abs(r.ratio)))
     body, share = limits(run.reading, about)
-    what = body if body == NOISE else f"motions of {body}"
+    what = f"{body} causes" if body == NOISE else f"motions of {body} cause"
     return (
-        f"σ of {about.name}, {significant(about.sigma, 2)} {about.parameter.unit}, is limited by {what} "
-        f"({share_text(share)} of its variance)"
+        f"{what} {share_text(share)} of the variance of {about.name} (σ {significant(about.sigma, 2)} "
+        f"{about.parameter.unit})"
     )
 
 
-def _misled(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> str:
+def _misled(run: RenderRun, found: tuple[Reading, ...], off: list[Reading]) -> tuple[str, ...]:
     own = [r for r in off if r.camera] or _changes(tuple(off)) or off
     worst = max(own, key=lambda r: abs(r.ratio))
     return (
-        f"{_score(found, off)}: the worst, {worst.name}, is read as {worst.read} and is {worst.shown(worst.true)}, "
-        f"wrong by {residual_text(abs(worst.ratio)).lstrip('+')} σ{_share(worst)}; {_cause(run, worst, len(found))}"
+        _score(found, off),
+        f"the worst is {worst.name}, with a reading of {worst.read} and a true value of {worst.shown(worst.true)}: an "
+        f"error of {residual_text(abs(worst.ratio)).lstrip('+')} σ{_share(worst)}",
+        _cause(run, worst, len(found)),
     )
 
 
@@ -267,15 +272,15 @@ def _score(found: tuple[Reading, ...], off: list[Reading], how: str = "") -> str
 
 def _share(worst: Reading) -> str:
     if abs(worst.error) > abs(worst.true):
-        return ", which is more than the change itself"
+        return ", larger than the change itself"
     return f" or {significant(100.0 * abs(worst.error / worst.true), 2, floor=0.0)} % of the change"
 
 
 def _unknown(run: RenderRun) -> str:
-    """What is wrong with a motion that an estimator takes for something else."""
+    """Why an estimator misreads a motion."""
     if run.estimators[run.judged].stated:
-        return "larger than stated"
-    return f"that the {_told(run)} does not know"
+        return "larger than the prior expects"
+    return f"outside the family of the {_told(run)}"
 
 
 def _cause(run: RenderRun, worst: Reading, count: int) -> str:
@@ -302,19 +307,20 @@ def _cause(run: RenderRun, worst: Reading, count: int) -> str:
             most = "the cause is" if share > 1.0 - _EXPLAINED else "most of it is"
             return (
                 f"{most} a motion {_unknown(run)} ({text}), read as {worst.parameter.symbol} by "
-                f"{worst.shown(part, sign=True)} {worst.parameter.unit}, which more frames do not cure: see Crosstalk"
+                f"{worst.shown(part, sign=True)} {worst.parameter.unit}; more frames do not reduce it: see Crosstalk"
             )
         return f"motions {_unknown(run)} add up to it ({_largest(parts)}): see Crosstalk"
     uncovered = joined([name for camera in used for name in found[camera].uncovered])
     if uncovered and run.estimators[run.judged].stated:
-        return f"{uncovered} take part, of which the crosstalk table knows nothing: see Residuals"
+        return f"{uncovered} contribute, which the crosstalk table does not contain: see Residuals"
     if uncovered:
         return (
-            f"{_ignores(run, uncovered)}, nor does the crosstalk table, and more frames do not cure it: see Residuals"
+            f"{_ignores(run, uncovered)}, and the crosstalk table does not contain them; more frames do not reduce the "
+            "error: see Residuals"
         )
     if parts:
-        return f"motions {_unknown(run)} take part ({_largest(parts)}): see Crosstalk and Residuals"
-    return "first-order crosstalk does not explain it, motions may be too large for it: see Residuals"
+        return f"motions {_unknown(run)} contribute ({_largest(parts)}): see Crosstalk and Residuals"
+    return "first-order crosstalk does not explain the error, motions may be too large for it: see Residuals"
 
 
 NAMED = 4
@@ -327,25 +333,28 @@ def _largest(parts: Mapping[str, float]) -> str:
 
 
 def _ignores(run: RenderRun, uncovered: str) -> str:
-    return f"the {_told(run)} knows nothing of {uncovered}"
+    return f"the {_told(run)} does not model {uncovered}"
 
 
-def _series_verdict(run: RenderRun, series: TimeSeries, found: tuple[Reading, ...], off: list[Reading]) -> str:
+def _series_verdict(
+    run: RenderRun, series: TimeSeries, found: tuple[Reading, ...], off: list[Reading]
+) -> tuple[str, ...]:
     span = f"over {len(series.times)} times from {moment(float(series.times[0]))} to {moment(float(series.times[-1]))}"
     if not off:
-        return f"Followed {span}: {_within(run, found, 'the truth', 'RMS; ')}; {_hidden(run, found)}"
+        return f"{_within(run, found, 'the truth', 'RMS; ')}, {span}", _hidden(run, found)
     worst = max([r for r in off if r.camera] or off, key=lambda r: abs(r.ratio))
     unit = worst.parameter.unit
     uncovered = joined([name for camera in run.crosstalk for name in systematics(run, camera).uncovered])
     if run.estimators[run.judged].stated:
-        why = f"motions {_unknown(run)} take part"
+        why = f"motions {_unknown(run)} contribute"
     else:
-        why = _ignores(run, uncovered) if uncovered else f"motions {_unknown(run)} take part"
+        why = _ignores(run, uncovered) if uncovered else f"motions {_unknown(run)} contribute"
     size = "the noise is" if _noise_only(run) else "σ is"
     return (
-        f"{_score(found, off, ' (RMS)')}, {span}: the worst, {worst.name}, is wrong by {worst.shown(worst.error)} "
-        f"{unit} RMS where it truly changes by {worst.shown(worst.true)} {unit} RMS and {size} "
-        f"{worst.shown(worst.sigma)} {unit}; {why}, which more frames do not cure: see Time course"
+        f"{_score(found, off, ' (RMS)')}, {span}",
+        f"the worst is {worst.name}, with an error of {worst.shown(worst.error)} {unit} RMS for a true change of "
+        f"{worst.shown(worst.true)} {unit} RMS; {size} {worst.shown(worst.sigma)} {unit}",
+        f"{why}; more frames do not reduce the error: see Time course",
     )
 
 
@@ -356,7 +365,7 @@ def _dimmed(run: RenderRun) -> str:
     if not lost:
         return ""
     names = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in lost)
-    return f"; light is lost on the way ({names} of the nominal light left)"
+    return f"light is lost on the way ({names} of the nominal light arrive)"
 
 
 def sharpness_lost(quality: ImageQuality) -> tuple[float, str, str]:
@@ -380,7 +389,7 @@ def _blurred(run: RenderRun) -> str:
     if run.quality is None:
         return ""
     share, where, change = sharpness_lost(run.quality)
-    return f"; the MTF at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
+    return f"the MTF at Nyquist {where}, falls {change}: see Image quality" if share > _SOFTER else ""
 
 
 def alarm_limit(count: int) -> float:
@@ -403,10 +412,10 @@ def _unstated(run: RenderRun, found: tuple[Reading, ...], told: tuple[str, ...])
     largest = joined([excess.text for excess in beyond[:NAMED]])
     more = f" and {len(beyond) - NAMED} more" if len(beyond) > NAMED else ""
     stated = run.experiment.stated
-    who = "nothing is stated to move" if stated is None else f"the disturbances {stated.name} state less"
+    who = "there is no prior" if stated is None else f"the prior {stated.name} expects less"
     return (
-        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, and {who}; a measurement "
-        "of such an instrument would not tell",
+        f"σ does not hold for {joined([r.name for r in off])}: the job moves {largest}{more}, but {who}; a measurement "
+        "of such an instrument would not show it",
     )
 
 

@@ -60,10 +60,10 @@ PLACES = {"left": 1.0, "centre": 0.0, "right": -1.0}
 """Fields of which results are named."""
 
 WAVELENGTH = 650e-9
-"""Of the waves in which wavefront errors are told, metres."""
+"""Wavelength that is the unit of wavefront errors, metres."""
 
 RINGS = 7
-"""Of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
+"""Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
 EDGED, EDGED_RINGS = (DEGREE, 10, 12, 14), 14
 """Degrees of the polynomials of a pupil that edges of surfaces cut, the first that do, and rings of its quadrature."""
@@ -447,4 +447,4 @@ class _Mean:
 
 
 _SOME = 1e-3
-"""Of a stop's area, in units of its radius: what is darker has no mean."""
+"""Smallest lit area of a stop, in units of its radius squared, for which a mean is defined."""

@@ -30,8 +30,9 @@ _BLUR_STEP = 1.25
 """From one class to the next beyond ``SPOT_RANGES``, those of blurred spots."""
 
 MOST_PHASE = 400.0
-"""Of the last class, radians from the middle to the edge of the pupil: 42 000 nodes. A spot that needs more is spread
-over some hundred times the area of a CCD."""
+"""Largest phase of the last class, radians from the middle to the edge of the pupil: 42 000 nodes. A spot that needs
+more is spread over some hundred times the area of a CCD.
+"""
 
 BLUR_PHASE = 1.5
 """Phase that a blur is counted with, of that of a tilt as steep as its steepest ray's. A tilt turns along one
@@ -74,7 +75,7 @@ class ImageChecks:
     light: float = 0.0
 
     def add(self, difference: np.ndarray, light: np.ndarray) -> None:
-        """Of further images.
+        """Add the checks of further images.
 
         Args:
             difference: (B,) of the two rules.
@@ -124,7 +125,7 @@ class NodeClasses:
         return np.array(out)
 
     def phase(self, number: int) -> float:
-        """Of the far end of a class, radians."""
+        """Largest phase of a class, radians."""
         return float(self.phase_per_pixel * np.hypot(*self.half) * self.reached[number])
 
     @property
@@ -134,11 +135,11 @@ class NodeClasses:
         return rings * arms
 
     def nodes(self, number: int) -> PupilNodes:
-        """Of a class."""
+        """Pupil nodes of a class."""
         return quadrature.disk_for(self.phase(number))
 
     def second_nodes(self, number: int) -> PupilNodes:
-        """Of the check of a class."""
+        """Pupil nodes of the second quadrature, which checks a class."""
         return quadrature.second_disk_for(self.phase(number))
 
     def class_of(

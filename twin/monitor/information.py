@@ -65,7 +65,7 @@ class Information:
         return float(np.sqrt(np.mean(self.splits[name].sigma ** 2)))
 
     def sigma_before(self, name: str) -> float:
-        """The same without any measurement."""
+        """Standard deviation of a quantity without any measurement, SI."""
         return float(np.sqrt(np.mean(self.splits[name].sigma_before ** 2)))
 
     def slopes(self, name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -170,7 +170,7 @@ class MonitorBeams:
 
     @cached_property
     def numerical_aperture(self) -> float:
-        """Of the returned beam at the CCD, the largest among the cameras."""
+        """Numerical aperture of the returned beam at the CCD, the largest among the cameras."""
         scales = [np.linalg.svd(m.first_order.scale[0], compute_uv=False) for m in self.instrument.cameras.values()]
         widest = max(channel.aperture for channel in self.instrument.channels)
         return 0.5 * widest / float(np.min(scales))
@@ -180,12 +180,12 @@ class MonitorBeams:
 
     @cached_property
     def coarse(self) -> MonitorBeams:
-        """The same with few nodes: enough for means over the aperture, which is a smooth function's integral."""
+        """These beams with few nodes: enough for means over the aperture, the integral of a smooth function."""
         return self._with(quadrature.disk(_COARSE_RINGS))
 
     @cached_property
     def scout(self) -> MonitorBeams:
-        """The same with the fewest nodes: enough for the change of a smooth function over the aperture."""
+        """These beams with the fewest nodes: enough for the change of a smooth function over the aperture."""
         return self._with(quadrature.disk(_SCOUT_RINGS))
 
     @cached_property
@@ -195,12 +195,14 @@ class MonitorBeams:
 
     @cached_property
     def _smooth(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N, T)."""
+        """Series of smooth functions: Zernike terms from values on the nodes (T, N); values, d/dx, d/dy from terms (N,
+        T).
+        """
         return self._series(MAP_TERMS)
 
     @cached_property
     def _rough(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The same of functions with fine structure."""
+        """Series of functions with fine structure, with the matrices of `_smooth`."""
         return self._series(ROUGH_TERMS)
 
     def _series(self, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -247,7 +249,7 @@ class MonitorBeams:
         return self.face_radius[:, None, None] * np.stack([self.nodes.x, self.nodes.y], axis=-1)
 
     def targets(self, states: int) -> np.ndarray:
-        """The same for as many states, channel-major, (C*S, N, 2)."""
+        """Values of `target` repeated for each state, channel-major, (C*S, N, 2)."""
         return np.repeat(self.target, states, axis=0)
 
     def _aim_nominal(self) -> Aimed:

@@ -76,8 +76,8 @@ def ray_tangents(path: MonitorBeams, motions: Sequence[ElementaryMotion]) -> tup
 
 
 def _of_one_structure(path: MonitorBeams, states: list[State]) -> list[State]:
-    """The same states, of which the first names the highest figure term of every mirror, as none: so the derivatives by
-    any motions take one and the same kernel, which is by far the longest to compile.
+    """These states in one structure: the first of them names the highest figure term of every mirror, with amplitude 0.
+    All derivatives by motions then share one kernel, whose compilation takes most of the time.
     """
     if not states:
         return states

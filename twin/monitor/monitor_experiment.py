@@ -112,7 +112,7 @@ class MonitorExperiment:
         return MonitorSize(len(self.path.channels), *self.path.shape, phase, frames, times, pictures)
 
     def stating(self, resolved: ResolvedJob) -> MonitorExperiment:
-        """The same instrument, with all that has been worked out of it, under another job's stated disturbances.
+        """Experiment on the same instrument, with everything computed for it, under the prior of another job.
 
         Args:
             resolved: the job; its instrument, cameras and detector must be this one's.
@@ -281,7 +281,9 @@ class MonitorExperiment:
 
     @cached_property
     def disturbances(self) -> Disturbances | None:
-        """The same with what it does to spots and cameras, for the analysis. Raises InputError as `stated`."""
+        """The prior with its effect on spots and cameras, for the analysis; None without a prior. Raises InputError as
+        `stated`.
+        """
         if self.stated is None:
             return None
         return disturbances_of(self.stated, self.path, self.thermal, self.instrument, self.backend)

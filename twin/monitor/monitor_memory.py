@@ -52,23 +52,24 @@ STARTED = 290e6
 what the heap keeps of arrays that are freed; bytes.
 """
 DRAWN = 410e6
-"""The same when it is drawn and written, the most of a small one; bytes."""
+"""Memory of a job while it is drawn and written, which is most of the memory of a small one; bytes."""
 _PIXEL = 380.0
-"""Of a spot's image while it is measured and while it is worked out what limits that, for each pixel: photons 24, fixed
-pattern 16, mean frames and maps of the fits before and after 64, images and maps of a stated state 85, the fit at work
-190; bytes."""
+"""Bytes per pixel of a spot's image during the measurement and the analysis of its limits: photons 24, fixed pattern
+16, mean frames and maps of the fits before and after 64, images and maps of a state of the prior 85, the current fit
+190.
+"""
 _RAY = 600.0
-"""Of a traced ray with its derivatives, its aiming and the polynomials of the pupil at its node, bytes."""
+"""Bytes per traced ray, with its derivatives, its aiming and the polynomials of the pupil at its node."""
 GREY = 2.0
-"""Of a pixel of a recorded frame."""
+"""Bytes per pixel of a recorded frame."""
 _OF_COURSE = 6.0
-"""Of a pixel of each time of a course: expected photons in single precision, and a first frame."""
+"""Bytes per pixel and time of a course: expected photons in single precision, and a first frame."""
 _IN_FILES = 2.0
-"""Of a pixel of the frames of one channel, while they become a file."""
+"""Bytes per pixel of the frames of one channel while they become a file."""
 WRITTEN = 60.0
-"""Of a pixel of a spot's image when it is drawn and written: photons, their file, means."""
+"""Bytes per pixel of a spot's image while it is drawn and written: photons, their file, means."""
 _OF_STATE = 24.0
-"""Of a pixel of each state that is rendered at once: photons, and what its noise does to the spot."""
+"""Bytes per pixel of each state that is rendered at once: photons, and the effect of their noise on the spot."""
 
 _ORDINARY = 600e6
 """A job that needs no more is never refused, bytes: what is free changes while other processes start, and what a study
@@ -99,7 +100,7 @@ class MonitorSize:
 
     @property
     def rays(self) -> int:
-        """Of sharp spots of all channels, wherever on their CCDs."""
+        """Number of rays of sharp spots of all channels, wherever they are on their CCDs."""
         return self.spots * NodeClasses(self.phase, (0.5 * self.rows, 0.5 * self.columns)).sharp_count
 
     def parts(self, detector: EmvaDetector) -> Mapping[str, float]:
@@ -120,7 +121,7 @@ class MonitorSize:
         }
 
     def bytes(self, detector: EmvaDetector) -> float:
-        """Of all together, above the imported program.
+        """Memory of all parts together, in addition to the imported program.
 
         Args:
             detector: of the area CCDs.

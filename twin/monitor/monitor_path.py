@@ -73,7 +73,7 @@ class MonitorPath(MonitorBeams):
 
     @cached_property
     def node_classes(self) -> NodeClasses:
-        """Of this instrument's images."""
+        """Classes of pupil nodes for this instrument's images."""
         phase = 2.0 * np.pi * self.numerical_aperture * self.pitch / self.wavelength
         return NodeClasses(phase, (0.5 * self.shape[0], 0.5 * self.shape[1]))
 
@@ -343,7 +343,7 @@ class MonitorPath(MonitorBeams):
         return np.swapaxes(photons, 0, 1), wanted
 
     def _second_field(self, states: Sequence[State], known: CoarseTrace, number: int) -> PupilField:
-        """The same beams at the nodes that check a class."""
+        """Field of the states' beams at the nodes that check a class."""
         if number not in self._second:
             self._second[number] = self._with(self.node_classes.second_nodes(number))
         second = self._second[number]

@@ -101,7 +101,7 @@ class Reading:
         return f"{self.shown(self.value)} ± {self.shown(self.sigma)} {self.parameter.unit}"
 
     def each(self, of: Callable[[Any], Any]) -> Reading:
-        """The same row with its numbers replaced.
+        """Row of the same reading with its numbers replaced.
 
         Args:
             of: array of a number over the states -> what takes its place.
@@ -124,7 +124,7 @@ class ReadingTable:
     left: Mapping[str, Mapping[str, Any]]
 
     def __iter__(self) -> Iterator[Reading]:
-        """Its rows."""
+        """Iterate over the rows."""
         return iter(self.rows)
 
     def at(self, state: int) -> ReadingTable:

@@ -390,7 +390,7 @@ class CourseSmoother:
         return found.at(slice(None))
 
     def take(self, shift: np.ndarray, before: NoiseParts, after: NoiseParts) -> None:
-        """The same of states that were measured otherwise.
+        """Take the shifts and the noise of states that were measured elsewhere.
 
         Args:
             shift: (S, 2 C) after - before of the next states, px.
@@ -403,7 +403,7 @@ class CourseSmoother:
         self._shifts.append(shift)
 
     def smoothed(self) -> SmoothedCourse | None:
-        """Of all that was taken; None where nothing is stated to move, and of a single time."""
+        """Smoothed course of all states that were taken; None without a prior, and for a single time."""
         stated, noise, times = self._stated, self._noise, self._times
         if stated is None or noise is None or len(times) < 2:
             return None

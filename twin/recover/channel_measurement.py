@@ -337,7 +337,7 @@ class ChannelMeasurement:
         return np.outer(own - by_shape - moved, own - by_shape - moved)
 
     def noise_parts(self, number: int) -> tuple[NoiseParts, NoiseParts]:
-        """Of the spot before and after, for the covariance of a series of shifts.
+        """Noise of the spot before and after, for the covariance of a series of shifts.
 
         Args:
             number: of the state after, from 1 on.

@@ -81,7 +81,7 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
     swapped = [channel.name for channel in channels if _swapped(channel)]
     if swapped:
         out.append(
-            f"before and after seem to be exchanged ({', '.join(swapped)}): by what the files say themselves, the "
+            f"before and after seem to be exchanged ({', '.join(swapped)}): by their time stamps, the "
             "frames after were recorded before those before; all changes then have the wrong sign"
         )
     elif times is not None:
@@ -89,14 +89,14 @@ def order_warnings(channels: Sequence[ChannelFrames], times: Sequence[float] | N
         if mixed:
             name, at = next(iter(mixed.items()))
             out.append(
-                f"{', '.join(mixed)}: by what the files say themselves, the frames of the series were recorded in "
-                f"another order than `times` says, first {name} at {moment(times[at])}"
+                f"{', '.join(mixed)}: by their time stamps, the frames of the series were recorded in an "
+                f"order that differs from `times`, first {name} at {moment(times[at])}"
             )
     return tuple(out)
 
 
 def _recorded(state: StateFrames) -> tuple[datetime, ...]:
-    """Of all files; empty where one does not say."""
+    """Recording times of all files; empty if one file gives none."""
     found = [time for time, _ in state.origin if time is not None]
     return tuple(found) if found and len(found) == len(state.origin) else ()
 

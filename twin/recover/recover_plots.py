@@ -18,7 +18,7 @@ from twin.recover.recover_run import RecoverRun, state_name
 from twin.run import svg
 
 LIMIT = 5.0
-"""Of the colour scale of residuals, sigmas."""
+"""Limit of the colour scale of residuals, sigmas."""
 
 
 def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, SpotResult, np.ndarray]]]]:
@@ -36,7 +36,7 @@ def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, Spo
 
 
 def _extent(spot: SpotResult) -> tuple[float, float, float, float]:
-    """Of an image on the CCD."""
+    """Extent of an image on the CCD."""
     (row, column), (height, width) = spot.frames.offset, spot.mean.shape
     return column - 0.5, column + width - 0.5, row + height - 0.5, row - 0.5
 

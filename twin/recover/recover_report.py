@@ -16,7 +16,7 @@ from twin.recover.channel_measurement import ChannelResult, SpotResult
 from twin.recover.recover_plots import Line, changes_svg, residuals_svg, spots_svg
 from twin.recover.recover_run import RecoverRun, state_name
 from twin.run.artefact import FAR, Cell, SvgFigure, Table, decimals_for, fixed, plain, significant
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 
 __all__ = ["KIND", "recover_numbers", "recover_report"]
 
@@ -63,20 +63,21 @@ def _name(run: RecoverRun) -> str:
 
 
 def _corrected(run: RecoverRun) -> tuple[int, int, SpotResult | None, str]:
-    """Sets of frames that were corrected, of how many, the dearest of them and whose it is."""
+    """Number of corrected sets of frames, of how many, the one whose correction costs most, and its name."""
     every = [
         (result.channel.name, state_name(run.times, k), spot)
         for result in run.channels
         for k, (_, spot) in enumerate(result.states())
     ]
-    dirty = [one for one in every if not one[2].clean]
-    if not dirty:
+    corrected = [one for one in every if not one[2].clean]
+    if not corrected:
         return 0, len(every), None, ""
-    channel, name, worst = max(dirty, key=lambda one: one[2].cost)
-    return len(dirty), len(every), worst, f"{channel} {name}"
+    channel, name, worst = max(corrected, key=lambda one: one[2].cost)
+    return len(corrected), len(every), worst, f"{channel} {name}"
 
 
-def _verdict(run: RecoverRun) -> str:
+def _verdict(run: RecoverRun) -> tuple[str, tuple[str, ...]]:
+    """The verdict, and the sentences that follow it."""
     reading = run.last
     found = reading.table.of(reading.judged)
     title = reading.estimators[reading.judged].title
@@ -85,40 +86,43 @@ def _verdict(run: RecoverRun) -> str:
     basis = "noise alone" if reading.disturbances is None else f"noise and disturbances {reading.disturbances.name}"
     if out:
         clearest = max(out, key=lambda one: abs(one.size))
-        stand = "stands" if len(out) == 1 else "stand"
-        first = (
-            f"{len(out)} of {len(found)} changes that the {title} reads{when} {stand} out of {FAR:g} σ (σ: {basis}), "
-            f"the clearest is {clearest.name}, {clearest.read}"
-        )
+        exceed = "exceeds" if len(out) == 1 else "exceed"
+        first = f"{len(out)} of {len(found)} readings of the {title}{when} {exceed} {FAR:g} σ (σ: {basis})"
+        second = f"the clearest change is {clearest.name}, {clearest.read}"
     else:
         parts = []
         for p in parameters.CAMERA_PARAMETERS:
             worst = max((one for one in found if one.parameter == p), key=lambda one: one.sigma)
             parts.append(f"{p.symbol} {significant(FAR * worst.sigma, 2, floor=0.0)} {p.unit}")
         first = (
-            f"No change is seen{when}: none of the {len(found)} that the {title} reads stands out of {FAR:g} σ (σ: "
-            f"{basis}), which hides changes below {', '.join(parts)}"
+            f"No change is detected{when}: none of the {len(found)} readings of the {title} exceeds {FAR:g} σ (σ: "
+            f"{basis})"
         )
+        second = f"changes below {', '.join(parts)} would not be detected"
     about = next((one for one in found if one.group == ANGLE_GROUP), max(found, key=lambda one: abs(one.size)))
     limit = ""
     if reading.disturbances is not None:
         body, share = limits(reading, about)
         what = body if body == NOISE else f"motions of {body}"
         size = f"{significant(about.sigma, 2)} {about.parameter.unit}"
-        limit = f"σ of {about.name}, {size}, is limited by {what} ({share_text(share)} of its variance)"
+        limit = f"{what} cause {share_text(share)} of the variance of {about.name} (σ {size})"
+        if body == NOISE:
+            limit = f"{what} causes {share_text(share)} of the variance of {about.name} (σ {size})"
     count, total, worst_spot, where = _corrected(run)
     cleaned = "the frames were taken as they are" if run.setup.test.corrections == "none" else "the frames are clean"
     if worst_spot is not None:
         most = round(100.0 * worst_spot.cost, 1)
         cost = f"up to {plain(most, 3)} %" if most >= 0.1 else "less than 0.1 %"
-        cleaned = f"{count} of {total} sets of frames were corrected, which costs {cost} of σ by noise ({where})"
+        cleaned = f"artefacts were corrected in {count} of {total} sets of frames"
+        cleaned += f", which increases the noise part of σ by {cost} ({where})"
     doubt = "" if reading.sigma_holds else "σ does not hold for this measurement: see the warnings"
-    return one_sentence(first, limit, cleaned, doubt)
+    return answer(first, doubt, second, limit, cleaned)
 
 
 def recover_report(run: RecoverRun) -> Report:
     """Report of the command."""
     reading = run.last
+    verdict, more = _verdict(run)
     facts = [
         ("instrument", _name(run) if run.setup.model is not None else f"geometry of {_name(run)}"),
         ("spot's shape", "from the model" if run.setup.test.template == "twin" else "learnt from the frames before"),
@@ -133,9 +137,9 @@ def recover_report(run: RecoverRun) -> Report:
     if transfers:
         sections.append(_transfer(transfers))
     return Report(
-        title=f"{_name(run)}: what measured frames say",
-        verdict=_verdict(run),
-        lead=(f"{assumed(reading)}.",),
+        title=f"{_name(run)}: readings of measured frames",
+        verdict=verdict,
+        lead=(*more, f"{assumed(reading)}."),
         facts=tuple(facts),
         summary=_summary(run),
         sections=tuple(sections),
@@ -154,7 +158,7 @@ def _warnings(run: RecoverRun) -> tuple[str, ...]:
     if run.smoothed is not None and not run.smoothed.consistency.agrees:
         # each time may agree with what moves, and all of them not with how it goes on in time
         found += (
-            f"the series contradicts the stated disturbances {run.smoothed.name} or how it goes on in time: chi-square "
+            f"the series contradicts the prior {run.smoothed.name} or its time laws: chi-square "
             f"{significant(run.smoothed.consistency.chi_square)} of {run.smoothed.consistency.degrees} coordinates "
             f"where {run.smoothed.consistency.limit:.1f} is exceeded with a chance of {FALSE_ALARM:g}; σ of filtered "
             "and smoothed changes does not hold",

@@ -70,7 +70,7 @@ class RecoverRun:
 
     @property
     def times(self) -> tuple[float, ...] | None:
-        """Of the states after, seconds; None for a single one."""
+        """Times of the states after, seconds; None for a single state."""
         return self.setup.test.times
 
     @property
@@ -80,9 +80,7 @@ class RecoverRun:
 
     @cached_property
     def worst(self) -> tuple[int, Consistency] | None:
-        """Of the states the one whose shifts agree least with the stated disturbances, and how they do; None without a
-        statement.
-        """
+        """The state whose shifts agree least with the prior, and its consistency; None without a prior."""
         found = [reading.recovery for reading in self.readings]
         if len(found) == 1:
             return None if self.last.consistency is None else (0, self.last.consistency)
@@ -142,9 +140,9 @@ def run_recover(
     ground = None if bench.calibration is None else bench.calibration.ground
     centroid = setup.test.analysis.centroid
     times = setup.test.times
-    source = f"the data sheet {setup.detector.name} says"
+    source = f"the data sheet {setup.detector.name} gives"
     if setup.test.photon_transfer == "measured":
-        source = "the frames in the dark and in even light say"
+        source = "the frames in the dark and in even light give"
     tables: Mapping[str, CameraCrosstalk] | None = None
     readings: list[MonitorReading] = []
     for k, one in enumerate(recoveries):
@@ -235,7 +233,7 @@ def _measured(
 def _plain(
     setup: MeasurementSetup, bench: _Bench, calibration: MonitorCalibration, channels: Sequence[ChannelFrames]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """As the main job measures a state and a course, as many states at once as there."""
+    """Recover the states in the same way, and in the same portions, as the main job does."""
     before = np.stack([channel.before.frames for channel in channels])
     states = len(channels[0].after)
     smoother = _smoother(setup, bench)
@@ -258,7 +256,7 @@ def _plain(
 def _corrected(
     setup: MeasurementSetup, bench: _Bench, found: Sequence[ChannelMeasurement]
 ) -> tuple[list[Recovery], SmoothedCourse | None]:
-    """Of spots that have been measured channel by channel."""
+    """Recover states whose spots have been measured channel by channel."""
     calibration = bench.calibration
     if calibration is None:
         template = found[0].shape
@@ -279,7 +277,7 @@ def _corrected(
 
 
 def _smoother(setup: MeasurementSetup, bench: _Bench) -> CourseSmoother | None:
-    """Of a series of which is stated how it goes on in time."""
+    """Smoother of a series whose prior has time laws; None for a single state or without a prior."""
     times = setup.test.times
     if times is None or bench.disturbances is None:
         return None
@@ -301,7 +299,7 @@ def _joined(positions: Sequence[SpotPositions]) -> SpotPositions:
 
 
 def _spot_issues(setup: MeasurementSetup, channels: Sequence[ChannelFrames], error: SpotError) -> list[Issue]:
-    """Of spots that are numbered state by state."""
+    """Issues of spots that are numbered state by state."""
     out = []
     for number, reason in error.reasons.items():
         channel = channels[number % len(channels)]
@@ -330,8 +328,8 @@ def _worst(
     suspect: Callable[[SpotResult], tuple[float, ...] | None],
     first: int = 0,
 ) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Of each channel with suspect spots the worst: where, and what makes it so. `suspect` gives that, largest for the
-    worst, or None for nothing.
+    """The worst state of each channel with suspect spots: its place, and the numbers that make it suspect. `suspect`
+    gives these numbers, largest for the worst, or None.
     """
     for result in results:
         judged = (
@@ -362,15 +360,17 @@ def _unlike(results: Sequence[ChannelResult], times: Sequence[float] | None, fir
     state after that there is.
     """
     return tuple(
-        f"{where}: the spot has not the calibrated shape, reduced chi-square of its"
-        f" core {chi:.2f} over {pixels} pixels: defocus, a reflection too near to be told apart, or vibration,"
-        " which `vibration: fitted` allows for; sigma does not hold what it does to the place"
+        f"{where}: the spot does not have the calibrated shape, reduced chi-square of its"
+        f" core {chi:.2f} over {pixels} pixels; possible causes are defocus, a reflection too near to be separated, and"
+        " vibration (`vibration: fitted` allows for it); sigma does not cover the effect on the position"
         for where, (chi, pixels) in _worst(results, times, lambda spot: None if spot.fits else spot.core, first)
     )
 
 
 def _coarse(channels: Sequence[ChannelFrames], setup: MeasurementSetup) -> tuple[str, ...]:
-    """Of CCDs whose noise does not spread over the steps of their grey values, by data sheet or as measured."""
+    """Warnings of CCDs whose noise, from the data sheet or measured, is too small for the steps of their grey
+    values.
+    """
     if setup.test.photon_transfer == "stated":
         return told_of_steps(channels[0].raw_noise, f"area CCD {setup.detector.name}")
     whose = f"area CCD {setup.detector.name}, as measured,"

@@ -148,7 +148,7 @@ class Record(Generic[S]):
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
     def of_part(self, part: Callable[[T], S]) -> list[Quantity[T]]:
-        """Its quantities for the record of something of which this record's source is a part."""
+        """Quantities of this record for the record of an object of which this record's source is a part."""
 
         def through(of: Callable[[S], Any]) -> Callable[[T], Any]:
             return lambda source: of(part(source))

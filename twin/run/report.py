@@ -35,12 +35,26 @@ class Section:
     closed: bool = False
 
 
-def one_sentence(*parts: str) -> str:
-    """Statements, each with or without its full stop, as one sentence with semicolons; empty ones are left out."""
-    said = [part.strip().rstrip(".") for part in parts if part.strip()]
-    # a capital that does not begin a symbol or an abbreviation
-    rest = [part[0].lower() + part[1:] if re.match(r"[A-Z][a-z]|A ", part) else part for part in said[1:]]
-    return "; ".join([*said[:1], *rest]) + "."
+MOST_SENTENCES = 2
+"""Sentences of a verdict; whatever else was found follows it."""
+
+
+def sentence(statement: str) -> str:
+    """A statement, with or without its full stop, as a sentence. A first word of small letters gets a capital, so
+    that a statement does not begin with a name; a path or a symbol stays as it is.
+    """
+    text = statement.strip().rstrip(".")
+    return f"{text[:1].upper() + text[1:] if re.match(r'[a-z]+[ ,:;]', text) else text}."
+
+
+def answer(*statements: str) -> tuple[str, tuple[str, ...]]:
+    """The verdict of a report, and the sentences that follow it in its lead.
+
+    Args:
+        statements: the most important first, each a sentence with or without its full stop; empty ones are left out.
+    """
+    said = [sentence(one) for one in statements if one.strip()]
+    return " ".join(said[:MOST_SENTENCES]), tuple(said[MOST_SENTENCES:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +63,8 @@ class Report:
 
     Attributes:
         title: of the report.
-        verdict: what was found, how well, what limits it, what to look at: one sentence worked out from the numbers.
-        lead: what else was found, a few sentences.
+        verdict: what was found and how well: at most two sentences, computed from the numbers.
+        lead: what limits it, where to look, what else was found: a few sentences.
         facts: what was set up, (label, text).
         summary: the main table, also printed in the terminal.
         sections: the rest of the report.
@@ -79,9 +93,9 @@ class Report:
         return (self.summary, *(artefact for section in self.sections for artefact in section.artefacts))
 
     def __post_init__(self) -> None:
-        """Refuse a verdict that is not one sentence, and two artefacts of one name: they would be one file."""
-        if not self.verdict.endswith(".") or re.search(r"[.!?]\s+[A-Z]", self.verdict):
-            raise ValueError(f"not one sentence: {self.verdict!r}")
+        """Refuse a verdict of more than two sentences, and two artefacts of one name: they would be one file."""
+        if not self.verdict.endswith(".") or len(re.findall(r"[.!?]\s+[A-Z]", self.verdict)) >= MOST_SENTENCES:
+            raise ValueError(f"not one or two sentences: {self.verdict!r}")
         names = [artefact.name for artefact in self.artefacts if artefact.within is None]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:

@@ -61,7 +61,7 @@ class _Bench:
         return MonitorExperiment(self._resolved, self.backend)
 
     def stating(self, resolved: ResolvedJob) -> _Bench:
-        """The same one under other stated disturbances."""
+        """Bench of the same instrument under another prior."""
         return _Bench(resolved, self._name, self)
 
 
@@ -95,7 +95,7 @@ class InstrumentTwin:
 
     @property
     def name(self) -> str:
-        """Of the instrument."""
+        """Name of the instrument."""
         return self.resolved.instrument.name
 
     @property
@@ -140,7 +140,7 @@ class InstrumentTwin:
         return self._bench.experiment.state(self.resolved.job)
 
     def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> InstrumentTwin:
-        """The same instrument with these bodies perturbed.
+        """Return this instrument with the given bodies perturbed.
 
         Args:
             perturb: motions in words, such as ``"M2 shift z 3 um"``, or node -> keys and unit strings of `perturb:` in
@@ -169,7 +169,7 @@ class InstrumentTwin:
             raise InputError(problem.at("", key=("perturb",))) from None
 
     def with_disturbances(self, disturbances: str | Mapping[str, Any]) -> InstrumentTwin:
-        """The same instrument with other motions stated, on which `posterior` and all total sigmas rest.
+        """Return this instrument with another prior, on which `posterior` and all total sigmas rest.
 
         Args:
             disturbances: as `disturbances:` in a job's YAML: name of a file of the library (``launch``), path of one's

@@ -163,7 +163,7 @@ class Found:
 
     @property
     def sigma_noise(self) -> xr.DataArray:
-        """Of that what the noise of the images does."""
+        """Standard deviations from the noise of the images alone."""
         return self._root(self.covariance_noise).rename("sigma_noise")
 
     @property

@@ -64,7 +64,7 @@ class StudyRun:
 
     Attributes:
         numbers: contents of study.json.
-        verdict: what was found, in one sentence.
+        verdict: what was found, in two sentences at most.
         folder: where it is.
         fault: what the study's file says of its responses and the runs contradict; None where they do not.
         missing: figures and files that could not be made, a sentence each; all else is there.

@@ -35,8 +35,8 @@ RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
 
 DEGREES = (DEGREE, 10, 12, 14)
-"""Of the polynomials of a pupil that edges cut, the first that do: outside of the light, in the middle of an obscured
-beam, wavefronts may bend much more than in it.
+"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Outside the light, in the middle
+of an obscured beam, a polynomial wavefront may bend much more than inside.
 """
 
 MAP_POINTS = 7

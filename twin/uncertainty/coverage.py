@@ -31,9 +31,9 @@ from twin.sensors.area_detector import coarse_warnings
 from twin.uncertainty.monitor_limits import MonitorLimits, expected_covariance, find_limits, unseen_texts
 
 LEVELS = (0.68, 0.95)
-"""Of the intervals whose coverage is counted."""
+"""Levels of the intervals whose coverage is counted."""
 HALF_WIDTHS = tuple(float(np.sqrt(2.0 * gammaincinv(0.5, level))) for level in LEVELS)
-"""The same in standard deviations of a normal error."""
+"""Half widths of the intervals in standard deviations of a normal error."""
 FALSE = 1e-2
 """Chance that any of all counts falls out of its limits though every sigma is right."""
 CHUNK = 32

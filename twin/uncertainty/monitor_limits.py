@@ -42,7 +42,9 @@ stated changes: what rounding makes of a trace is 1e-10."""
 _DRAWS = 100_000
 _STATES = 6
 _PIXELS = 1 << 21  # of the images of these states that are worked on at once
-"""Of which the covariance of a shift is averaged; it differs by some per cent from one to another."""
+"""States over which the covariance of a shift is averaged, and pixels of their images that are processed at once. The
+covariance varies by some per cent between states.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +238,7 @@ def _own(stated: Disturbances) -> list[bool]:
 
 
 def _second_monitor(experiment: MonitorExperiment) -> Disturbances:
-    """The same motions seen by a monitor whose sub-aperture is on the other side of every pupil."""
+    """Disturbances of a second monitor for the same motions, with its sub-aperture on the other side of every pupil."""
     resolved = experiment.resolved
     mirrored = {name: mounted.mirrored for name, mounted in resolved.instrument.cameras.items()}
     instrument = resolved.instrument.model_copy(update={"cameras": mirrored})
@@ -271,7 +273,7 @@ def short_text(quantity: Quantity) -> str:
 
 
 def unit_text(quantity: Quantity) -> str:
-    """Its unit."""
+    """Unit of a quantity."""
     return quantity.parameter.unit
 
 

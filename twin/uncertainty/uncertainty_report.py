@@ -13,7 +13,7 @@ from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from analysis.units import ARCSEC
 from twin.run import svg
 from twin.run.artefact import Cell, SvgFigure, Table, shown_unit, significant
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer, sentence
 from twin.uncertainty.coverage import FALSE, HALF_WIDTHS, LEVELS, Coverage, UncertaintyRun
 from twin.uncertainty.monitor_limits import (
     BEST,
@@ -49,20 +49,21 @@ def limits_section(limits: MonitorLimits | None, lines: int = FEW, folded: int =
     title = "What limits the readings"
     if limits is None:
         unknown = (
-            "Nothing is stated to move, so that all sigmas are those of the noise of the images alone, and nothing can "
-            "be said of what else limits them. State what is expected to move and to warm up, disturbances: orbit in "
-            "the job or in the instrument: a file of scenes/library/disturbances or one of your own."
+            "There is no prior on disturbances. All sigmas are those of the noise of the images alone, and other "
+            "limits "
+            "are unknown. Give the expected motions and temperatures by `disturbances: orbit` in the job or in the "
+            "instrument: a file of scenes/library/disturbances or one of your own."
         )
         return Section(title, (unknown,))
     figure = SvgFigure(
         "limits",
-        "What the measurement takes away, and what is left",
-        f"Stated disturbances: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
+        "What the measurement removes, and what remains",
+        f"Prior: {limits.stated.name}. Left: standard deviation of every quantity's error after the "
         "measurement over that before it. Right: whose motions make up the variance that the posterior leaves, bodies "
         "of both cameras together.",
         _limits_svg(limits),
     )
-    text = [_verdict(limits)]
+    text = [" ".join(map(sentence, _verdict(limits)))]
     if limits.outside > RARE:
         text.append(f"{_lost(limits)}.")
     return Section(title, tuple(text), (figure, _remedies(limits), _hidden(limits), _ledger(limits, lines)), folded)
@@ -92,8 +93,7 @@ def uncertainty_report(run: UncertaintyRun) -> Report:
         )
     return Report(
         f"{limits.instrument}: what limits its monitor under {limits.stated.name}",
-        one_sentence(_verdict(limits), said),
-        (),
+        *answer(*_verdict(limits)[:1], said, *_verdict(limits)[1:]),
         (
             (
                 "Disturbances",
@@ -116,21 +116,21 @@ def _headline(limits: MonitorLimits) -> int:
     return 0
 
 
-def _verdict(limits: MonitorLimits) -> str:
-    """What is left of the headline quantity, what makes it up and what would help most."""
+def _verdict(limits: MonitorLimits) -> tuple[str, ...]:
+    """Statements: what is left of the headline quantity, what makes it up, and what would help most."""
     q = _headline(limits)
     quantity, split = limits.quantities[q], limits.splits[BEST]
     unit, name = unit_text(quantity), short_text(quantity)
     motion, share = limits.lines(BEST, q)[0]
     best = min(limits.remedies, key=lambda remedy: float(remedy.sigma[q]))
-    helped = f"of what could be added {best.what} would help most and leave {significant(best.sigma[q], 2)} {unit}"
+    helped = f"the most effective addition is {best.what}, which would leave {significant(best.sigma[q], 2)} {unit}"
     if best.sigma[q] > 0.95 * split.sigma[q]:
-        helped = "neither more frames nor points on the ground nor further spots take away 5% of it"
-    return one_sentence(
+        helped = "neither more frames nor ground points nor further spots would reduce it by 5%"
+    return (
         f"Under {limits.stated.name} the posterior leaves a standard deviation of "
         f"{significant(split.sigma[q], 2)} {unit} of the {name}, {significant(split.sigma_before[q], 2)} {unit} before "
         "the measurement",
-        f"{body_text(motion)} makes {100 * share:.0f}% of the variance that is left, noise of the images "
+        f"{body_text(motion)} contributes {100 * share:.0f}% of the remaining variance, noise of the images "
         f"{_percent(float(split.noise[q]) / float(split.sigma[q]) ** 2)}",
         helped,
     )
@@ -314,18 +314,18 @@ def _states(coverage: Coverage) -> Section:
                 low, high = (100.0 * float(end[k]) / n for end in coverage.limits(name, level))
                 cells += [100.0 * float(coverage.held(name, level)[k]) / n, f"{low:.1f} to {high:.1f}"]
             rows.append((quantity_text(quantity), name, rms, ratio, *cells))
-    said = f"{coverage.drawn} states were drawn from the stated disturbances, rendered, exposed and recovered"
+    said = f"{coverage.drawn} states were drawn from the prior, rendered, exposed and recovered"
     widths = " and ".join(f"{width:.3f}" for width in HALF_WIDTHS)
     text = [
-        f"{said}. Intervals of {widths} total sigma should hold the truth in 68 and 95% of them; beside each share "
-        f"stands what agrees with this, at a chance of {100 * FALSE:g}% that any of all falls out though every sigma "
-        "is right."
+        f"{said}. Intervals of {widths} total sigma should contain the truth in 68 and 95% of them. The range "
+        f"beside each share agrees with this; if every sigma is right, the chance that any share lies outside its "
+        f"range is {100 * FALSE:g}%."
     ]
     if lost:
         text.append(
-            f"In {lost} of them a spot left its CCD. Those that are left are calmer than is stated: their chi-square "
-            "is smaller, and so are errors that go with the motions of the spots, which the limits take into account; "
-            "the posterior's do not."
+            f"In {lost} of them a spot left its CCD. The motions of the remaining states are smaller than the prior: "
+            "their chi-square is smaller, and so are errors that are correlated with the motions of the spots. The "
+            "limits take this into account; the errors of the posterior do not change."
         )
     mean = float(np.mean(coverage.chi_square))
     text.append(
@@ -340,7 +340,7 @@ def _states(coverage: Coverage) -> Section:
 
 
 PALETTE = (svg.BLUE, svg.VERMILION, svg.GREEN, svg.ORANGE, svg.PURPLE, svg.SKY, svg.YELLOW)
-"""Of the bodies that make up most; the others are grey."""
+"""Colours of the bodies with the largest shares; the others are grey."""
 MARKS = "os^vDP*X"
 
 

@@ -19,7 +19,7 @@ from twin.validation.registry import Selection
 
 SCHEMA = "space-camera-twin/validation"
 SCHEMA_VERSION = 2
-"""Of validation.json; the version rises when a key changes its meaning or goes."""
+"""Version of validation.json; it rises when a key changes its meaning or is removed."""
 
 FILES = "artefacts"
 """Folder, in the run folder, of what the groups add; each has a folder of its prefix there."""

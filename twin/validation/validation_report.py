@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from twin.run.artefact import Data, Marked, PngFigure, SvgFigure, Table, decimals_for, fixed, plain, significant
 from twin.run.page import links, report_page, reproduce
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.run_folder import RunFolder, write_manifest
 from twin.validation.checks.check import AGREED, PAPERS, SIGMAS, VERDICTS, CheckResult, Verdict
 from twin.validation.runner import GroupRun, Validation
@@ -171,13 +171,15 @@ VERDICTS_TEXT = (
 
 
 def verdict(validation: Validation) -> str:
-    """What the checks gave, in one sentence."""
+    """What the checks gave, in two sentences."""
     counts = ", ".join(f"{validation.counts[v]} {v}" for v in VERDICTS if validation.counts[v])
     count, strange = len(validation.results), [r.id for r, _ in validation.unexpected]
-    expected = "every verdict is the one that earlier work leads one to expect"
+    expected = "all verdicts are as expected from earlier work"
     if strange:
-        expected = f"{len(strange)} not as expected: look at {', '.join(strange)}"
-    return one_sentence(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
+        expected = f"{len(strange)} of the verdicts {'is' if len(strange) == 1 else 'are'} not as expected: "
+        expected += f"look at {', '.join(strange)}"
+    told, _ = answer(f"{count} check{'' if count == 1 else 's'}: {counts or 'no verdict'}", expected)
+    return told
 
 
 def _papers(validation: Validation) -> Iterator[Section]:

@@ -58,7 +58,7 @@ class Verification:
 
     @property
     def verdict(self) -> str:
-        """In one sentence: are the files as they were, does the run come out the same, and where was it made."""
+        """In a few sentences: are the files as they were, does the run come out the same, and where was it made."""
         state, count = self.state, len(self.state.manifest.sha256)
         told = [
             f"{_files(names)} {what}"
@@ -70,7 +70,7 @@ class Verification:
             if names
         ]
         first = "; ".join(told) if told else f"All {count} files are as the run wrote them"
-        return report.one_sentence(first, *self._repeated())
+        return " ".join(map(report.sentence, (first, *self._repeated())))
 
     def _repeated(self) -> list[str]:
         if self.obstacle:
@@ -95,7 +95,7 @@ class Verification:
             out = [f"made again, {what} came out different in {_named([one.file for one in worst])}"]
         where = made.elsewhere
         if not where.known:
-            out.append("the manifest does not say on which processor and by which source it was made")
+            out.append("the manifest does not name the processor and the source that made it")
         if where.program:
             out.append(f"another program made it: {_named(where.program)}")
         if where.processor:

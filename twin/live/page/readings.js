@@ -121,10 +121,10 @@ export class Readings {
     }
     const found = told.readings.disturbances;
     byId('consistency').textContent = found
-      ? `σ, error and in σ are of ${judged}. The shifts ${found.agrees ? 'agree' : 'do NOT agree'} with the stated disturbances “${found.name}”: `
+      ? `σ, error and in σ are of ${judged}. The shifts ${found.agrees ? 'agree' : 'do NOT agree'} with the prior “${found.name}”: `
         + `χ² ${found.chi_square.toPrecision(3)} with ${found.degrees_of_freedom} degrees of freedom, limit ${found.limit.toPrecision(3)}`
         + `${found.agrees || !found.suspects.length ? '.' : `; suspects: ${found.suspects.slice(0, 3).map((one) => one.body).join(', ')}.`}`
-      : `σ, error and in σ are of ${judged}: of the noise alone, since nothing is stated to move.`;
+      : `σ, error and in σ are of ${judged}: of the noise alone, since there is no prior.`;
     this.strip();
   }
 

@@ -16,7 +16,7 @@ from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, 
 from twin.orbit.angle.angle_sections import listed, sections, signs
 from twin.orbit.flight.light_effects import LightEffects
 from twin.run.artefact import FAR, Cell, Table, fixed
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import AngleSetup
@@ -44,14 +44,15 @@ def angle_report(run: AngleRun) -> Report:
     said, lead = (
         (["the sigmas are those of points, image points and readings"], ()) if simulated is None else _found(simulated)
     )
-    verdict = one_sentence(
-        f"Since the laboratory {listed(changed)}, along the track, as the ground points of {first.name} see it", *said
+    verdict, more = answer(
+        f"Since the laboratory {listed(changed)} along the track, measured from the ground points of {first.name}",
+        *said,
     )
     setup = run.setup
     return Report(
         "Intersection angles from ground points",
         verdict,
-        lead,
+        (*more, *lead),
         _measured_facts(run, setup) if isinstance(setup, MeasuredAngleSetup) else _facts(setup),
         _methods(run),
         (_planes(run), *(() if simulated is None else sections(simulated))),
@@ -83,13 +84,13 @@ def _found(run: SimulatedAngleRun) -> tuple[list[str], tuple[str, ...]]:
         sigma_1 = along.sigma[at] / ARCSEC
         lead.append(
             f"Since the laboratory {names[at]} has changed by {fixed(change[at], 2)} ± {sigma_1:.2f} arcsec as seen "
-            f"from the ground; the trace of the instrument says {fixed(true / ARCSEC, 3)} arcsec."
+            f"from the ground; the trace of the instrument gives {fixed(true / ARCSEC, 3)} arcsec."
         )
     with np.errstate(divide="ignore", invalid="ignore"):
         worst = float(np.nanmax(np.abs(off) / sigma)) if np.any(sigma > 0.0) else None
     if worst is not None:
-        held = "all are within" if worst <= FAR else "not all are within"
-        said.append(f"{held} {FAR:g} σ of the truth, the farthest {worst:.1f} σ: see the methods")
+        held = "all angles are within" if worst <= FAR else "not all angles are within"
+        said.insert(0, f"{held} {FAR:g} σ of the truth, with a largest error of {worst:.1f} σ: see the methods")
     return said, tuple(lead)
 
 

@@ -14,7 +14,7 @@ from twin.orbit.calibration.observations import any_effect, light_effects
 from twin.orbit.calibration.schemes import meets, values_of
 from twin.orbit.calibration.screening import meeting_of
 from twin.run.artefact import Cell, Table
-from twin.run.report import Report, one_sentence
+from twin.run.report import Report, answer
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.setup import CalibrationSetup
@@ -38,13 +38,15 @@ def calibration_report(run: CalibrationRun) -> Report:
     # of averaged parameters the scheme with most fields; the last one lets each field use its own
     scheme = list(run.schemes)[-2:][0]
     after = [values_of(run.schemes[scheme], what).mean() for what in ("plan_rms", "height_rms")]
-    verdict = one_sentence(
-        f"Calibration takes the errors from {plan:.0f} m in plan and {height:.0f} m in height to {after[0]:.2f} m and "
-        f"{after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
-        f"{limits.plan:g} m in plan and {limits.height:g} m in height, assumed for 1:50 000, are met in every field by "
-        f"{'schemes ' + ', '.join(good) if good else 'no scheme'}: see the schemes",
+    verdict, more = answer(
+        f"Calibration changes the errors from {plan:.0f} m in plan and {height:.0f} m in height to {after[0]:.2f} m "
+        f"and {after[1]:.2f} m (scheme {scheme}, mean of the fields' RMS)",
+        f"{('schemes ' if len(good) > 1 else 'scheme ') + ', '.join(good) if good else 'no scheme'} "
+        f"{'meet' if len(good) > 1 else 'meets'} the limits of {limits.plan:g} m in plan and {limits.height:g} m in "
+        "height, assumed for 1:50 000, in every field: see the schemes",
     )
     lead = (
+        *more,
         calibration_sections.scheme_summary(run.scheme_means),
         *(() if run.monitoring is None else (calibration_sections.monitor_gain(run.monitoring),)),
         *(() if run.strips is None else (calibration_sections.strip_gain(run.schemes, run.strips),)),
@@ -209,8 +211,8 @@ def _measured_warnings(run: CalibrationRun) -> list[str]:
         if wide:
             listed = ", ".join(f"{line} {factor:.1f}" for line, factor in wide.items())
             found.append(
-                f"{name}: image points scatter more than their sigmas say, by factors of {listed}; their sigmas have "
-                "been made larger by these"
+                f"{name}: image points scatter more than their sigmas predict, by factors of {listed}; their sigmas "
+                "were multiplied by these factors"
             )
     for one in run.campaign.passes:
         meeting = meeting_of(run.campaign, one, run.fields[one.name].adjustment)

@@ -56,9 +56,9 @@ if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data_setup import AnyCalibration
 
 _EVEN = 1e-3
-"""Of their interval, by which times of readings may be uneven."""
+"""Largest deviation of an interval between readings from their median interval, relative, for even times."""
 STEPWISE_TOLERANCE = 1e-3
-"""Of the sigmas; the last step of a round of the stepwise solution."""
+"""Largest last step of a round of the stepwise solution, in sigmas."""
 
 
 @dataclass(frozen=True, eq=False)

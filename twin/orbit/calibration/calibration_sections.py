@@ -167,15 +167,16 @@ def _strips_section(run: CalibrationRun, found: Strips) -> Section:
         "ties, are then intersected with the adjusted attitude and orbit. "
         f"The attitude's noise here is {noise}.",
         "Rays of one place that do not meet show errors of the attitude. What lasts for many readings and changes "
-        "within the pass is seen by many ties and is taken out; noise that is independent from one reading to the next "
-        "lies mostly in the mean of the three exposures, which no tie sees. A turn that the whole pass has in common "
+        "within the pass appears in many ties and is removed; noise that is independent from one reading to the next "
+        "lies mostly in the mean of the three exposures, which no tie observes. A turn that the whole pass has in "
+        "common "
         "stays, and so does the bias of the scheme: plan hardly gains where biases make it. In pitch even more stays: "
         "whatever repeats itself from one line's view of a place to the next, for as long as two such views last. It "
         "shifts heights, and only a strip that is long against this, with errors slower than it is long, gains much.",
         "Slow errors during the seconds in which a line sees the control points look like a change of its interior "
         "orientation or of the bias, and a calibration on control points alone takes part of them for one. Adjusting "
         "the attitude afterwards would count this part twice, and errors would grow. With the tie points of the whole "
-        "strip in the calibration, interior and attitude are told apart, and the adjusted attitude belongs to them. A "
+        "strip in the calibration, interior and attitude are separable, and the adjusted attitude belongs to them. A "
         "single campaign of few fields scatters: each slow error that a pass keeps is shared by all of its points, so "
         "that one scheme may lose by chance where it gains on average.",
     )
@@ -403,11 +404,11 @@ def _rank(run: CalibrationRun) -> Section:
     for i, j in zip(*np.unravel_index(order, size.shape), strict=True):
         rows.append((found.names[int(i)], found.names[int(j)], float(found.correlation[i, j])))
     text = [f"Gauge: {found.gauge}."]
-    text += [f"The points cannot tell: {c}." for c in found.open]
+    text += [f"Not observable: {c}." for c in found.open]
     text += [f"Weak, but solved for: {c}." for c in found.weak]
     if resting := rests_on_launch(found):
         listed = ", ".join(f"{name} ({100.0 * share:.0f}% of its variance)" for name, share in resting.items())
-        text.append(f"From what launch leaves to expect, not from the points: {listed}.")
+        text.append(f"Determined by the prior on the launch, not by the points: {listed}.")
     state = "converges" if way.converged else "does not converge"
     text.append(
         f"The stepwise solution, bias and interior in turn, {state} for {run.campaign.spec.schemes[0][0]} in "
@@ -430,7 +431,7 @@ def _rank(run: CalibrationRun) -> Section:
         "roll and pitch of a field go with the offset of its orbit.",
         figure_svg("correlation-matrix", run),
     )
-    return Section("What cannot be told apart", tuple(text), (table, figure))
+    return Section("Observability", tuple(text), (table, figure))
 
 
 def _data(run: CalibrationRun) -> Section:

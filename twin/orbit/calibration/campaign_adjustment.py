@@ -19,8 +19,9 @@ from optics.numerics.frozen_map import FrozenMap
 from twin.orbit.calibration.campaign import Campaign, FieldPass, FoundDrift
 
 GAUGE = Gauge(held=("nadir x", "nadir y"))
-"""Of three lines. The nadir line's principal point stays as the laboratory has it: x is not observable against pitch,
-y against roll so weakly that a field would not know it to a pixel."""
+"""Gauge of three lines. The nadir line's principal point keeps its laboratory value: x is not observable against pitch,
+and y against roll so weakly that one field would not determine it to a pixel.
+"""
 _LEAST_OFFSET = 1e-3
 """Metres; sigma of an orbit without a drift along one axis."""
 _LEAST_RATE = 1e-11

@@ -89,7 +89,7 @@ def _place(direction: np.ndarray, model: LineModel) -> np.ndarray:
 
 
 _SAME_PHASE = 1e-6
-"""Of an interval between readings: times of readings are rounded."""
+"""Phase that counts as zero, as a share of the interval between readings: times of readings are rounded."""
 _HEIGHTS = (-500.0, 9000.0)
 """Metres: of land. A control point outside of them is refused by the calibration, not here."""
 

@@ -32,7 +32,7 @@ _OWN_SIGMAS = 4.0
 the median of n good points is uncertain by 1.44 / sqrt(n) of itself (1 / ln 2 of its root mean square)."""
 _MEDIAN_SPREAD = 1.0 / np.log(2.0)
 _FALSE_ALARM = 1e-4
-"""Of check points, as of image points in the adjustment."""
+"""False-alarm rate of check points, the same as for image points in the adjustment."""
 
 
 def screened(campaign: Campaign) -> Campaign:

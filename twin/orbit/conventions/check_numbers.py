@@ -109,7 +109,7 @@ CHECK: Record[Check] = Record(
     Quantity("alike", lambda run: [dict(one) for one in run.alike], "other readings that are as likely"),
     Quantity("reading", _best, "every convention of the best reading"),
     Quantity("readings_tried", lambda run: run.count, "how many readings were tried"),
-    Quantity("decided_by_cost", lambda run: DECIDED, "cost by which two readings are told apart"),
+    Quantity("decided_by_cost", lambda run: DECIDED, "cost by which two readings are separated"),
     Quantity("factor_of_variance", lambda run: run.factor, "by how much the sigmas' squares are too small"),
     Quantity("ground_accuracy_m", lambda run: run.readings.ground.accuracy, "of the way to the ITRS, as stated"),
     Quantity(

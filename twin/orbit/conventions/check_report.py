@@ -8,7 +8,7 @@ from twin.orbit.conventions.check_numbers import changes_text, places_of
 from twin.orbit.conventions.check_run import DECIDED, Answer, Check, Tried
 from twin.orbit.conventions.pass_readings import QUESTIONS
 from twin.run.artefact import Cell, Table
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 
 ANOTHER, NONE = 3, 4
 """Exit codes: another reading than the stated one stands; none explains the points."""
@@ -20,10 +20,11 @@ _NAMED = 6
 def check_report(run: Check) -> Report:
     """Report of a check."""
     code = {"stands": 0, "another": ANOTHER, "none": NONE}[run.verdict]
+    verdict, more = _verdict(run)
     return Report(
         "Conventions of a pass",
-        _verdict(run),
-        _lead(run),
+        verdict,
+        (*more, *_lead(run)),
         _facts(run),
         _ranking(run),
         (_questions(run), _places(run)),
@@ -32,27 +33,28 @@ def check_report(run: Check) -> Report:
     )
 
 
-def _verdict(run: Check) -> str:
+def _verdict(run: Check) -> tuple[str, tuple[str, ...]]:
     best, stated = run.best.fit, run.stated_fit
     if run.verdict == "none" or best is None:
         left = "no reading can have imaged the points" if best is None else (
             f"the best of {run.count} readings ({changes_text(run.best.changes)}) leaves {_metres(best.rms)}, "
             f"chi-square {best.chi_square / best.freedom:.3g} times its freedom"
         )  # fmt: skip
-        return one_sentence(
+        return answer(
             "None of the readings explains the points",
             left,
             "three conventions may be wrong at once, or camera, ground points or uncertainty are",
         )
     size = f"{_metres(best.rms)} and {best.rms_pixels:.3g} px on the ground"
     open_ones = [QUESTIONS[name].title for name, answers in run.answers.items() if _open(answers)]
-    cannot = f"the points cannot tell: {', '.join(open_ones)}" if open_ones else "the points tell every convention"
+    cannot = "the points determine every convention"
+    if open_ones:
+        cannot = f"the points do not determine these conventions: {', '.join(open_ones)}"
     if run.verdict == "stands":
-        return one_sentence(f"The stated conventions explain the points, leaving {size}", cannot)
+        return answer(f"The stated conventions explain the points, leaving {size}", cannot)
     was = f"under them {stated.why}" if stated.fit is None else f"which leave {_metres(stated.fit.rms)}"
-    return one_sentence(
-        f"The stated conventions are wrong, {was}", f"right is {changes_text(run.best.changes)}, leaving {size}", cannot
-    )
+    right = f"the points agree with {changes_text(run.best.changes)}, leaving {size}"
+    return answer(f"The stated conventions are wrong, {was}", right, cannot)
 
 
 def _open(answers: tuple[Answer, ...]) -> bool:
@@ -171,7 +173,7 @@ def _warnings(run: Check) -> tuple[str, ...]:
             more = f" and {len(points) - _NAMED} more" if len(points) > _NAMED else ""
             found.append(f"left out as gross errors in {name}: {', '.join(points[:_NAMED])}{more}")
     if run.factor > 2.0:
-        found.append(f"residuals are {np.sqrt(run.factor):.1f} times as large as the sigmas and uncertainties say")
+        found.append(f"residuals are {np.sqrt(run.factor):.1f} times as large as the sigmas and uncertainties predict")
     accuracy = run.readings.ground.accuracy
     if accuracy is None:
         found.append("how good the way of the ground points' datum to WGS 84 is, is not stated by its authority")

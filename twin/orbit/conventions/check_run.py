@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 Verdict = Literal["stands", "another", "none"]
 DECIDED = 20.0
-"""Two readings are told apart if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that
+"""Two readings are separated if one is exp(-10) = 1/22 000 as likely as the other: a few hundred are tried, so that
 one in a hundred checks is wrong at most."""
 _FITS = 9.0
 """Chi-square over its freedom up to which a reading explains the points: sigmas three times too small."""

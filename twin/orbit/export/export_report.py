@@ -10,7 +10,7 @@ from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.run.artefact import Cell, Table, significant
 from twin.run.data_files import FrameFacts, tiff
 from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 
 FOLDER = "models"
 
@@ -89,12 +89,12 @@ def export_report(run: Export) -> Report:
     rpc = [(max(line.polynomial.error_px), name) for name, line in run.lines.items() if line.polynomial is not None]
     low, _, high = run.heights
     images = sum(line.window.frame is not None for line in run.lines.values())
-    verdict = one_sentence(
-        f"{len(run.lines)} lines as community sensor models and rational polynomials"
+    verdict, more = answer(
+        f"The folder has {len(run.lines)} lines as community sensor models and rational polynomials"
         + (f", with {images} images" if images else ""),
         f"on ground {low:.0f} to {high:.0f} m high the sensor models are within {significant(isd[0], 2)} pixels of the "
         f"rigorous sensor ({isd[1]} is the worst)",
-        f"the polynomials within {significant(max(rpc)[0], 2)} pixels ({max(rpc)[1]})"
+        f"the polynomials are within {significant(max(rpc)[0], 2)} pixels ({max(rpc)[1]})"
         if rpc
         else "there are no polynomials",
     )
@@ -122,7 +122,7 @@ def export_report(run: Export) -> Report:
         ("Read", "the run folder of a simulation" if run.source.folder is not None else "a test without images"),
     )
     return Report(
-        "Line cameras for other software", verdict, (), facts, summary, _sections(run), warnings=_warnings(run)
+        "Line cameras for other software", verdict, more, facts, summary, _sections(run), warnings=_warnings(run)
     )
 
 

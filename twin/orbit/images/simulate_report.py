@@ -18,7 +18,7 @@ from twin.orbit.images.simulate_run import Simulation
 from twin.run.artefact import Cell, Data, PngFigure, SvgFigure, Table
 from twin.run.data_files import FrameFacts, MapPlace
 from twin.run.reference_frames import described
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREEN, INK, LIGHT, ORANGE, SKY, VERMILION, look, new_figure, plain_axes, to_png, to_svg
 
 if TYPE_CHECKING:
@@ -213,12 +213,11 @@ def simulation_report(run: Simulation) -> Report:
     images = run.patch.images
     low = min(images, key=lambda name: min(images[name].nyquist))
     full = [name for name, image in images.items() if image.saturated]
-    verdict = one_sentence(
-        f"{len(images)} images of {patch.lines} lines and {patch.pixels} pixels near "
+    verdict, more = answer(
+        f"The pass has {len(images)} images of {patch.lines} lines and {patch.pixels} pixels near "
         f"{latitude:.3f}° N, {longitude:.3f}° E, "
         "with orthophoto, elevation model, the laboratory's camera and the measured orbit and attitude",
-        f"the softest is {low}, with a modulation of {min(images[low].nyquist):.3f} at half a cycle per sample: see "
-        "Sharpness",
+        f"the modulation is lowest in {low}, {min(images[low].nyquist):.3f} at half a cycle per sample: see Sharpness",
         f"pixels are saturated in {', '.join(full)}" if full else "",
     )
     files = {name: image.frame[None] for name, image in images.items()}
@@ -226,7 +225,7 @@ def simulation_report(run: Simulation) -> Report:
     return Report(
         "Images of a patch of ground from orbit",
         verdict,
-        (),
+        more,
         _facts(run.setup),
         _summary(run),
         sections(run),

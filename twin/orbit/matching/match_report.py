@@ -7,7 +7,7 @@ import numpy as np
 from twin.orbit.images.point_report import point_artefacts
 from twin.orbit.matching.match_run import Match
 from twin.run.artefact import Cell, Table
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 
 _FAR = 0.5
 """Share of the reach: matches that lie farther from where they were expected leave the search little room."""
@@ -17,8 +17,7 @@ def match_report(run: Match) -> Report:
     """Report of a run."""
     return Report(
         "Points measured in images",
-        _verdict(run),
-        (),
+        *_verdict(run),
         _facts(run),
         _summary(run),
         (_measured(run), _images(run)),
@@ -26,7 +25,7 @@ def match_report(run: Match) -> Report:
     )
 
 
-def _verdict(run: Match) -> str:
+def _verdict(run: Match) -> tuple[str, tuple[str, ...]]:
     role = run.measurements.ground.role
     counts = [f"{int(np.sum(role == name))} {name}" for name in ("control", "check", "tie") if np.any(role == name)]
     ways = [
@@ -38,15 +37,15 @@ def _verdict(run: Match) -> str:
     far = ""
     if ways:
         way, name = max(ways)
-        far = f"camera and platform expected them {way:.1f} px away in {name}, the line in which they are most wrong"
+        far = f"the largest difference from camera and platform is {way:.1f} px, in {name}"
     shares = [
         (float(line.accepted.mean()), name) for one in run.points.sorts.values() for name, line in one.lines.items()
     ]
     share, name = min(shares)
-    return one_sentence(
+    return answer(
         f"{', '.join(counts)} points were measured in {len(run.ground.images)} images",
+        f"the share of accepted points is lowest in {name}, {share:.0%}: see Why points were not accepted",
         far,
-        f"fewest were accepted in {name}, {share:.0%}: see Why points were not accepted",
     )
 
 

@@ -128,7 +128,7 @@ class ImagePoints:
         return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
     def numbered(self, first: int) -> ImagePoints:
-        """The same, their ground points counted from ``first``."""
+        """These image points with their ground points counted from ``first``."""
         return replace(self, point=self.point - first)
 
 

@@ -14,7 +14,7 @@ from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
 from twin.run.artefact import SYMBOLS, Cell, SvgFigure, Table
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.sensors.area_detector import coarse_warnings
 
 if TYPE_CHECKING:
@@ -107,12 +107,12 @@ def _smoothed(run: MonitorRun) -> Section:
     fits = "agree" if found.agrees else "do not agree"
     reach = "lies within" if chosen.agrees else "goes beyond"
     text = (
-        f"All measurements together, by the stated disturbances ({stated.name}) and how they go on in time: the best "
+        f"All measurements together, by the prior ({stated.name}) and its time laws: the best "
         f"linear estimate at every time. Measured every {moment(spec.interval)}, it makes the cameras' height error "
         f"{_times(chosen.factor, 'smaller')} than values that are linear between the measurements.",
-        f"It states {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
+        f"Its sigma is {rms(chosen.sigma):.2f} m RMS; the largest error is {chosen.furthest:.2f} of its sigma, which "
         f"{reach} the limit of {chosen.limit:.2f} (false alarm at most {FALSE_ALARM:g}). Measured shifts {fits} with "
-        f"what is stated: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
+        f"the prior: chi-square {found.chi_square:.4g} of {found.degrees} degrees of freedom, limit "
         f"{found.limit:.4g}.",
     )
     caption = "Mean over the points, with the total sigma of the smoothed height."
@@ -259,16 +259,17 @@ def monitor_report(run: MonitorRun) -> Report:
     none, chosen, floor = cases["none"], cases["interval"], cases["true"]
     bought = none.height_rms - chosen.height_rms
     others = floor.height_rms**2 > 0.5 * chosen.height_rms**2
-    limit = "images, orbit and attitude" if others else "what the monitor leaves of the cameras' changes"
-    verdict = one_sentence(
-        f"Monitoring every {moment(spec.interval)} takes the heights' error from {none.height_rms:.2f} m to "
-        f"{chosen.height_rms:.2f} m RMS{'' if bought > 0.0 else ', which is no gain'}, while the intersection angle "
-        f"changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec",
+    limit = "images, orbit and attitude" if others else "the remaining errors of the monitor"
+    verdict, more = answer(
+        f"Monitoring every {moment(spec.interval)} changes the heights' error from {none.height_rms:.2f} m to "
+        f"{chosen.height_rms:.2f} m RMS{'' if bought > 0.0 else ', which is no gain'}",
+        f"with the true cameras {floor.height_rms:.2f} m would remain, so that {limit} cause most of the error",
+        f"the intersection angle changes by {np.ptp(run.angle_change) / ARCSEC:.2g} arcsec: see the errors over the "
+        "course",
         _gain(run),
-        f"with the true cameras {floor.height_rms:.2f} m are left, so that most of it comes from {limit}: see the "
-        "errors over the course",
     )
     lead = (
+        *more,
         f"The cameras alone: {none.camera_height_rms:.2f} m without, {chosen.camera_height_rms:.2f} m with this "
         f"interval, {cases['monitored'].camera_height_rms:.2f} m monitored at every time. "
         f"One arcsecond of the angle is {abs(run.conversion.of_angle):.1f} m of height.",
@@ -296,11 +297,11 @@ def _gain(run: MonitorRun) -> str:
     if not run.smoothing:
         return ""
     chosen = run.smoothed
-    fits = "as" if chosen.agrees else "other than"
+    fits = "agrees with" if chosen.agrees else "contradicts"
     return (
         f"smoothed together, the same measurements leave {chosen.case.camera_height_rms:.2f} m by the cameras, "
-        f"{_times(chosen.factor, 'less')} than linear between, {fits} their stated sigma of "
-        f"{rms(chosen.sigma):.2f} m says"
+        f"{_times(chosen.factor, 'less')} than by linear interpolation, which {fits} their sigma of "
+        f"{rms(chosen.sigma):.2f} m"
     )
 
 
@@ -363,12 +364,11 @@ def _warnings(run: MonitorRun) -> tuple[str, ...]:
         found = chosen.consistency
         if not found.agrees:
             out.append(
-                f"the measured shifts contradict the stated disturbances: chi-square {found.chi_square:.4g}, limit "
-                f"{found.limit:.4g}; the stated sigmas cannot be relied on"
+                f"the measured shifts contradict the prior: chi-square {found.chi_square:.4g}, limit "
+                f"{found.limit:.4g}; the sigmas are not reliable"
             )
         if not chosen.agrees:
             out.append(
-                f"smoothed heights are wrong by up to {chosen.furthest:.3g} of their stated sigma, limit "
-                f"{chosen.limit:.2f}"
+                f"smoothed heights are wrong by up to {chosen.furthest:.3g} of their sigma, limit {chosen.limit:.2f}"
             )
     return tuple(out)

@@ -29,13 +29,14 @@ if TYPE_CHECKING:
     from scenes.specs.orbit.setup import MonitorSetup
 
 CASES = ("none", "monitored", "interval", "smoothed", "parameters", "true")
-"""As calibrated; corrected at every time; corrected by values interpolated over the file's interval; by values smoothed
-from the same measurements, where disturbances are stated; by the true four parameters; the true lines. The last two are
-bounds that no measurement gives."""
+"""Cases of the line geometry: as calibrated; corrected at every time; corrected by values interpolated over the file's
+interval; by values smoothed from the same measurements, if there is a prior; by the true four parameters; the true
+lines. The last two are bounds that no measurement gives.
+"""
 FALSE_ALARM = 1e-4
 """Chance that right sigmas are called wrong, both sides together."""
 _STEP = np.array([ARCSEC, ARCSEC, ARCSEC, 10e-6])
-"""Of the derivatives, rad and m: the intersection is linear over it to 1e-5."""
+"""Steps of the derivatives, rad and m: over them the intersection is linear to 1e-5."""
 
 
 @dataclass(frozen=True, eq=False)

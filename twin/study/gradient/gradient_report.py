@@ -19,7 +19,7 @@ from scenes.yaml.errors import key_text
 from twin.run import cli, command, page, procedure, provenance, reference_frames, run_folder, svg
 from twin.run.artefact import Cell, SvgFigure, Table, plain, significant
 from twin.run.quantity import Quantity, Record
-from twin.run.report import Report, Section, one_sentence
+from twin.run.report import Report, Section, answer
 from twin.run.run_folder import RunFolder
 from twin.sensors.area_detector import coarse_warnings
 from twin.study.gradient.study_gradient import AD, Gradient, study_gradient
@@ -68,10 +68,11 @@ def _write_report(setup: StudySetup, found: Gradient, folder: RunFolder, warning
         f"the trace.{_agreement(found)} All other entries are differences. Spots are the means of their rays, as the "
         "energy centroid has them; estimators are applied to these.",
     )
+    said, more = verdict(found)
     report = Report(
         f"{study.name}: gradient",
-        verdict(found),
-        (*([study.description] if study.description else ()), *about),
+        said,
+        (*more, *([study.description] if study.description else ()), *about),
         (),
         _response_table(found),
         (Section("Sensitivity", (), figures), Section("Factors", (), (_factor_rows(found),))),
@@ -94,20 +95,20 @@ def _agreement(found: Gradient) -> str:
     )
 
 
-def verdict(found: Gradient) -> str:
-    """Which factors move most, and how sure that is, in one sentence."""
+def verdict(found: Gradient) -> tuple[str, tuple[str, ...]]:
+    """Which factors move most, and how certain that is: two sentences at most, and what follows."""
     moved = [i for i in range(len(found.responses)) if np.any(found.change[i])]
     strongest = Counter(found.factors[int(np.argmax(np.abs(found.change[i])))].name for i in moved)
     total = len(found.responses)
-    first = [f"{name} moves {count} of {total} responses most" for name, count in strongest.most_common(2)]
+    first = [f"the factor {name} moves {count} of {total} responses most" for name, count in strongest.most_common(2)]
     still = total - len(moved)
     sure = ""
     if found.worst is not None:
         sure = f"automatic differentiation and differences agree to {significant(found.worst, 2, floor=0.0)}"
-    return one_sentence(
+    return answer(
         ", ".join(first) or "No factor moves any response",
-        f"nothing moves {still} of them" if moved and still else "",
         sure,
+        f"no factor moves {still} of the responses" if moved and still else "",
         "see the figures of the sensitivity",
     )
 
@@ -324,7 +325,7 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
     found = study_gradient(setup, session.backend, session.advance)
     session.advance(procedure.WRITE, 0, 1)
     folder = session.folder
-    numbers = reference_frames.described("gradient", {**GRADIENT(found), "verdict": verdict(found)})
+    numbers = reference_frames.described("gradient", {**GRADIENT(found), "verdict": verdict(found)[0]})
     folder.write_text("config.yaml", setup.to_yaml())
     folder.write_json("gradient.json", numbers)
     folder.write_bytes("gradient.csv", _whole_table(found).content())
@@ -339,7 +340,7 @@ def _work(setup: StudySetup, session: procedure.Session) -> command.Result:
 
 
 def _print_result(found: Gradient, warnings: Sequence[str], console: Console) -> None:
-    cli.print_verdict(console, verdict(found))
+    cli.print_verdict(console, verdict(found)[0])
     table = cli.result_table(f"{len(found.responses)} responses by {len(found.factors)} factors")
     picked = [0, 1, 2, 3, 4, 5, 8]
     heads = ("response", "strongest factor", "derivative", "unit", "per spread", "all, rss", "AD-diff.")

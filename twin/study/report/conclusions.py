@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from scenes.specs.samplers import GRID, SAMPLERS
 from twin.run.artefact import decimals_for, fixed, significant
-from twin.run.report import one_sentence
+from twin.run.report import answer
 from twin.study.report.sensitivity_indices import HARMONICS, RESAMPLES, Indices, NoIndices
 from twin.study.report.study_analysis import GOALS, Convergence, Requirement, StudyAnalysis
 from twin.study.report.study_statistics import LEAST, Description, Estimate, Interval, Response, impossible, typeset
@@ -157,9 +157,9 @@ def conclusions(found: StudyAnalysis) -> list[str]:
     return [text for text in out if text]
 
 
-def verdict(found: StudyAnalysis) -> str:
-    """A study in one sentence: how its requirements are met, or else what moves its first response, and whether its
-    runs are enough to say so.
+def verdict(found: StudyAnalysis) -> tuple[str, tuple[str, ...]]:
+    """A study in two sentences, and what follows: how its requirements are met, or else what moves its first response,
+    and whether its runs are enough for that.
     """
     runs = found.runs
     failed = int(runs.failed.sum())
@@ -168,17 +168,21 @@ def verdict(found: StudyAnalysis) -> str:
     if known:
         # the last of several is all together
         worst = min(known, key=lambda r: (r.share, r.name))
-        name = f"{worst.name} ({worst.text})" if worst.name else "all requirements together"
+        name = f"the requirement {worst.name} ({worst.text})" if worst.name else "all requirements together"
         least = ", met least," if len(known) > 1 else ""
         are = "is" if worst.name else "are"
         whatever = _whatever(worst)
-        first.append(f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a number{whatever}")
+        first.append(
+            f"{name}{least} {are} met by {worst.met} of {plural(worst.count, 'run')} with a finite value{whatever}"
+        )
     elif runs.responses:
-        first.append(_contributors(found, runs.responses[0]))
+        first.append(f"Response {_contributors(found, runs.responses[0])}")
     short = [name for name, statistics in found.convergences.items() if not all(one.enough for one in statistics)]
     if short:
-        first.append(f"they are too few for some statistics of {plural(len(short), 'response')}: see the convergence")
-    return one_sentence(*(part for text in first for part in text.split(". ")))
+        first.append(
+            f"the runs are too few for some statistics of {plural(len(short), 'response')}: see the convergence"
+        )
+    return answer(*(part for text in first for part in text.split(". ")))
 
 
 def _requirement_text(found: StudyAnalysis) -> str:
@@ -186,7 +190,7 @@ def _requirement_text(found: StudyAnalysis) -> str:
     for r in found.requirements:
         name = f"{r.name} ({r.text})" if r.name else "All requirements together"
         if r.share is None:
-            texts.append(f"{name}: no run has a number.")
+            texts.append(f"{name}: the value is NaN in all runs.")
             continue
         of = f" (95% interval {span(r.interval)})" if r.interval is not None else " of the grid"
         are = "is" if r.name else "are"
@@ -195,18 +199,18 @@ def _requirement_text(found: StudyAnalysis) -> str:
 
 
 def _whatever(r: Requirement) -> str:
-    """What the runs without a number leave open, for the end of a sentence."""
+    """The share that failed runs leave open, for the end of a sentence."""
     if r.bounds is None:
         return ""
     interval = f" (95% interval {span(r.bounds_interval)})" if r.bounds_interval is not None else ""
-    return f", and by {r.met} to {r.most} of all {r.runs} runs, whatever the others would have given{interval}"
+    return f", and by {r.met} to {r.most} of all {r.runs} runs, for any values of the others{interval}"
 
 
 def _contributors(found: StudyAnalysis, response: Response) -> str:
     about = found.descriptions[response.name]
     name = response.name
     if about.count == 0:
-        return f"{name}: no run has a number."
+        return f"{name}: the value is NaN in all runs."
     if response.constant:
         return f"{name} is the same in all {plural(about.count, 'run')}: {with_unit(about.low, response.unit, 6)}."
     assert about.mean is not None
@@ -234,13 +238,13 @@ def _contributors(found: StudyAnalysis, response: Response) -> str:
         return text
     model = found.linear[name]
     if model is None:
-        return f"{text} {plural(about.count, 'run')} are too few to tell what moves it."
+        return f"{text} {plural(about.count, 'run')} are too few to find its main factors."
     sure = [e for e in model.effects if _sure(e.swing.interval)]
     share = max(model.adjusted, 0.0)
     if share < LINEAR and about.count >= LEAST:
-        return f"{text} Hardly linear in the factors ({percent(share, 0)} of its variance): its curves tell more."
+        return f"{text} Hardly linear in the factors ({percent(share, 0)} of its variance): see its curves."
     if not sure:
-        text += " No factor has a linear effect that stands out of the scatter."
+        text += " No linear effect of a factor exceeds the scatter."
     else:
         parts = [f"{e.factor} {with_unit(e.swing.value, response.unit)}" for e in sure[:3]]
         text += f" Largest changes over the middle 90% of a factor: {listed(parts)}."

@@ -44,7 +44,7 @@ class LinearModel:
         adjusted: the same, corrected for the number of terms.
         terms: number of coefficients, the constant included.
         effects: of each factor that varies, the largest swing first.
-        cannot: names of factors whose effects the runs do not tell apart.
+        cannot: names of factors whose effects the runs do not separate.
     """
 
     r2: float

@@ -383,7 +383,7 @@ LINEAR: Record[LinearModel] = Record(
     Quantity("r2", lambda model: model.r2, "share of the variance that it explains"),
     Quantity("adjusted_r2", lambda model: model.adjusted, "corrected for the number of terms"),
     Quantity("effects", lambda model: {e.factor: e for e in model.effects}, "by factor", record=EFFECT),
-    Quantity("not_separable", lambda model: model.cannot, "factors whose effects the runs do not tell apart"),
+    Quantity("not_separable", lambda model: model.cannot, "factors whose effects the runs do not separate"),
 )
 MAIN_EFFECT: Record[MainEffect] = Record(
     "Means of a response over the runs of a grid, for each value of a factor.",

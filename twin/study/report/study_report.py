@@ -75,7 +75,7 @@ def report_files(
 ) -> StudyReport:
     """The report with all its files; arguments as of ``write_report``."""
     found = StudyAnalysis.of(StudyRuns.of(data, study))
-    said, runs = words.verdict(found), found.runs
+    (said, more), runs = words.verdict(found), found.runs
     about = (
         f"{words.plural(runs.count, 'run')} of {study.base.command}, {int(runs.failed.sum())} of them failed; "
         f"{words.design_title(runs.kind)}, seed {study.design.seed}."
@@ -83,7 +83,7 @@ def report_files(
     report = Report(
         study.name,
         said,
-        (*([study.description] if study.description else ()), about),
+        (*more, *([study.description] if study.description else ()), about),
         (),
         _response_table(found),
         (Section("Factors", (), (_factor_table(runs),)), *sections(found)),
@@ -316,7 +316,7 @@ def _influences(found: StudyAnalysis) -> Section | None:
     cannot = sorted({name for r in things for m in [found.linear[r.name]] if m is not None for name in m.cannot})
     remarks = [f"The linear model explains of the variance (R²): {', '.join(texts)}."] if texts else []
     if cannot:
-        remarks.append(f"Not told apart from the other factors, and left out of the model: {', '.join(cannot)}.")
+        remarks.append(f"Not separable from the other factors, and left out of the model: {', '.join(cannot)}.")
     return Section("What the factors do", tuple(remarks), (figure, table) if rows else (figure,))
 
 

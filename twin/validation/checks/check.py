@@ -125,7 +125,7 @@ class Supposed:
     said: str
 
     def range(self, holds: Callable[[float], bool], agrees: bool) -> InputRange:
-        """As of a number, with nothing to look for."""
+        """Range of this choice. It has no limits, because the choice is not a number."""
         return InputRange(self.name, None, "1", None, None, agrees, self.said)
 
 
@@ -267,7 +267,7 @@ class CheckResult:
         return asdict(self) | {"also": list(self.also), "inputs": [asdict(i) for i in self.inputs]}
 
     def timed(self, seconds: float) -> CheckResult:
-        """The same with its computing time."""
+        """Result of the same check with its computing time."""
         return replace(self, seconds=seconds)
 
 
@@ -434,7 +434,7 @@ class Check(Spec):
         return replace(found, implied=None if self.printed is not None else goal, power=allowed, inputs=ranges)
 
     def worse(self, *results: CheckResult) -> CheckResult:
-        """Of one statement in several forms: the first result that is not the expected one, or else the first."""
+        """The result of a statement in several forms: the first that is not the expected one, otherwise the first."""
         return next((r for r in results if r.verdict != self.expected), results[0])
 
     def failed(self, why: str) -> CheckResult:

@@ -25,7 +25,7 @@ TEST = "angle"
 OFF_AXIS = "angle_off_axis"
 TRACED = "angle_gf7"
 PAIRS = (("forward", "nadir"), ("nadir", "backward"))
-"""Of alpha and beta."""
+"""Pairs of lines that define alpha and beta."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from twin.validation.checks.group import Context, group_of
 from twin.validation.paper_000.passes import OFF_AXIS, TEST, TRACED, Passes, planes_of, repeated, setup_of
 
 SCALE_HEIGHT = 8435.0
-"""Of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""
+"""Scale height of the standard atmosphere's pressure at 15 °C, R T/(M g), metres."""
 
 
 def light_passes(context: Context) -> Passes:

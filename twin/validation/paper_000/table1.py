@@ -205,7 +205,7 @@ def _pair(context: Context, data: Data, own: Differences) -> CheckResult:
 
 
 def _pitch_variance(passes: Passes, line: str) -> float:
-    """Of a plane through n points at their range, arcsec^2."""
+    """Variance of the pitch of a plane through n points at their range, arcsec^2."""
     points = passes.points[line]
     reach = float(np.mean(np.linalg.norm(points - passes.flight.station, axis=1)))
     return (passes.flight.spec.errors.points / reach / ARCSEC) ** 2 / len(points)

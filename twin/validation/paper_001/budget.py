@@ -145,7 +145,7 @@ def three_sigma(budget: ErrorBudget, cause: str) -> float:
 
 
 def more_trials(budget: ErrorBudget, factor: int) -> ErrorBudget:
-    """The same budget with ``factor`` times the trials for each line."""
+    """Error budget with ``factor`` times the trials for each line."""
     other = copy(budget)
     other.spec = budget.spec.model_copy(update={"trials": factor * budget.spec.trials})
     return other

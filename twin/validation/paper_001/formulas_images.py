@@ -82,7 +82,7 @@ class Ratio:
 
     @classmethod
     def mean(cls, cameras: Mapping[str, tuple[float, float]]) -> Ratio:
-        """Of camera -> (value, sigma); the cameras' noise is independent."""
+        """Mean ratio of camera -> (value, sigma); the noise of the cameras is independent."""
         values, sigmas = np.array(list(cameras.values())).T
         return cls(float(values.mean()), float(np.sqrt(np.sum(sigmas**2)) / len(values)), dict(cameras))
 

@@ -25,7 +25,7 @@ AMOUNTS = {"d_alpha": 50e-6, "d_beta": 50e-6, "d_gamma": 20 * ARCSEC, "d_f": 20e
 SMALLEST = 0.5
 """Smallest size of a random motion, as a share of its AMOUNTS."""
 UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e-6])
-"""Of the response matrix: arcsec and micrometres."""
+"""Units of the response matrix: arcsec and micrometres."""
 Parts = Callable[[float, float], tuple[float, float]]
 
 

@@ -31,7 +31,7 @@ FIELDS, IMAGES = "calibrate.yaml", "calibrate_images.yaml"
 _NO_LIGHT = EffectsSpec(light_time=False, aberration=False, refraction=False)
 
 TOLERANCE = 1e-3
-"""Of the conditional sigmas; the last step of a round of the stepwise solution."""
+"""Largest last step of a round of the stepwise solution, in conditional sigmas."""
 _STEP = {"f": 1e-5, "x": 1e-5, "y": 1e-5}
 """Metres: how far an element is changed to either side, 1.5 px; what is left of third order is 1e-9 of it."""
 _TURN = 1.5e-5
@@ -48,19 +48,19 @@ def setup_of(file: str, fields: Sequence[str] = (), **changes: Any) -> Calibrati
 
 
 def changed(setup: CalibrationSetup, **changes: Any) -> CalibrationSetup:
-    """The same with other values of its test's attributes."""
+    """A setup with other values of its test's attributes."""
     return setup.model_copy(update={"test": setup.test.model_copy(update=changes)})
 
 
 def without_light(setup: CalibrationSetup) -> CalibrationSetup:
-    """The same without light time, aberration and refraction, which the paper does not mention: they are taken out of
-    image points to 0.004 px, and flying without them takes half of the time.
+    """A setup without light time, aberration and refraction, which the paper does not mention. The adjustment removes
+    them from image points to 0.004 px, and a flight without them takes half the time.
     """
     return changed(setup, effects=_NO_LIGHT)
 
 
 def exact(setup: CalibrationSetup) -> CalibrationSetup:
-    """The same with exact image points, control and orbit, and an attitude with a constant bias only."""
+    """A setup with exact image points, control and orbit, and an attitude with a constant bias only."""
     errors = setup.test.errors
     tracker = errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
     update = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
@@ -95,11 +95,11 @@ class Turned:
     angles: np.ndarray
 
     def position(self, seconds: np.ndarray) -> np.ndarray:
-        """As the base."""
+        """Position of the base."""
         return self.base.position(seconds)
 
     def inertial_velocity(self, seconds: np.ndarray) -> np.ndarray:
-        """As the base."""
+        """Inertial velocity of the base."""
         return self.base.inertial_velocity(seconds)
 
     def body_to_itrs(self, seconds: np.ndarray) -> np.ndarray:

@@ -143,7 +143,7 @@ def _slopes(latitude: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _above(one: FieldPass) -> float:
-    """Of the flight above the check points, metres."""
+    """Height of the flight above the check points, metres."""
     earth = one.data.earth
     flight = float(earth.geodetic(one.trajectory.position(0.0))[2])
     return flight - float(np.mean(earth.geodetic(one.check_ground)[2]))

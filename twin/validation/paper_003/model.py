@@ -28,7 +28,7 @@ _FOCAL = 0.65
 """Metres; angles are drawn as image motion."""
 FIELD = "Beijing"
 CAMPAIGNS, FAST_CAMPAIGNS = 9, 5
-"""Of seven fields, for the errors of yaw over their sigma."""
+"""Campaigns of seven fields, in the full and in the fast run, for the errors of yaw over their sigma."""
 FAST_SIDE = 380
 """Lines and pixels of a rendered patch in the fast run."""
 FORM = (

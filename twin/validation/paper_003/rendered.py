@@ -126,7 +126,7 @@ def _brightest(image: np.ndarray, count: int) -> list[tuple[int, int]]:
 
 
 def _centroid(image: np.ndarray, row: int, column: int) -> np.ndarray:
-    """Of all within the reach of the point spread function from a pixel."""
+    """Centroid of all pixels within the reach of the point spread function from a pixel."""
     part = image[row - _REACH : row + _REACH + 1, column - _REACH : column + _REACH + 1]
     if part.shape != (2 * _REACH + 1,) * 2:
         raise ValueError("a mark lies too near to the window's border")

@@ -126,7 +126,7 @@ class SpotTest:
 
     @cached_property
     def part(self) -> Perspective:
-        """The same over the uneven points."""
+        """The traced camera's parameters, fitted over the uneven points alone."""
         return Perspective.nearest(self.true_place[UNEVEN], self.true_turn[UNEVEN])
 
     @property

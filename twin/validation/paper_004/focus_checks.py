@@ -123,7 +123,7 @@ class Plan:
 
     @cached_property
     def motion(self) -> RigidMotion:
-        """Of the assembly, wanted."""
+        """Motion of the assembly that corrects the focal plane."""
         state = self.alignment.states[0]
         where, sigma = measured_defocus(state)
         # the plane wants how far best focus lies downstream of the CCD

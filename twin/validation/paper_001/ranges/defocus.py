@@ -27,7 +27,7 @@ from twin.validation.paper_001.ranges.turns import CLAIMED, FINE, NAMES, motion_
 RETURNS = ("plane", "roof", "roof along", "corner")
 """Kinds of return: a mirror facet; a roof whose ridge lies across the line, or along it; a corner cube."""
 SHIFT = 60e-6
-"""Of the line CCD, metres."""
+"""Shift of the line CCD, metres."""
 _OFFSETS: dict[str, tuple[float, float] | None] = {
     "plane": None,
     "roof": None,

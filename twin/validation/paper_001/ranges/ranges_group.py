@@ -24,10 +24,10 @@ from twin.validation.paper_001.ranges.turns import NAMES, Range, criterion
 INSTRUMENT, OTHER = "monitor_pair", "gf7_pair"
 """The camera that Table 5 implies; and one of another focal length, in full runs."""
 FIELDS = (1.0, 1.5, 2.0, 2.4, 2.72, 2.8)
-"""Of the area CCDs, degrees: nearer, and the left and right prisms stand in each other."""
+"""Fields of the area CCDs, degrees. At smaller fields the left and right prisms overlap."""
 OFFSETS_X = (-0.28, -0.24, -0.12, 0.0, 0.12, 0.24, 0.28)
 OFFSETS_Y = (-0.24, -0.12, 0.12, 0.24)
-"""Of the sub-aperture, metres; the pupil's radius is 0.32 m."""
+"""Offsets of the sub-aperture, metres; the pupil's radius is 0.32 m."""
 _SINGLE = ("001.eq2.range", "001.eq3.range", "001.eq5.range", "001.eq7.range", "001.small_angles.range")
 _BY_EQUATION = {"eq2": "d_beta", "eq3": "d_alpha", "eq5": "d_gamma", "eq7": "d_f"}
 

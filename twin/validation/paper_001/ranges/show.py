@@ -194,7 +194,7 @@ def limit_of(both: Sequence[turns.Range], form: str, kind: str) -> tuple[float, 
 
 
 def limit_text(both: Sequence[turns.Range], form: str, kind: str, per: float) -> str:
-    """The same in words."""
+    """The limit of `limit_of` in words."""
     size, whence = limit_of(both, form, kind)
     unit = "mm" if both[0].parameter == "d_f" else "″"
     if size == 0.0:
