@@ -395,6 +395,7 @@ def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.all(np.concatenate([total[c][name].sigma - total[c]["posterior"].sigma for c in both]) > 0.0)
 
 
+@pytest.mark.second
 def test_an_estimator_of_a_study(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Its readings and sigmas are responses of a study, and a study's gradient goes through it."""
     add(monkeypatch, ESTIMATORS, "half", Half())
@@ -433,6 +434,7 @@ responses:
 """
 
 
+@pytest.mark.second
 @extends(READINGS)
 def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The change of the principal distance as a part of it: one entry, seen in every view of the table of readings."""

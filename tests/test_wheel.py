@@ -46,6 +46,7 @@ def names_of_ours(text: str) -> list[str]:
     return [name for name in found if str(name).partition(".")[0] in backend.PACKAGES]
 
 
+@pytest.mark.second
 def test_no_module_of_a_wheel_asks_for_one_outside_of_it() -> None:
     asked = 0
     for path in FILES:

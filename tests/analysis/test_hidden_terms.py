@@ -72,6 +72,7 @@ def test_a_rate_with_a_prior_is_told_and_its_sigma_is_in_x_of_the_outer_lines():
     assert told.rates is None
 
 
+@pytest.mark.second
 def test_false_alarms_of_rates_and_courses_are_those_of_chance():
     """30 passes of 12 points: probabilities are even; 1e-4 of this test's own (Kolmogorov, two of them)."""
     rng, rates, courses = np.random.default_rng(5), [], []

@@ -13,6 +13,7 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw, consistency
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.monitoring import MonitorGeometry
+from tests.tiers import quick
 
 RARE = 1e-6
 """False-alarm rate of each statistical comparison here."""
@@ -284,7 +285,7 @@ def test_rows_of_the_angle_and_of_parameters():
         assert row[0] == -row[4]
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
+@pytest.mark.parametrize("cameras", quick(1, [2, 1]))
 def test_false_alarms_and_power_of_the_chi_square(cameras):
     """5000 drawn shifts each. Noise is a hundredth of the motions, so that three times them are three times the spread
     to 1e-4."""

@@ -169,6 +169,7 @@ def test_sigmas_are_right_in_a_hundred_campaigns_of_seven_fields():
     assert stats.chi2.sf(*wrong) < 5e-4
 
 
+@pytest.mark.second
 def test_seven_fields_are_quick():
     fields, _ = campaign(flight(60), np.random.default_rng(23))
     spent = []

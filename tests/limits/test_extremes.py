@@ -98,6 +98,7 @@ def test_memory_is_what_was_estimated(name: str, tmp_path: Path) -> None:
     estimated(took)
 
 
+@pytest.mark.second
 def test_an_instrument_beyond_all_is_refused(tmp_path: Path) -> None:
     """The draw of the slow tests above: refused before anything of it is computed."""
     took, said = run(tmp_path, "twin.render", INSTRUMENTS_BEYOND["CCD of 8192 x 8192 pixels"].write(tmp_path))

@@ -21,6 +21,7 @@ from scenes.specs.load import load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.node_table import read_temperatures
+from tests.tiers import quick
 
 M1 = "base/forward/M1"
 PRISM = "base/forward/monitor/left/prism_180"
@@ -65,7 +66,7 @@ def warmed(model: ThermalModel, folder: Path, body: str, points: np.ndarray, val
 # --- what is linear ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("body", [M1, PRISM, "base/forward", "base/central_prism"])
+@pytest.mark.parametrize("body", quick(2, [M1, "base/forward", PRISM, "base/central_prism"]))
 def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> None:
     points = lattice(silica, body)
     if body in ("base/forward", "base/central_prism"):
@@ -142,7 +143,9 @@ def quadratic(points: np.ndarray) -> np.ndarray:
 LATTICES = [(21, 19, 9), (41, 37, 17)]
 
 
-@pytest.mark.parametrize("lattices", [LATTICES[:1], pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"])
+@pytest.mark.parametrize(
+    "lattices", [*quick(0, [LATTICES[:1]]), pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"]
+)
 def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path, lattices) -> None:
     """Solved directly on the same elements; a table of 12 mm lies h^2/8 of the curvature below the field."""
     held = silica.elastic(M1, cells=FINE_CELLS)

@@ -161,6 +161,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     path = write(
         tmp_path,

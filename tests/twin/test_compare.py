@@ -11,6 +11,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
+from optics.numerics.backend import Backend
 from scenes.yaml.errors import InputError
 from twin.compare.__main__ import app
 from twin.compare.compare_report import compare, numbers, verdict
@@ -21,7 +22,7 @@ from twin.scripting.instrument_twin import load
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def runs(tmp_path_factory: pytest.TempPathFactory, backend: Backend) -> Path:
     """Data of three small jobs: a, b with another despace, and a once more, written as the command writes them."""
     from twin.main_job.render_files import write_data
 
@@ -30,7 +31,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, shift, seed in (("a", 3, 1), ("b", 4, 1), ("again", 3, 1), ("seed", 3, 2)):
         twin = pair.perturbed({"base/forward/M2": {"shift": f"0 0 {shift} um"}})
         with RunFolder(folder / name) as target:
-            write_data(render_job(twin.resolved, pair.experiment.backend, 2, seed), target)
+            write_data(render_job(twin.resolved, backend, 2, seed, experiment=twin.experiment), target)
             write_manifest(target, "twin.render", 0.0, 1.0, seed=seed, warnings=[])
     return folder
 

@@ -15,6 +15,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
+from tests.tiers import quick
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign
@@ -131,7 +132,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(1, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     change, key, words = BAD[case]
     changes = [change] if change[0] == SIZE else [change, (SIZE, "lines: 200, pixels: 200}")]

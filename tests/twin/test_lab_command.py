@@ -117,6 +117,7 @@ def test_config_repeats_the_run(done, tmp_path: Path) -> None:
     assert str(target / "report.html") in result.stdout
 
 
+@pytest.mark.second
 def test_turntable(tmp_path: Path) -> None:
     """With half the angles and fewer folds than the example."""
     text = TURNTABLE.read_text("utf-8")

@@ -244,6 +244,7 @@ def test_a_run_of_uncertainty_opens_its_job(tmp_path):
     assert read_source(str(folder)).resolved == resolve(folder / "config.yaml")
 
 
+@pytest.mark.second
 def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_path):
     """States of the test itself: temperatures, swings and ramps; poses to rounding."""
     setup = resolve_monitor(SCENES / "orbit" / "monitor.yaml")

@@ -115,6 +115,7 @@ def test_a_further_beam_never_raises_a_sigma(bench: LayoutBench, facts: tuple[Be
         assert np.trace(many) < np.trace(few)
 
 
+@pytest.mark.second
 def test_beams_combined_are_the_layout_that_is_built(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     built = bench.try_layout((FIRST, SECOND))
     assert built.refused == ""

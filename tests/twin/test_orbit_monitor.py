@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
@@ -327,6 +328,7 @@ def test_shifts_that_contradict_the_disturbances_are_told(tmp_path: Path, backen
 # The command
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     import twin.orbit.__main__ as command
 
@@ -384,7 +386,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(3, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     import twin.orbit.__main__ as command
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import twin.validate as command
+from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from twin.run.artefact import Data, PngFigure, SvgFigure, Table
 from twin.validation import registry
@@ -668,7 +669,7 @@ runpy.run_module("twin.validate", run_name="__main__", alter_sys=True)
 
 
 @pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+    ("number", "code"), [*quick(0, [(signal.SIGINT, 130)]), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
 )
 def test_an_interrupt_leaves_nothing(number, code, tmp_path):
     process = subprocess.Popen(
