@@ -354,7 +354,7 @@ def with_gross_errors(seed, share, robust, actual, views):
 
 
 @pytest.mark.parametrize("share", quick(1, [0.1, 0.0]))
-@pytest.mark.parametrize("robust", ["huber", "igg"])
+@pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_robust_weights_and_variance_components_go_together(robust, share):
     """Two passes with gross errors of 5 to 30 px, of 0.3 px and of twice the noise that is claimed. Two-sided false
     alarm of 1e-4; what the variance factors of 300 redundant observations add to it is a hundredth."""

@@ -49,6 +49,7 @@ def test_absent_peers_are_named_and_the_others_compared(quick) -> None:
         assert (f"ratio_{peer}" in data[part]) != named
 
 
+@pytest.mark.second
 def test_a_quick_run_judges_no_limit(quick) -> None:
     limits = json.loads(quick.stdout)["limits"]
     assert all(limit["met"] is None for limit in limits)

@@ -97,6 +97,7 @@ def test_wavefronts_and_focus_are_of_the_light_that_comes_through(backend, bare)
     assert CameraOptics.alone(masked, backend).wavefront((1.0, 0.0)).rms < 0.5 * bare.wavefront((1.0, 0.0)).rms
 
 
+@pytest.mark.second
 def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> None:
     """Wavefronts, map over the field, curves along the line and through focus; no part of it is above the whole."""
     fields = ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.0))

@@ -36,6 +36,7 @@ def test_command_writes_all(tmp_path: Path) -> None:
         assert json.loads(path.read_text("utf-8"))["type"] == "object"
 
 
+@pytest.mark.second
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):

@@ -225,6 +225,7 @@ def test_bodies_without_finite_elements_follow_linear_fields_only(silica, tmp_pa
         assert "the nearest linear field" in str(caught.value)
 
 
+@pytest.mark.second
 def test_warnings_of_coverage_and_of_coarse_tables(silica, tmp_path) -> None:
     points = lattice(silica, M1, (9, 9, 4))
     half = points[points[:, 0] < np.quantile(points[:, 0], 0.8)]

@@ -78,6 +78,7 @@ def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: Matc
     assert 0.0 < np.abs(control.height - height).max() < 12.0
 
 
+@pytest.mark.second
 def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoints) -> None:
     """The same ground on the same day: 0.05 px."""
     spec = asked().model_copy(update={"tie": 40})

@@ -11,6 +11,7 @@ import tifffile
 
 import twin.lab as command
 from scenes.specs.load import LAB, LIBRARY, SCENES
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 
 run = partial(invoke, command.app)
@@ -167,7 +168,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("name", quick(3, BAD))
 def test_bad_input(name: str, tmp_path: Path) -> None:
     changes, key, words = BAD[name]
     path = write_focus(tmp_path, **changes)

@@ -153,6 +153,7 @@ def test_a_slope_across_a_jump_says_so(bench: LayoutBench) -> None:
     assert slope.errors[STATED_NAME]["angle"] > abs(slope.values[STATED_NAME]["angle"])
 
 
+@pytest.mark.second
 def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBench) -> None:
     names = [number.name for number in numbers_of(bench, (FIRST,))]
     assert names == list(CONTINUOUS)

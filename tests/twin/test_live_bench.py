@@ -13,6 +13,7 @@ import pytest
 import twin
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from twin.live.camera_pictures import CameraPictures
 from twin.live.computer import Answers
 from twin.live.knobs import KINDS, knob_name, perturbation
@@ -298,7 +299,7 @@ def test_the_greeting_and_every_answer_are_json(bench, first):
     assert np.array_equal(pixels, image)
 
 
-@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus"])
+@pytest.mark.parametrize("view", quick(1, ["wavefront", "spot", "mtf", "focus"]))
 def test_pictures_of_a_camera(bench, view):
     pictures = CameraPictures(bench.twin.experiment)
     assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")

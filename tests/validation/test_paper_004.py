@@ -111,6 +111,7 @@ def test_every_equation_and_table_has_rows(prefix):
     assert any(identifier.startswith(f"004.{prefix}.") for identifier in STATED)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("identifier", "value", "accuracy", "verdict"),
     [
