@@ -14,7 +14,7 @@ from tests.hunt.legal_instruments import legal_instrument
 from tests.hunt.legal_jobs import legal_job
 from tests.tiers import quick
 
-FEW, MANY = 10, 1000
+FEW, MANY = 6, 1000
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def require_honest(outcomes) -> Counter:
 
 @pytest.mark.parametrize("cases", quick(1, [FEW, 60]))
 def test_nobody_is_misled(found, cases) -> None:
-    outcomes = found(0, cases, 12 if cases > FEW else 5)
+    outcomes = found(0, cases, 12 if cases > FEW else 3)
     counts = require_honest(outcomes)
     # a twin that refuses or warns of everything would be honest, too
     assert counts[RIGHT] > 0.4 * cases

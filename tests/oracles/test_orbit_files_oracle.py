@@ -63,7 +63,7 @@ def date(epoch: str, seconds: float) -> Any:
 
 
 @pytest.mark.parametrize("epoch", quick(1, EPOCHS))
-@pytest.mark.parametrize("frame", ["GCRF", "EME2000"])
+@pytest.mark.parametrize("frame", quick(1, ["GCRF", "EME2000"]))
 def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) -> None:
     """With pole, UT1 and celestial pole offsets of the same table; 0.6 mm and 2 um/s: its nutation is interpolated."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D
@@ -87,7 +87,7 @@ def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) ->
 
 
 @pytest.mark.parametrize("epoch", quick(1, EPOCHS))
-@pytest.mark.parametrize("frame", ["GCRS", "TEME"])
+@pytest.mark.parametrize("frame", quick(1, ["GCRS", "TEME"]))
 def test_inertial_frames_against_astropy(epoch: str, frame: str) -> None:
     """astropy leaves the celestial pole's offsets out, and joins days by straight lines; at midnight both tables are
     the same. 1 um is rounding; TEME's sidereal time takes 1e-5 m more.
@@ -132,6 +132,7 @@ def read(folder: Path, orbit: dict[str, Any], attitude: dict[str, Any]) -> Any:
     return platform_table(*read_platform(spec, folder), bench.EPOCH)
 
 
+@pytest.mark.second
 def test_messages_against_orekit_s_own_readers(orekit: Path, tmp_path: Path) -> None:
     """OEM, AEM and SP3 are parsed by Orekit, brought to its ITRF, and compared with what we make of the same files."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D

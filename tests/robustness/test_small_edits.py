@@ -96,7 +96,7 @@ def well_told(error: InputError) -> bool:
     return said and "watertight" not in str(error)
 
 
-@pytest.mark.parametrize("number", quick(3, range(QUICK)))
+@pytest.mark.parametrize("number", quick(2, range(QUICK)))
 def test_random_edits_run(number, tmp_path, backend) -> None:
     assert outcome(number, tmp_path, backend) == ("runs", "")
 
@@ -121,7 +121,7 @@ NAMED = [
 ]
 
 
-@pytest.mark.parametrize(("file", "key", "change"), quick(2, NAMED), ids=[key for _, key, _ in NAMED])
+@pytest.mark.parametrize(("file", "key", "change"), quick(1, NAMED), ids=[key for _, key, _ in NAMED])
 def test_named_edits(file, key, change, tmp_path, backend) -> None:
     """Spots lie on the middle of their CCDs, and the central prism is a closed body of the volume that its facets give
     it, also where a wall is no more because the facets beside it go down to the bottom.

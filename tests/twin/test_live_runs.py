@@ -21,6 +21,7 @@ from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
 from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from tests.tiers import quick
 from tests.twin.test_course import JOB as COURSE
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
@@ -398,17 +399,20 @@ def test_folders_that_are_none_of_a_run(tmp_path):
 
 @pytest.mark.parametrize(
     "damage",
-    [
-        lambda text: "",
-        lambda text: text[: len(text) // 2],
-        lambda text: text.replace("cameras:", "camaras:"),
-        lambda text: text.replace("gf7:", "gf9:"),
-        lambda text: "\0\1\2" + text,
-        lambda text: "[" * 2000,
-        lambda text: "&a [*a]",
-        lambda text: "- a\n- b\n",
-        lambda text: text.replace("3 um", "3 parsec"),
-    ],
+    quick(
+        3,
+        [
+            lambda text: "",
+            lambda text: text[: len(text) // 2],
+            lambda text: text.replace("cameras:", "camaras:"),
+            lambda text: text.replace("gf7:", "gf9:"),
+            lambda text: "\0\1\2" + text,
+            lambda text: "[" * 2000,
+            lambda text: "&a [*a]",
+            lambda text: "- a\n- b\n",
+            lambda text: text.replace("3 um", "3 parsec"),
+        ],
+    ),
 )
 def test_a_damaged_config_is_told_with_its_place(tmp_path, damage):
     text = resolve(written(tmp_path, JOB)).to_yaml()

@@ -224,6 +224,7 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     assert np.abs(noisy.parts["noise"] / noisy.sigma).max() < 4.9
 
 
+@pytest.mark.second
 def test_image_noise_is_the_floor(noisy) -> None:
     """0.3 pixels in both lines, by hand: each moves a point along the track by 0.3 lines of 0.63 m, and the height by
     the difference over base to height. 300 points: 4% of an RMS, five sigmas; 4% for the altitude."""
@@ -232,6 +233,7 @@ def test_image_noise_is_the_floor(noisy) -> None:
     assert noisy.cases["true"].height_rms == pytest.approx(expected, rel=0.25)
 
 
+@pytest.mark.second
 def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
     """The trace of the prism alone explains what the monitor is wrong by, and heights with it."""
     flight, parts = noisy.flight, noisy.parts
@@ -245,6 +247,7 @@ def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
     assert left == pytest.approx(whole, abs=1e-3)  # products of two arcseconds
 
 
+@pytest.mark.second
 def test_causes_add_up(noisy) -> None:
     """Each entry of the file alone, against all together, at the time that is looked at: linear but for products."""
     flight = noisy.flight
