@@ -841,10 +841,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert schema[prism]["properties"]["kind"]["anyOf"][0]["enum"][-2:] == kinds
     for change, said in (
         (("corner, ", "corner, angle_errors: {window: [0 rad, 0 rad]}, "), "no such face; found 'window', allowed: mi"),
-        (
-            ("kind: two_plates", "kind: corner"),
-            "prism_0.kind: not one of the choices; found 'corner', allowed: rhombo",
-        ),
+        (("kind: two_plates", "kind: corner"), "prism_0.kind: not one of the choices; found 'corner', allowed: rhombo"),
         (("shift: 130 mm", "shift: 110 mm"), "monitor.prism_0.shift: base/forward/monitor/left/prism_0: the mirrors"),
     ):
         with pytest.raises(InputError, match=re.escape(said)):

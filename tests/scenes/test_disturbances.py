@@ -13,14 +13,7 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import (
-    DISTURBANCES,
-    INSTRUMENTS,
-    LIBRARY,
-    library_names,
-    load_camera,
-    load_disturbances,
-)
+from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_camera, load_disturbances
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate

@@ -98,26 +98,6 @@ def test_report_is_self_contained_and_names_its_files(done) -> None:
     assert not re.search(r"@import|url\(\s*['\"]?http|<script[^>]+src|<link[^>]+href", text)
 
 
-@pytest.mark.slow
-def test_config_repeats_the_run(done, tmp_path: Path) -> None:
-    """From its own folder, where the camera's file is not beside it."""
-    folder, _ = done
-    config = tmp_path / "config.yaml"
-    config.write_bytes((folder / "config.yaml").read_bytes())
-    target = tmp_path / "again"
-    target.mkdir()
-    refused = run("focus", config, "--out", target)
-    assert refused.exit_code == 2
-    assert "--force" in refused.stderr
-    assert files(target) == set()
-    result = run("focus", config, "--out", target, "--force")
-    assert result.exit_code == 0, result.stderr
-    assert (target / "focus.json").read_bytes() == (folder / "focus.json").read_bytes()
-    assert (target / "config.yaml").read_bytes() == config.read_bytes()
-    assert "true" in result.stdout
-    assert str(target / "report.html") in result.stdout
-
-
 @pytest.mark.second
 def test_turntable(tmp_path: Path) -> None:
     """With half the angles and fewer folds than the example."""
@@ -132,14 +112,6 @@ def test_turntable(tmp_path: Path) -> None:
     data = json.loads(result.stdout)
     assert {"repeat_rms_arcsec", "chauvenet_rms_arcsec", "fits", "chosen"} <= set(data)
     assert {"report.html", "turntable.json", "config.yaml", "manifest.json"} <= files(tmp_path / "run")
-
-
-def test_help() -> None:
-    for arguments in ((), ("focus",), ("distortion",), ("turntable",)):
-        result = run(*arguments, "--help")
-        assert result.exit_code == 0
-        assert "Usage" in result.stdout
-    assert "Exit codes" in run("--help").stdout
 
 
 # what is wrong, where it is said, and what to do about it

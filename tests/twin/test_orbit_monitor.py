@@ -120,11 +120,7 @@ def test_true_parameters_reproduce_the_traced_line(case: str, quiet, backend, gf
     values = [float(v[0]) for v in (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)]
     nominal, true = (traced_line_cameras(gf7_pair, backend, s)["forward"] for s in ({}, state))
     calibrated = CalibratedLine(
-        nominal.pixels,
-        nominal.directions,
-        nominal.origins,
-        gf7_pair.camera_axes("forward"),
-        change.nominal_distance,
+        nominal.pixels, nominal.directions, nominal.origins, gf7_pair.camera_axes("forward"), change.nominal_distance
     )
     pixel = np.linspace(0.0, nominal.pixels - 1.0, 201)
     moved = np.linalg.norm(true.look(pixel) - nominal.look(pixel), axis=1).max()
@@ -380,12 +376,7 @@ BAD = {
         ["base/forward/focal_plane"],
     ),
     "short orbit": ("after: 42 min", "after: 2401 s", "orbit.after", ["a minute before the first and after"]),
-    "no overlap": (
-        "ground: {",
-        "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {",
-        "cameras",
-        ["steering: yaw"],
-    ),
+    "no overlap": ("ground: {", "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {", "cameras", ["steering: yaw"]),
 }
 
 

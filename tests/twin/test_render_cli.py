@@ -359,13 +359,6 @@ def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypa
     assert f"{truth['cameras']['backward']['d_beta_arcsec']:.4f}" in result.stdout
 
 
-def test_help_teaches():
-    result = run("--help")
-    assert result.exit_code == 0
-    for word in ("--out", "--seed", "--frames", "--backend", "--force", "--json", "--quiet", "rotate", "Exit codes"):
-        assert word in result.stdout
-
-
 @pytest.mark.second
 def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

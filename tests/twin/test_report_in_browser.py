@@ -34,10 +34,7 @@ def run(backend):
 
 
 PLANE = "base/backward/focal_plane"
-MOTIONS = {
-    "turned": {PLANE: Motion(rotate=(0.0, 0.0, 1e-4))},
-    "shifted": {PLANE: Motion(shift=(0.0, 1e-5, 0.0))},
-}
+MOTIONS = {"turned": {PLANE: Motion(rotate=(0.0, 0.0, 1e-4))}, "shifted": {PLANE: Motion(shift=(0.0, 1e-5, 0.0))}}
 """What the view shows; the rest of the page is of the run."""
 
 

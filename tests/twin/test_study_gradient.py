@@ -255,11 +255,7 @@ def test_options_of_runs_are_refused(small, option):
             "key: [recovered, centroid]",
             "not a number in the base",
         ),
-        (
-            "key: [recovered, intersection_angle, derived, change_arcsec]",
-            "key: [recovered, nothing]",
-            "no such key",
-        ),
+        ("key: [recovered, intersection_angle, derived, change_arcsec]", "key: [recovered, nothing]", "no such key"),
     ],
     ids=["text", "whole number", "text response", "no response"],
 )
