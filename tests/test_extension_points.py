@@ -395,6 +395,7 @@ def test_an_estimator(monkeypatch: pytest.MonkeyPatch) -> None:
         assert np.all(np.concatenate([total[c][name].sigma - total[c]["posterior"].sigma for c in both]) > 0.0)
 
 
+@pytest.mark.second
 def test_an_estimator_of_a_study(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Its readings and sigmas are responses of a study, and a study's gradient goes through it."""
     add(monkeypatch, ESTIMATORS, "half", Half())
@@ -433,6 +434,7 @@ responses:
 """
 
 
+@pytest.mark.second
 @extends(READINGS)
 def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The change of the principal distance as a part of it: one entry, seen in every view of the table of readings."""
@@ -839,10 +841,7 @@ def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert schema[prism]["properties"]["kind"]["anyOf"][0]["enum"][-2:] == kinds
     for change, said in (
         (("corner, ", "corner, angle_errors: {window: [0 rad, 0 rad]}, "), "no such face; found 'window', allowed: mi"),
-        (
-            ("kind: two_plates", "kind: corner"),
-            "prism_0.kind: not one of the choices; found 'corner', allowed: rhombo",
-        ),
+        (("kind: two_plates", "kind: corner"), "prism_0.kind: not one of the choices; found 'corner', allowed: rhombo"),
         (("shift: 130 mm", "shift: 110 mm"), "monitor.prism_0.shift: base/forward/monitor/left/prism_0: the mirrors"),
     ):
         with pytest.raises(InputError, match=re.escape(said)):

@@ -46,6 +46,7 @@ def names_of_ours(text: str) -> list[str]:
     return [name for name in found if str(name).partition(".")[0] in backend.PACKAGES]
 
 
+@pytest.mark.second
 def test_no_module_of_a_wheel_asks_for_one_outside_of_it() -> None:
     asked = 0
     for path in FILES:
@@ -58,6 +59,7 @@ def test_no_module_of_a_wheel_asks_for_one_outside_of_it() -> None:
     assert asked > 3000
 
 
+@pytest.mark.second
 def test_modules_named_as_text_are_those_of_two_lists() -> None:
     """A wheel puts nothing before a name in a text: what imports by such a name has to know what stands before it."""
     named = re.compile(rf"({'|'.join(backend.PACKAGES)})(\.\w+){{2,}}(:\w+)?")

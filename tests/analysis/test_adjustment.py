@@ -25,6 +25,7 @@ from tests.analysis.test_three_line_model import (
     observe,
     orbit,
 )
+from tests.tiers import quick
 
 NOISE = Noise(0.3 * PITCH, 0.5 * ARCSEC)
 CONTROL, ORBIT = 1.0, 0.3
@@ -352,8 +353,8 @@ def with_gross_errors(seed, share, robust, actual, views):
     return error / size @ np.linalg.solve(unit, error / size), len(error), found, lost
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1])
-@pytest.mark.parametrize("robust", ["huber", "igg"])
+@pytest.mark.parametrize("share", quick(1, [0.1, 0.0]))
+@pytest.mark.parametrize("robust", quick(1, ["huber", "igg"]))
 def test_robust_weights_and_variance_components_go_together(robust, share):
     """Two passes with gross errors of 5 to 30 px, of 0.3 px and of twice the noise that is claimed. Two-sided false
     alarm of 1e-4; what the variance factors of 300 redundant observations add to it is a hundredth."""
@@ -430,6 +431,7 @@ def test_priors_pull_as_their_weight_says():
     assert against.degrees_of_freedom == without.degrees_of_freedom + 1
 
 
+@pytest.mark.second
 def test_seven_fields_are_quick_and_check_points_gain():
     """60 points x 3 lines x 7 fields; check points without control before and after, 100 m class and metres."""
     rng = np.random.default_rng(14)
@@ -498,10 +500,12 @@ def sharply_measured(claimed, actual, outliers):
     return fields, replace(noise, image=0.1 * PITCH), wrong
 
 
-@pytest.mark.parametrize("robust", ["huber", "igg"])
 @pytest.mark.parametrize(
-    ("actual", "outliers"),
-    [(0.02, 0.03), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((0.02, 0.0), (0.06, 0.03)))],
+    ("robust", "actual", "outliers"),
+    [
+        *quick(1, [("igg", 0.02, 0.03), ("huber", 0.02, 0.03)]),
+        *(pytest.param(r, *c, marks=pytest.mark.slow) for r in ("huber", "igg") for c in ((0.02, 0.0), (0.06, 0.03))),
+    ],
 )
 def test_robust_weights_settle_where_others_hardly_check_a_point(robust, actual, outliers):
     """0.02 px claimed, attitude of 0.25 px: an image point is predicted ten times worse than it is measured."""

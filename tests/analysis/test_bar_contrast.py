@@ -11,6 +11,7 @@ from scipy import stats
 
 from analysis.mtf.bar_mtf import BarError, _design, _waves, measure_bars
 from analysis.spots.noise import NoiseModel
+from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
 PAN, MULTISPECTRAL = 7e-6, 28e-6
@@ -174,6 +175,7 @@ def test_turned_and_mirrored_regions_say_the_same():
         assert sign * other.frequency == pytest.approx(np.array(expected), abs=1e-7)
 
 
+@pytest.mark.second
 def test_sigma_without_a_model_is_that_with_the_right_one():
     """200 regions of 16 x 16 px in white noise of 2 DN: the variance of one is known to sqrt(2 / 245), the mean to
     0.6%. The fit weighs its pixels and takes out a little less than one for each of its eleven unknowns: at most 2.6%.
@@ -234,7 +236,7 @@ def repeats(contrast, use_model, count=200, f=0.5):
 
 
 @pytest.mark.parametrize("use_model", [True, False])
-@pytest.mark.parametrize("f", [0.2, 0.5])
+@pytest.mark.parametrize("f", quick(1, [0.2, 0.5]))
 def test_sigma_agrees_with_the_scatter(f, use_model):
     bars = repeats(400.0, use_model, f=f)
     low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], len(bars) - 1)

@@ -81,6 +81,7 @@ def campaign(cameras, counts, draws, seed):
                 assert 5e-5 < chance < 1 - 5e-5, (attitude, total, size)
 
 
+@pytest.mark.second
 def test_a_small_campaign_is_honest_or_warned_of():
     campaign((0.3, 6.0), (6, 40), 1, 1)
 

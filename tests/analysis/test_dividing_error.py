@@ -143,6 +143,7 @@ def test_misfits_are_told_apart() -> None:
     assert np.mean(common) == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.second
 def test_covariance_matches_the_scatter() -> None:
     """Slope of the corrected error over the camera's field, 200 calibrations of a curve that the spline follows."""
     reading = np.radians(np.linspace(100.75, 103.25, 55))

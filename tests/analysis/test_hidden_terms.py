@@ -72,6 +72,7 @@ def test_a_rate_with_a_prior_is_told_and_its_sigma_is_in_x_of_the_outer_lines():
     assert told.rates is None
 
 
+@pytest.mark.second
 def test_false_alarms_of_rates_and_courses_are_those_of_chance():
     """30 passes of 12 points: probabilities are even; 1e-4 of this test's own (Kolmogorov, two of them)."""
     rng, rates, courses = np.random.default_rng(5), [], []
@@ -84,6 +85,7 @@ def test_false_alarms_of_rates_and_courses_are_those_of_chance():
         assert stats.kstest(chances, "uniform").pvalue > 5e-5
 
 
+@pytest.mark.second
 def test_a_random_walk_shows_in_the_residuals_and_stated_it_is_in_the_sigmas():
     """Ten passes, 1 arcsec in a root of a second: silent sigmas are 10 wrong, residuals tell every time; stated, the
     interior's errors have their sigmas (chi-square, false alarm 1e-4), and the component of variance finds the walk."""

@@ -9,6 +9,7 @@ from scipy import stats
 from analysis.matching import matches, window_checks
 from analysis.matching.matches import MatchOptions, Reason
 from tests.analysis.stereo_pairs import Pair, layered, photographed, rivals, textured
+from tests.tiers import quick
 
 # texture slope (0.5 sharp, 2 soft), noise of both images over contrast, relief in px with its length, radiometry
 EASY = {"slope": 1.0, "noise": 0.1, "relief": 0.0, "length": 12.0, "radiometry": "same"}
@@ -44,7 +45,7 @@ def judged(pair: Pair, options: MatchOptions | None = None):
     return used, error, 0.5 * square, found
 
 
-@pytest.mark.parametrize("changes", SMALL, ids=str)
+@pytest.mark.parametrize("changes", quick(2, SMALL), ids=str)
 def test_errors_keep_in_their_covariances(changes) -> None:
     """64 points: three standard deviations of the mean half of chi-square of those accepted, 1 of a point, beyond what
     is asked for: one false alarm in 700 where it lies at the limit.
@@ -65,6 +66,7 @@ def test_steps_of_depth_are_refused_or_widened() -> None:
     assert (np.abs(error[used]).max(axis=1) > 0.5).mean() < 0.06
 
 
+@pytest.mark.second
 def test_windows_over_edges_between_layers_are_refused() -> None:
     """Two textures, the near one 1.5 px before the far one and hiding some of it: half of the windows hold an edge.
     Those without one are used, and what is used is right within its covariance.
@@ -83,6 +85,7 @@ def test_windows_over_edges_between_layers_are_refused() -> None:
     assert square.mean() < HIGH * stats.chi2.isf(1e-3, 2 * len(square)) / (2 * len(square))
 
 
+@pytest.mark.second
 def test_windows_too_weak_to_show_a_step_are_refused_only_where_others_have_one() -> None:
     """Noise of half the contrast, steps of 1.5 px; the same noise and more without steps refuses none."""
     pair, _edge = layered(9, step=1.5, noise=0.5, seed=24)

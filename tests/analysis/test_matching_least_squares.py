@@ -8,6 +8,7 @@ from analysis.matching.least_squares import least_squares
 from analysis.matching.matches import MatchOptions, Reason, resampled
 from analysis.matching.spline import SplineStack
 from tests.analysis.texture_image import Texture, detected, lattice
+from tests.tiers import quick
 
 SIZE = 570
 PLACES = lattice(18, 28, 47, seed=3)  # windows of 25 px do not overlap: errors are independent
@@ -106,8 +107,10 @@ def test_affine_change_without_noise(texture, templates):
     assert np.abs(fits.gain - 0.6).max() < 0.02
 
 
-@pytest.mark.parametrize(("sharp", "largest"), [((0.45, 0.45), 0.006), ((0.1, 0.4), 0.008), ((0.1, 0.1), 0.008)])
-@pytest.mark.parametrize("sharpness", [True, False])
+@pytest.mark.parametrize(
+    ("sharp", "largest"), quick(1, [((0.45, 0.45), 0.006), ((0.1, 0.4), 0.008), ((0.1, 0.1), 0.008)])
+)
+@pytest.mark.parametrize("sharpness", quick(1, [True, False]))
 def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpness):
     """An MTF of 0.25 at the limit in the image against others in the template, gain 0.7: with the terms for sharpness
     still the spline's error; without them chance correlations of slopes and bends, below 0.02 px.
@@ -135,7 +138,7 @@ def test_reference_of_finer_pixels(texture, clean):
     assert limits(2 * len(PLACES))[0] < chi_square(fits.place - PLACES, fits.covariance()) < limits(2 * len(PLACES))[1]
 
 
-@pytest.mark.parametrize("seed", [21, 22])
+@pytest.mark.parametrize("seed", quick(1, [21, 22]))
 def test_covariance_with_noise(clean, templates, seed):
     """Shot noise and 20 electrons of read noise on contrast 120; spline errors are a tenth of the sigma."""
     fits = least_squares(detected(clean, seed), templates, started())

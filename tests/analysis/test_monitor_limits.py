@@ -13,6 +13,7 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw, consistency
 from analysis.monitor.estimators import Shifts, applicable
 from analysis.monitor.monitoring import MonitorGeometry
+from tests.tiers import quick
 
 RARE = 1e-6
 """False-alarm rate of each statistical comparison here."""
@@ -284,11 +285,11 @@ def test_rows_of_the_angle_and_of_parameters():
         assert row[0] == -row[4]
 
 
-@pytest.mark.parametrize("cameras", [1, 2])
-def test_false_alarms_and_power_of_the_chi_square(cameras):
-    """5000 drawn shifts each. Noise is a hundredth of the motions, so that three times them are three times the spread
+@pytest.mark.parametrize(("cameras", "count"), quick(1, [(2, 1000), (2, 5000), (1, 5000)]))
+def test_false_alarms_and_power_of_the_chi_square(cameras, count):
+    """Drawn shifts. Noise is a hundredth of the motions, so that three times them are three times the spread
     to 1e-4."""
-    stated, count = a_statement(cameras=cameras), 5000
+    stated = a_statement(cameras=cameras)
     noise = a_noise(count=4 * cameras, size=0.01)
     rng = np.random.default_rng(7)
     root = np.linalg.cholesky(stated.spot_covariance + noise)

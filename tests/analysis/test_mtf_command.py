@@ -385,6 +385,7 @@ def test_numbers_at_the_ends_of_double_precision(tmp_path, scale, what):
         assert result.stderr.count("\n") == (1 if result.exit_code else 0)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("options", [["--json"], []])
 def test_a_result_that_cannot_be_printed(edge_tiff, options):
     command = [sys.executable, "-m", "analysis.mtf", str(edge_tiff), "--roi", ROI, "--pitch", "7 um", *options]

@@ -17,6 +17,7 @@ from analysis.orbit.shared_noise import SharedNoise
 from analysis.orbit.three_line_model import LineModel
 from tests.analysis.test_adjustment import BIAS, INNER, LABORATORY, NOISE, PITCH, measured, truth
 from tests.analysis.test_three_line_model import ARCSEC, cameras, field_points, mounting, observe
+from tests.tiers import quick
 
 FREE = Gauge(start=WORST)
 HOLD_SIX = Gauge(held=("nadir x", "forward f", "nadir f", "backward f", "nadir y", "Beijing yaw"))
@@ -228,7 +229,7 @@ def long_camera(focal=5.5):
     return models, 0.8 * half / focal * 500e3
 
 
-@pytest.mark.parametrize("count", [6, 200])
+@pytest.mark.parametrize("count", quick(1, [6, 200]))
 def test_a_long_camera_is_calibrated_and_what_launch_tells_is_marked(count):
     """f of 5.5 m is known to 0.2 mm by 200 points, a quarter of a pixel at the ends of the line: refused as open when f
     counted as much as a principal point. With launch values as priors the errors have the sigmas they are given; false

@@ -132,6 +132,7 @@ def test_rows_of_shared_noise_are_derivatives_of_the_misclosures():
                 assert slope == pytest.approx(rows[:, k], rel=1e-5, abs=1e-5 * np.abs(rows[:, k]).max()), group
 
 
+@pytest.mark.second
 def test_sigmas_are_right_where_points_share_noise():
     """12 campaigns of two fields; two-sided false alarm 1e-3 each for parameters and residuals.
 
@@ -169,6 +170,7 @@ def test_sigmas_are_right_in_a_hundred_campaigns_of_seven_fields():
     assert stats.chi2.sf(*wrong) < 5e-4
 
 
+@pytest.mark.second
 def test_seven_fields_are_quick():
     fields, _ = campaign(flight(60), np.random.default_rng(23))
     spent = []

@@ -21,6 +21,7 @@ from analysis.mtf.edge_location import EdgeError, _direction, locate_edge, pixel
 from analysis.mtf.rice import rice_bias, rice_sigma, signal_modulus
 from analysis.mtf.slanted_edge import measure_edge
 from analysis.spots.noise import NoiseModel
+from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
 WAVELENGTH, F_NUMBER = 650e-9, 9.2
@@ -250,7 +251,7 @@ def test_speed():
 # --- noise ---
 
 
-@pytest.mark.parametrize(("contrast_e", "use_model"), [(4000, True), (4000, False), (600, True)])
+@pytest.mark.parametrize(("contrast_e", "use_model"), quick(1, [(4000, True), (4000, False), (600, True)]))
 def test_sigma_agrees_with_the_scatter(contrast_e, use_model):
     edges = repeats(contrast_e, use_model=use_model)
     low, high = chi_square_limits(len(edges))

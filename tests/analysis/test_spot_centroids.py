@@ -26,6 +26,7 @@ from analysis.spots.likelihood import image_bound
 from analysis.spots.noise import NoiseModel
 from analysis.spots.spot_image import sane
 from analysis.spots.spot_template import SpotTemplate
+from tests.tiers import quick
 
 FALSE_ALARM = 1e-6
 SHAPE = (96, 96)
@@ -131,7 +132,7 @@ def moved(request, places, fixed):
     return step, record(electrons(places + step), fixed, 3)
 
 
-@pytest.mark.parametrize("name", ["likelihood", "energy", "gauss"])
+@pytest.mark.parametrize("name", quick(1, ["likelihood", "energy", "gauss"]))
 def test_difference_agrees_with_stated_sigma(name, moved, template, before):
     """Before and after on the same pixels: at rest the pattern cancels, moved by a spot's size it counts twice."""
     step, after = moved
@@ -209,7 +210,7 @@ def test_every_spot_needs_a_template_that_exists(template):
             maximum_likelihood_fit(mean, FRAMES, NOISE, template, np.array(wrong))
 
 
-@pytest.mark.parametrize("elliptical", [False, True])
+@pytest.mark.parametrize("elliptical", quick(1, [True, False]))
 def test_a_gaussian_fits_in_chi_square(elliptical):
     """100 Gaussian spots of about 100 degrees of freedom each, in a window whose soft edge is a third of its pixels: 5
     sigma of the mean is a false alarm of 6e-7. The Airy rings of a larger window do not fit.

@@ -118,6 +118,7 @@ def test_places_on_edges_keep_in_their_covariances():
     assert np.sqrt(np.linalg.cond(found.covariance[used])).min() > 3.0
 
 
+@pytest.mark.second
 def test_a_bare_edge_has_no_place_along_it():
     """However strong, and in whichever direction: the noise's own slopes do not count. What passes stands by chance on
     a place where the noises of both are alike, 11 of 800 of another seed; by the normal matrix alone twice as many.

@@ -41,6 +41,7 @@ def test_json_is_all_of_stdout_and_progress_is_on_stderr(quick) -> None:
     assert "s left" in quick.stderr
 
 
+@pytest.mark.second
 def test_absent_peers_are_named_and_the_others_compared(quick) -> None:
     data = json.loads(quick.stdout)
     for part, peer in (("trace", "batoid"), ("trace", "optiland"), ("psf", "poppy")):
@@ -48,6 +49,7 @@ def test_absent_peers_are_named_and_the_others_compared(quick) -> None:
         assert (f"ratio_{peer}" in data[part]) != named
 
 
+@pytest.mark.second
 def test_a_quick_run_judges_no_limit(quick) -> None:
     limits = json.loads(quick.stdout)["limits"]
     assert all(limit["met"] is None for limit in limits)

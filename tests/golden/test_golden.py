@@ -222,6 +222,7 @@ def test_a_golden_file_of_other_packages_is_not_compared(monkeypatch, tmp_path) 
         check(BY_NAME["design"])
 
 
+@pytest.mark.second
 def test_a_changed_golden_file_fails_the_command(monkeypatch, tmp_path) -> None:
     """A quick job from its process to the exit code."""
     kept = json.loads(golden_file("mtf_bars").read_text("utf-8"))

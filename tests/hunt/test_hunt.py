@@ -12,8 +12,9 @@ from tests.hunt.dense_images import DenseImages
 from tests.hunt.hunt import RIGHT, hunt
 from tests.hunt.legal_instruments import legal_instrument
 from tests.hunt.legal_jobs import legal_job
+from tests.tiers import quick
 
-FEW, MANY = 60, 1000
+FEW, MANY = 6, 1000
 
 
 @pytest.fixture
@@ -31,12 +32,13 @@ def require_honest(outcomes) -> Counter:
     return Counter(o.kind for o in outcomes)
 
 
-def test_nobody_is_misled(found) -> None:
-    outcomes = found(0, FEW, 12)
+@pytest.mark.parametrize("cases", quick(1, [FEW, 60]))
+def test_nobody_is_misled(found, cases) -> None:
+    outcomes = found(0, cases, 12 if cases > FEW else 3)
     counts = require_honest(outcomes)
     # a twin that refuses or warns of everything would be honest, too
-    assert counts[RIGHT] > 0.4 * FEW
-    assert sum(o.checked for o in outcomes) > 2
+    assert counts[RIGHT] > 0.4 * cases
+    assert sum(o.checked for o in outcomes) > (2 if cases > FEW else 0)
 
 
 @pytest.mark.slow

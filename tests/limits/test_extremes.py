@@ -18,6 +18,7 @@ from optics.numerics.backend import Backend
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.limits.extremes import INSTRUMENTS_BEYOND, STUDIES_BEYOND, Extreme, with_ccd
+from tests.tiers import quick
 from twin.monitor.monitor_experiment import MonitorExperiment
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -98,6 +99,7 @@ def test_memory_is_what_was_estimated(name: str, tmp_path: Path) -> None:
     estimated(took)
 
 
+@pytest.mark.second
 def test_an_instrument_beyond_all_is_refused(tmp_path: Path) -> None:
     """The draw of the slow tests above: refused before anything of it is computed."""
     took, said = run(tmp_path, "twin.render", INSTRUMENTS_BEYOND["CCD of 8192 x 8192 pixels"].write(tmp_path))
@@ -109,7 +111,7 @@ def test_an_instrument_beyond_all_is_refused(tmp_path: Path) -> None:
     assert 1024 < int(told[1]) < 2048
 
 
-@pytest.mark.parametrize("name", ["conic of M1 a thousand times", "radius of M3 40 percent less"])
+@pytest.mark.parametrize("name", quick(1, ["conic of M1 a thousand times", "radius of M3 40 percent less"]))
 def test_surfaces_that_make_no_image_are_named_first(name: str, tmp_path: Path, backend: Backend) -> None:
     """And not the prism or the baffle that their light then meets."""
     with pytest.raises(InputError) as caught:

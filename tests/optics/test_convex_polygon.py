@@ -21,6 +21,7 @@ from optics.geometry.polygon import (
 from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_shadow import FEW_SIDES, PupilShadow, quadrature_within, separate
 from scenes.models.shadow import Shadows
+from tests.tiers import quick
 
 RNG = np.random.default_rng(7)
 SOME, OTHERS = (hull(RNG.normal(size=(60, count, 2))) for count in (7, 6))
@@ -151,13 +152,14 @@ def test_a_sliver_within_a_pupil_has_its_area_and_no_more(thin: float, across: f
         assert np.max(np.abs(points)) < 1.0
 
 
-def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says() -> None:
-    """Of 300 pupils with one to six shadows, slivers and outlines that touch the rim or each other among them."""
+@pytest.mark.parametrize("count", quick(1, [40, 300]))
+def test_random_shadows_in_a_pupil_take_what_a_dense_raster_of_it_says(count) -> None:
+    """Of pupils with one to six shadows, slivers and outlines that touch the rim or each other among them."""
     rng = np.random.default_rng(33)
     line = (np.arange(300) + 0.5) / 150.0 - 1.0
     x, y = (a.ravel() for a in np.meshgrid(line, line))
     raster = np.stack([x, y], axis=-1)[np.hypot(x, y) < 1.0]
-    for _ in range(300):
+    for _ in range(count):
         outlines = [_random_shadow(rng) for _ in range(rng.integers(1, 7))]
         if len(outlines) > 1 and rng.random() < 0.3:  # shares a side with the first
             outlines[-1] = outlines[0] + (outlines[0][:, 1] - outlines[0][:, 0])[:, None]

@@ -95,6 +95,7 @@ def test_poppys_names_of_zernike_terms() -> None:
         assert zernike.name(j)[-1] == zern_name(j)[-1].lower()
 
 
+@pytest.mark.second
 def test_mtf_of_poppys_image(backend, camera) -> None:
     """The camera's own wavefront in a round pupil through poppy's matrix transform: its MTF along both axes."""
     poppy = pytest.importorskip("poppy")

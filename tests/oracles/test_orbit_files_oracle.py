@@ -12,6 +12,7 @@ import pytest
 
 from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.specs.orbit.setup import load_three_line_camera
+from tests.tiers import quick
 from tests.twin import orbit_file_bench as bench
 from twin.orbit.flight.earth import Earth
 from twin.orbit.flight.light_effects import LightEffects
@@ -61,8 +62,8 @@ def date(epoch: str, seconds: float) -> Any:
     return AbsoluteDate(epoch.removesuffix("Z"), TimeScalesFactory.getUTC()).shiftedBy(float(seconds))
 
 
-@pytest.mark.parametrize("epoch", EPOCHS)
-@pytest.mark.parametrize("frame", ["GCRF", "EME2000"])
+@pytest.mark.parametrize("epoch", quick(1, EPOCHS))
+@pytest.mark.parametrize("frame", quick(1, ["GCRF", "EME2000"]))
 def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) -> None:
     """With pole, UT1 and celestial pole offsets of the same table; 0.6 mm and 2 um/s: its nutation is interpolated."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D
@@ -85,8 +86,8 @@ def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) ->
         np.testing.assert_allclose(rate, np.array(found.getVelocity().toArray()), rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("epoch", EPOCHS)
-@pytest.mark.parametrize("frame", ["GCRS", "TEME"])
+@pytest.mark.parametrize("epoch", quick(1, EPOCHS))
+@pytest.mark.parametrize("frame", quick(1, ["GCRS", "TEME"]))
 def test_inertial_frames_against_astropy(epoch: str, frame: str) -> None:
     """astropy leaves the celestial pole's offsets out, and joins days by straight lines; at midnight both tables are
     the same. 1 um is rounding; TEME's sidereal time takes 1e-5 m more.
@@ -131,6 +132,7 @@ def read(folder: Path, orbit: dict[str, Any], attitude: dict[str, Any]) -> Any:
     return platform_table(*read_platform(spec, folder), bench.EPOCH)
 
 
+@pytest.mark.second
 def test_messages_against_orekit_s_own_readers(orekit: Path, tmp_path: Path) -> None:
     """OEM, AEM and SP3 are parsed by Orekit, brought to its ITRF, and compared with what we make of the same files."""
     from org.hipparchus.geometry.euclidean.threed import Vector3D
@@ -183,6 +185,7 @@ def test_messages_against_orekit_s_own_readers(orekit: Path, tmp_path: Path) -> 
         assert abs(state.getDate().durationFrom(date(bench.EPOCH, mine.orbit_time[k]))) < 1e-9
 
 
+@pytest.mark.second
 def test_rugged_sees_the_same_ground_points(orekit: Path, tmp_path: Path) -> None:
     """The camera's looks, orbit and attitude in the GCRF go to Rugged, the same files to us; with light time and
     aberration, at three heights, within 5 mm. Its table of frames has steps of 10 ms.

@@ -52,6 +52,7 @@ def told(tally: Tally) -> str:
     return "\n\n".join(map(str, tally.bad))
 
 
+@pytest.mark.second
 def test_spoilt_files_are_refused_or_taken(table, tmp_path) -> None:
     cheap = {name: case for name, case in table.items() if case.kind.startswith(QUICK)}
     tally = run_many([(name, 3) for name in cheap], tmp_path, table)

@@ -20,6 +20,7 @@ from optics.geometry.solid import solid_mesh
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.robustness.tree_edits import editable, holder, job_of, scaled, trees
+from tests.tiers import quick
 from twin.main_job.render_job import STAGES, render_job
 from twin.monitor.monitor_experiment import MonitorExperiment
 
@@ -95,7 +96,7 @@ def well_told(error: InputError) -> bool:
     return said and "watertight" not in str(error)
 
 
-@pytest.mark.parametrize("number", range(QUICK))
+@pytest.mark.parametrize("number", quick(2, range(QUICK)))
 def test_random_edits_run(number, tmp_path, backend) -> None:
     assert outcome(number, tmp_path, backend) == ("runs", "")
 
@@ -120,7 +121,7 @@ NAMED = [
 ]
 
 
-@pytest.mark.parametrize(("file", "key", "change"), NAMED, ids=[key for _, key, _ in NAMED])
+@pytest.mark.parametrize(("file", "key", "change"), quick(1, NAMED), ids=[key for _, key, _ in NAMED])
 def test_named_edits(file, key, change, tmp_path, backend) -> None:
     """Spots lie on the middle of their CCDs, and the central prism is a closed body of the volume that its facets give
     it, also where a wall is no more because the facets beside it go down to the bottom.
@@ -158,6 +159,7 @@ def _block_volume(experiment: MonitorExperiment) -> float:
     return float(np.mean(np.maximum(top + spec.height, 0.0)) * 16.0 * spec.spread[0] * spec.spread[1])
 
 
+@pytest.mark.second
 def test_a_camera_out_of_focus_says_so(tmp_path, backend) -> None:
     """M1's radius by 0.2 %: the spots are blurred; moved as the warning says the focal plane makes them sharp."""
     camera, instrument = trees("gf7_pair")

@@ -30,6 +30,7 @@ from scenes.specs.load import load_camera
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
+from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.camera.camera_optics import CameraOptics
@@ -58,6 +59,7 @@ def with_edges(text: str, surface: str = "M1") -> CameraSpec:
     return camera(re.sub(rf"  {surface}: {{", f"  {surface}: {{edges: [{text}], ", BARE))
 
 
+@pytest.mark.second
 def test_edges_take_the_share_of_their_area(backend, cut, bare) -> None:
     """The stop is M1 and light comes square to it: what a disk and three vanes before it take of the middle's beam."""
     assert bare.wavefront().vignetted == 0.0
@@ -95,6 +97,7 @@ def test_wavefronts_and_focus_are_of_the_light_that_comes_through(backend, bare)
     assert CameraOptics.alone(masked, backend).wavefront((1.0, 0.0)).rms < 0.5 * bare.wavefront((1.0, 0.0)).rms
 
 
+@pytest.mark.second
 def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> None:
     """Wavefronts, map over the field, curves along the line and through focus; no part of it is above the whole."""
     fields = ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.0))
@@ -186,7 +189,7 @@ def dense_mtf(optics: CameraOptics, field: tuple[float, float], frequency: np.nd
     return np.array(out)
 
 
-@pytest.mark.parametrize("field", [(0.0, 0.0), (0.5, -1.0)])
+@pytest.mark.parametrize("field", quick(1, [pytest.param((0.5, -1.0)), pytest.param((0.0, 0.0))]))
 def test_mtf_of_a_cut_pupil_is_that_of_its_raster(cut, bare, field) -> None:
     cutoff = min(float(np.min(pupil.cutoff(np.eye(2), 650e-9))) for pupil in cut.pupils([field]))
     frequency = np.linspace(0.0, 1.0, 21) * cutoff

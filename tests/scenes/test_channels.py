@@ -10,6 +10,7 @@ import pytest
 from scenes.models.obstruction import check_beams, find_obstructions
 from scenes.yaml.errors import InputError
 from tests.scenes import monitor_layouts
+from tests.tiers import quick
 
 NAMES = ("left", "right", "left_2", "right_2")
 
@@ -149,7 +150,9 @@ REFUSED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("changes", "key", "words"), REFUSED, ids=[f"{k}-{i}" for i, (_, k, _) in enumerate(REFUSED)])
+@pytest.mark.parametrize(
+    ("changes", "key", "words"), quick(8, REFUSED), ids=[f"{k}-{i}" for i, (_, k, _) in enumerate(REFUSED)]
+)
 def test_what_cannot_stand_is_told_at_its_line(changes, key, words, backend, tmp_path) -> None:
     """At the channel's own key where the file says it there; the line is that of the key, or of what holds it."""
     data = changed(*changes)
@@ -215,6 +218,7 @@ def _edit(count: int, seed: int, backend, folder) -> list[str]:
     return said
 
 
+@pytest.mark.second
 def test_random_edits_are_refused_in_words(backend, tmp_path) -> None:
     said = _edit(20, 1, backend, tmp_path)
     assert 8 < len(said) < 20

@@ -100,6 +100,7 @@ def test_missing_file_names_the_one_that_was_meant(tmp_path: Path) -> None:
         read_table(tmp_path, COLUMNS)
 
 
+@pytest.mark.second
 def test_a_long_table_takes_seconds(tmp_path: Path) -> None:
     path = tmp_path / "long.csv"
     path.write_text("point,x [mm],count\n" + "p1,12.25,4\n" * 200_000)

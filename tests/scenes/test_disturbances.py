@@ -13,19 +13,13 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import DisturbancesSpec
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.load import (
-    DISTURBANCES,
-    INSTRUMENTS,
-    LIBRARY,
-    library_names,
-    load_camera,
-    load_disturbances,
-)
+from scenes.specs.load import DISTURBANCES, INSTRUMENTS, LIBRARY, library_names, load_camera, load_disturbances
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.robustness.case import Reached, cut
+from tests.tiers import quick
 from twin.render import app
 
 MIRRORS = [f"base/{camera}/M{k}" for camera in ("forward", "backward") for k in (1, 2, 3)]
@@ -67,7 +61,7 @@ def command(folder, job: str, own: str = "", instrument: str = "") -> tuple[int,
 # --- what is stated ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", library_names(DISTURBANCES))
+@pytest.mark.parametrize("name", quick(1, library_names(DISTURBANCES)))
 @pytest.mark.parametrize("instrument", library_names(INSTRUMENTS))
 def test_every_file_is_of_every_instrument_of_the_library(backend, name, instrument, tmp_path) -> None:
     (tmp_path / "job.yaml").write_text(f"instrument: {instrument}\ndisturbances: {name}\n")
@@ -330,7 +324,7 @@ OF_FILE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", OF_FILE)
+@pytest.mark.parametrize("case", quick(12, OF_FILE))
 def test_what_a_file_says_wrong(tmp_path, case) -> None:
     """One message with the file's own line, and nothing is written."""
     cause, key, told = OF_FILE[case]
@@ -384,7 +378,7 @@ OF_JOB = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", OF_JOB)
+@pytest.mark.parametrize("case", quick(6, OF_JOB))
 def test_what_a_job_says_wrong(tmp_path, case) -> None:
     """Told at the job's line, also where it changes what a file says."""
     value, key, told = OF_JOB[case]

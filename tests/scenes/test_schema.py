@@ -26,6 +26,7 @@ from scenes.yaml.yaml_file import read_yaml
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.second
 def test_command_writes_all(tmp_path: Path) -> None:
     command = [sys.executable, "-W", "error", "-m", "scenes.schema", "--out", str(tmp_path / "new" / "folder")]
     result = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=True)
@@ -35,6 +36,7 @@ def test_command_writes_all(tmp_path: Path) -> None:
         assert json.loads(path.read_text("utf-8"))["type"] == "object"
 
 
+@pytest.mark.second
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match="file"):

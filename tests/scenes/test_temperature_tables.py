@@ -21,6 +21,7 @@ from scenes.specs.load import load_camera, load_instrument, load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from scenes.yaml.node_table import read_temperatures
+from tests.tiers import quick
 
 M1 = "base/forward/M1"
 PRISM = "base/forward/monitor/left/prism_180"
@@ -65,7 +66,7 @@ def warmed(model: ThermalModel, folder: Path, body: str, points: np.ndarray, val
 # --- what is linear ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("body", [M1, PRISM, "base/forward", "base/central_prism"])
+@pytest.mark.parametrize("body", quick(2, [M1, "base/forward", PRISM, "base/central_prism"]))
 def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> None:
     points = lattice(silica, body)
     if body in ("base/forward", "base/central_prism"):
@@ -86,7 +87,7 @@ def test_a_linear_table_is_the_linear_temperature(silica, tmp_path, body) -> Non
         )
 
 
-@pytest.mark.parametrize("head", ["dT [K]", "dT [mK]", "T [K]", "T [degC]"])
+@pytest.mark.parametrize("head", quick(1, ["dT [K]", "dT [mK]", "T [K]", "T [degC]"]))
 def test_an_even_table_is_the_even_temperature(silica, tmp_path, head) -> None:
     points = lattice(silica, M1, (7, 7, 3))
     value = {"dT [K]": 2.0, "dT [mK]": 2000.0, "T [K]": 295.15, "T [degC]": 22.0}[head]
@@ -142,7 +143,9 @@ def quadratic(points: np.ndarray) -> np.ndarray:
 LATTICES = [(21, 19, 9), (41, 37, 17)]
 
 
-@pytest.mark.parametrize("lattices", [LATTICES[:1], pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"])
+@pytest.mark.parametrize(
+    "lattices", [*quick(0, [LATTICES[:1]]), pytest.param(LATTICES, marks=pytest.mark.slow)], ids=["one", "two"]
+)
 def test_a_quadratic_field_is_the_thermo_elastic_solution(silica, tmp_path, lattices) -> None:
     """Solved directly on the same elements; a table of 12 mm lies h^2/8 of the curvature below the field."""
     held = silica.elastic(M1, cells=FINE_CELLS)
@@ -222,6 +225,7 @@ def test_bodies_without_finite_elements_follow_linear_fields_only(silica, tmp_pa
         assert "the nearest linear field" in str(caught.value)
 
 
+@pytest.mark.second
 def test_warnings_of_coverage_and_of_coarse_tables(silica, tmp_path) -> None:
     points = lattice(silica, M1, (9, 9, 4))
     half = points[points[:, 0] < np.quantile(points[:, 0], 0.8)]

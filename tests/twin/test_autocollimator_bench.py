@@ -111,6 +111,7 @@ def test_spots_lie_where_the_exact_trace_sends_them(axis: str, reader: Reader) -
         assert np.max(np.abs(reading[unit - 1] - exact)) < 5e-4 * angles[-1]
 
 
+@pytest.mark.second
 def test_the_images_noise_is_as_stated(reader: Reader, backend: Backend) -> None:
     # one state seen 60 times: the only differences are the detectors' temporal noise
     setup = with_errors()

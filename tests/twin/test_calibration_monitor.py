@@ -42,10 +42,7 @@ SEED = np.random.SeedSequence(3)
 def setup_with(exact: bool = False) -> CalibrationSetup:
     """Three fields of the example; exact: no noise, and no bias that changes from field to field or in a pass."""
     test = WHOLE.test
-    update: dict[str, object] = {
-        "fields": FrozenMap({k: test.fields[k] for k in KEPT}),
-        "schemes": (KEPT[:1], KEPT),
-    }
+    update: dict[str, object] = {"fields": FrozenMap({k: test.fields[k] for k in KEPT}), "schemes": (KEPT[:1], KEPT)}
     if exact:
         tracker = test.errors.star_tracker.model_copy(update={"thermal": ThermalDriftSpec()})
         errors = {"switched_on": False, "season": (0.0, 0.0, 0.0), "star_tracker": tracker}
@@ -161,6 +158,7 @@ def write(folder: Path, *changes: tuple[str, str]) -> Path:
     return path
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     path = write(
         tmp_path,

@@ -129,6 +129,7 @@ def test_errors_with_ties_are_those_of_the_covariances() -> None:
         assert least < value < most
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     """One field, few ties, readings every 0.5 s."""
     text = EXAMPLE.read_text("utf-8")

@@ -268,6 +268,7 @@ def test_the_command_refocuses(blurred, monkeypatch) -> None:
     assert (out / "again" / "optics.json").read_bytes() == (out / "optics.json").read_bytes()
 
 
+@pytest.mark.second
 def test_a_diffraction_limited_camera_says_so(backend) -> None:
     run = run_camera(resolve_camera("gf7"), backend)
     text = " ".join(verdict(run))

@@ -15,6 +15,7 @@ from optics.thermal.heat import Temperature
 from scenes.models.scenery import build_scenery
 from scenes.specs.resolved import resolve
 from tests.scenes import monitor_layouts
+from tests.tiers import quick
 from tests.twin.path_bench import IDEAL
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.path_tracing.sinks import NOMINAL
@@ -221,7 +222,7 @@ def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
 # --- path tracer, pictures --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("layout", ["two", "hollow"])
+@pytest.mark.parametrize("layout", quick(1, ["two", "hollow"]))
 def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, backend) -> None:
     """For every channel, with a reflector turned: places on the CCD and path lengths."""
     own = request.getfixturevalue(layout)

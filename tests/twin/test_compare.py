@@ -20,19 +20,31 @@ from twin.run.run_folder import RunFolder, write_manifest
 from twin.scripting.instrument_twin import load
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Data of three small jobs: a, b with another despace, and a once more, written as the command writes them."""
+def write(folder: Path, name: str, shift: int = 3, seed: int = 1) -> None:
+    """Data of a small job, as the command writes them."""
     from twin.main_job.render_files import write_data
 
+    twin = load("monitor_pair").perturbed({"base/forward/M2": {"shift": f"0 0 {shift} um"}})
+    with RunFolder(folder / name) as target:
+        write_data(render_job(twin.resolved, twin.experiment.backend, 2, seed, experiment=twin.experiment), target)
+        write_manifest(target, "twin.render", 0.0, 1.0, seed=seed, warnings=[])
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three jobs: a, b with another despace, and a once more."""
     folder = tmp_path_factory.mktemp("runs")
-    pair = load("monitor_pair")
-    for name, shift, seed in (("a", 3, 1), ("b", 4, 1), ("again", 3, 1), ("seed", 3, 2)):
-        twin = pair.perturbed({"base/forward/M2": {"shift": f"0 0 {shift} um"}})
-        with RunFolder(folder / name) as target:
-            write_data(render_job(twin.resolved, pair.experiment.backend, 2, seed), target)
-            write_manifest(target, "twin.render", 0.0, 1.0, seed=seed, warnings=[])
+    write(folder, "a")
+    write(folder, "b", shift=4)
+    write(folder, "again")
     return folder
+
+
+@pytest.fixture(scope="module")
+def seeded(runs: Path) -> Path:
+    """And a with another seed."""
+    write(runs, "seed", seed=2)
+    return runs
 
 
 def run(*words: object) -> tuple[int, str]:
@@ -79,9 +91,9 @@ def test_what_differs_is_found(runs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.second
-def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
+def test_noise_alone_is_within_some_sigma(seeded: Path, tmp_path: Path) -> None:
     """Another seed: every reading moves, none by more than 5 sigma (some 70 of them: 4e-5)."""
-    folders = [runs / "a", runs / "seed"]
+    folders = [seeded / "a", seeded / "seed"]
     strict, loose = compare(folders, 1e-9, None), compare(folders, 1e-9, 5.0)
     readings = [one for one in strict.found[0].numbers if one.in_sigma is not None]
     assert len(readings) > 40
@@ -93,17 +105,17 @@ def test_noise_alone_is_within_some_sigma(runs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.second
-def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(runs: Path, tmp_path: Path) -> None:
+def test_files_without_a_sigma_of_the_noise_are_compared_by_the_one_they_have(seeded: Path, tmp_path: Path) -> None:
     """As runs wrote them before there were stated disturbances: `_sigma` alone, of the noise."""
     old = []
     for name in ("a", "seed"):
         folder = tmp_path / name
-        shutil.copytree(runs / name, folder)
+        shutil.copytree(seeded / name, folder)
         text = (folder / "recovered.json").read_text()
         text = re.sub(r'\n *"[a-z_]+_sigma": [^\n]*', "", text).replace("_sigma_noise", "_sigma")
         (folder / "recovered.json").write_text(text)
         old.append(folder)
-    now, then = (compare(pair, 1e-9, None).found[0].numbers for pair in ([runs / "a", runs / "seed"], old))
+    now, then = (compare(pair, 1e-9, None).found[0].numbers for pair in ([seeded / "a", seeded / "seed"], old))
     key = "cameras.forward.model.d_f_um"
     one, other = (next(n for n in numbers if n.key == key) for numbers in (now, then))
     assert one.sigma == other.sigma is not None

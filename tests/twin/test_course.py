@@ -22,6 +22,7 @@ from scenes.specs.job import checked_nodes
 from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
@@ -319,7 +320,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(5, BAD))
 def test_a_bad_course_is_explained_and_leaves_nothing(case: str, tmp_path) -> None:
     text, line, words = BAD[case]
     job = written(tmp_path, text)

@@ -12,6 +12,7 @@ from optics.numerics.threads import one_blas_thread
 from scenes.models.disturbances import state_of
 from scenes.specs.job import AnalysisSpec, JobSpec
 from scenes.specs.resolved import resolve_job
+from tests.tiers import quick
 from tests.twin.dirty_frames import KINDS, Drawn, clean_scene, draw, measurement, record, replace
 
 SETS = 200
@@ -60,7 +61,7 @@ def squares(bench, kinds, seeds, centroid="ml", learnt=False):
     return np.array(out), told
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "all"])
+@pytest.mark.parametrize("kind", quick(1, ["all", *KINDS]))
 def test_dirt_is_found_and_corrected(bench, kind):
     """One set of each kind."""
     kinds = STANDING if kind == "all" else (kind,)
@@ -131,6 +132,7 @@ def test_dark_rings_of_a_brighter_spot_are_not_taken_for_dead_pixels(bench, seed
     assert not lone_pixels(screen_frames(drawn.after, bench[2]), bench[2]).any()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("centroid", ["gaussian", "energy"])
 def test_other_centroids_are_corrected_as_well(bench, centroid):
     """They know no shape: what is missing is put in by the fitted one, what is beside the spot taken off."""
@@ -168,7 +170,7 @@ def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     assert measured > 12
 
 
-@pytest.mark.parametrize("kind", ["clean", "bad pixels", "background"])
+@pytest.mark.parametrize("kind", quick(1, ["background", "clean", "bad pixels"]))
 def test_a_learnt_shape_is_that_of_the_spot_alone(bench, kind):
     """Without a model the shape is learnt from the frames before: holes in these, a column through the spot among them,
     are filled by the frequencies that optics let through; slopes of the background do not go with the spot.
@@ -197,6 +199,7 @@ def test_what_the_frames_before_hold_stands_in_the_sigma_of_a_learnt_shape(bench
             assert not any(one.kind == "smear" for one in before.findings)
 
 
+@pytest.mark.second
 def test_another_spot_is_told_with_a_learnt_shape_as_well(bench):
     """The test of the core still finds what is no noise: a spot after of 1.1 px more smear."""
     template, detector, noise = bench
@@ -232,7 +235,7 @@ def test_frames_of_another_noise_than_stated_are_told(bench):
         assert noise_ratio(dirty.after, noise) is None
 
 
-@pytest.mark.parametrize("learnt", [False, True])
+@pytest.mark.parametrize("learnt", quick(1, [True, False]))
 def test_four_times_the_noise_is_noise(bench, learnt):
     """It was refused as frames that are unlike each other, or was told as a spot of another shape: defocus. No frame,
     no pixel and no shape is to blame, and sigma is that of the frames' own noise.

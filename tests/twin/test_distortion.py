@@ -18,6 +18,7 @@ from optics.targets.target_shapes import pinhole
 from optics.waves.diffraction import Grid
 from optics.waves.transfer import TransferTable
 from scenes.specs.resolved import resolve_distortion
+from tests.tiers import quick
 from twin.laboratory.distortion_bench import DistortionBench
 from twin.laboratory.distortion_numbers import DISTORTION
 from twin.laboratory.distortion_report import distortion_report
@@ -126,6 +127,7 @@ def test_spots_are_found_where_the_chief_rays_go():
     assert abs(slope) < 0.2 * r.compensated.fit.sigma("principal_distance")
 
 
+@pytest.mark.second
 def test_noise_of_the_spots_is_as_stated():
     """The same spots on another day's frames: temporal noise, and columns that stay."""
     b = within(altered(points=55, setting=0.0))
@@ -215,11 +217,14 @@ def test_bench_that_cannot_be_built(changes, key, text):
 
 @pytest.mark.parametrize(
     ("changes", "key", "text"),
-    [
-        ({"light": 1.3}, "light", "saturated"),
-        ({"light": 0.001, "frames": 1}, "light", "no spot"),
-        ({"zero": 3600 * ARCSEC}, "reach", "beside the line"),
-    ],
+    quick(
+        1,
+        [
+            ({"light": 1.3}, "light", "saturated"),
+            ({"light": 0.001, "frames": 1}, "light", "no spot"),
+            ({"zero": 3600 * ARCSEC}, "reach", "beside the line"),
+        ],
+    ),
 )
 def test_test_that_cannot_be_measured(changes, key, text):
     b, few = within(altered(**changes)), [0, 20, 40, 54]

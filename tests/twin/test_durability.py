@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.tiers import quick
 from tests.twin.replacing import FILES, Moments, replace_run, replace_study, standing
 from tests.twin.study_bench import ROOT, write_study
 from twin.run.run_folder import RunFolderError
@@ -31,7 +32,7 @@ def hidden(place: Path) -> set[str]:
     return {path.name for path in place.iterdir()} - {"run", "lost+found"}
 
 
-@pytest.mark.parametrize("kind", REPLACE)
+@pytest.mark.parametrize("kind", quick(1, REPLACE))
 def test_a_disk_that_fails_at_any_step(tmp_path, kind) -> None:
     """No room left from some step on, at a few of all steps by default; then room again."""
     place = tmp_path / "disk"

@@ -112,6 +112,7 @@ def test_equation_12_and_table_5_from_the_printed_lines(budget):
     assert propagated(spot, geometry, "paper_joint")["d_f"] == pytest.approx(0.5 * table_5["d_f"], rel=1e-9)
 
 
+@pytest.mark.second
 def test_all_causes_together_give_table_5(budget):
     together = budget.together()
     assert together.spot[0] / ARCSEC == pytest.approx(0.145, rel=0.2, abs=3.0 * together.spot[1] / ARCSEC)

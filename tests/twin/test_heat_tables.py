@@ -79,6 +79,7 @@ def _linear(field, points: np.ndarray) -> np.ndarray:
     return np.asarray(field.change + points @ np.array(field.gradient))
 
 
+@pytest.mark.second
 def test_one_material_evenly_heated_keeps_its_angles(silica, tmp_path) -> None:
     """Told as nodes of the base, from which all bodies inherit."""
     points = np.random.default_rng(2).uniform(-1.0, 1.0, (40, 3))

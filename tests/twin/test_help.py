@@ -6,6 +6,7 @@ import shlex
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from scenes.kinds.file_kinds import kind_of
 from scenes.yaml.yaml_file import read_yaml
@@ -32,16 +33,20 @@ MADE = "runs/"
 """Beginning of files that other examples make."""
 
 
-def command_of(program: str):
-    """The command line interface of a program."""
+def app_of(program: str) -> typer.Typer:
     if program in FUNCTIONS:
         app = typer.Typer()
         app.command()(importlib.import_module(program).main)
-        return typer.main.get_command(app)
+        return app
     module = importlib.import_module(program)
     if hasattr(module, "__path__"):  # a package
         module = importlib.import_module(f"{program}.__main__")
-    return typer.main.get_command(module.app)
+    return module.app
+
+
+def command_of(program: str):
+    """The command line interface of a program."""
+    return typer.main.get_command(app_of(program))
 
 
 def helps():
@@ -58,12 +63,14 @@ HELPS = list(helps())
 
 @pytest.mark.parametrize(("name", "command", "text"), HELPS, ids=[" ".join(name) for name, _, _ in HELPS])
 def test_the_examples_of_a_help_can_be_run(name, command, text) -> None:
+    assert "Usage" in CliRunner().invoke(app_of(name[0]), [*name[1:], "--help"]).stdout
     text = " ".join(text.split())
     examples = re.findall(r"`python -m ([^`]+)`", text) or re.findall(
         r"python -m ([\w. ]+(?: --[\w-]+| [\w./-]+)*)", text
     )
     assert examples, "no example"
     assert any(example.startswith(" ".join(name)) for example in examples)
+    assert "Exit code" in text or len(name) > 1 or name == ("scenes.schema",)
     for example in examples:
         program, *words = shlex.split(example)
         assert program in (*PROGRAMS, *FUNCTIONS)

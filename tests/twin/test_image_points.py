@@ -15,6 +15,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.specs.orbit.setup import resolve_calibration, resolve_simulate
+from tests.tiers import quick
 from tests.twin.commands import invoke, refused
 from twin.orbit.calibration.calibration_run import true_values
 from twin.orbit.calibration.campaign import Campaign
@@ -77,6 +78,7 @@ def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: Matc
     assert 0.0 < np.abs(control.height - height).max() < 12.0
 
 
+@pytest.mark.second
 def test_tie_points_are_five_times_better(flown: Simulation, control: MatchedPoints) -> None:
     """The same ground on the same day: 0.05 px."""
     spec = asked().model_copy(update={"tie": 40})
@@ -131,7 +133,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(1, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     change, key, words = BAD[case]
     changes = [change] if change[0] == SIZE else [change, (SIZE, "lines: 200, pixels: 200}")]

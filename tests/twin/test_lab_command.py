@@ -11,6 +11,7 @@ import tifffile
 
 import twin.lab as command
 from scenes.specs.load import LAB, LIBRARY, SCENES
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 
 run = partial(invoke, command.app)
@@ -97,26 +98,7 @@ def test_report_is_self_contained_and_names_its_files(done) -> None:
     assert not re.search(r"@import|url\(\s*['\"]?http|<script[^>]+src|<link[^>]+href", text)
 
 
-@pytest.mark.slow
-def test_config_repeats_the_run(done, tmp_path: Path) -> None:
-    """From its own folder, where the camera's file is not beside it."""
-    folder, _ = done
-    config = tmp_path / "config.yaml"
-    config.write_bytes((folder / "config.yaml").read_bytes())
-    target = tmp_path / "again"
-    target.mkdir()
-    refused = run("focus", config, "--out", target)
-    assert refused.exit_code == 2
-    assert "--force" in refused.stderr
-    assert files(target) == set()
-    result = run("focus", config, "--out", target, "--force")
-    assert result.exit_code == 0, result.stderr
-    assert (target / "focus.json").read_bytes() == (folder / "focus.json").read_bytes()
-    assert (target / "config.yaml").read_bytes() == config.read_bytes()
-    assert "true" in result.stdout
-    assert str(target / "report.html") in result.stdout
-
-
+@pytest.mark.second
 def test_turntable(tmp_path: Path) -> None:
     """With half the angles and fewer folds than the example."""
     text = TURNTABLE.read_text("utf-8")
@@ -130,14 +112,6 @@ def test_turntable(tmp_path: Path) -> None:
     data = json.loads(result.stdout)
     assert {"repeat_rms_arcsec", "chauvenet_rms_arcsec", "fits", "chosen"} <= set(data)
     assert {"report.html", "turntable.json", "config.yaml", "manifest.json"} <= files(tmp_path / "run")
-
-
-def test_help() -> None:
-    for arguments in ((), ("focus",), ("distortion",), ("turntable",)):
-        result = run(*arguments, "--help")
-        assert result.exit_code == 0
-        assert "Usage" in result.stdout
-    assert "Exit codes" in run("--help").stdout
 
 
 # what is wrong, where it is said, and what to do about it
@@ -166,7 +140,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("name", BAD)
+@pytest.mark.parametrize("name", quick(3, BAD))
 def test_bad_input(name: str, tmp_path: Path) -> None:
     changes, key, words = BAD[name]
     path = write_focus(tmp_path, **changes)

@@ -153,6 +153,7 @@ def test_a_slope_across_a_jump_says_so(bench: LayoutBench) -> None:
     assert slope.errors[STATED_NAME]["angle"] > abs(slope.values[STATED_NAME]["angle"])
 
 
+@pytest.mark.second
 def test_a_layout_at_a_limit_has_slopes_and_one_beyond_tells_why(bench: LayoutBench) -> None:
     names = [number.name for number in numbers_of(bench, (FIRST,))]
     assert names == list(CONTINUOUS)
@@ -178,6 +179,7 @@ def test_spots_that_fill_their_pixels_are_refused(bench: LayoutBench) -> None:
     assert 0.9 < facts.sigmas[STATED_NAME]["forward/d_f"] / dim.sigmas[STATED_NAME]["forward/d_f"] < 1.0
 
 
+@pytest.mark.second
 def test_another_area_ccd_counts_the_same_spots_in_other_pixels(bench: LayoutBench, tmp_path: Path) -> None:
     (tmp_path / STATED_NAME).write_text(STATED, "utf-8")
     ccds = "area_ccds: {coarse: {detector: monitor_ccd, pitch: 12 um, rows: 96, columns: 96}, "

@@ -13,6 +13,7 @@ import pytest
 import twin
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from tests.tiers import quick
 from twin.live.camera_pictures import CameraPictures
 from twin.live.computer import Answers
 from twin.live.knobs import KINDS, knob_name, perturbation
@@ -166,13 +167,16 @@ def test_the_order_of_states_does_not_matter(bench, first):
 
 @pytest.mark.parametrize(
     ("knobs", "cause"),
-    [
-        ({"base/forward/M1 shift x": 90_000.0}, "misses"),
-        ({f"{PLANE} shift x": 2000.0}, "outside its area CCD"),
-        ({"base temperature": -300.0}, "0 K"),
-        ({f"{M2} shift z": 1e9}, "too large"),
-        ({"base/forward/M9 shift z": 1.0}, "no such knob"),
-    ],
+    quick(
+        2,
+        [
+            ({"base/forward/M1 shift x": 90_000.0}, "misses"),
+            ({f"{PLANE} shift x": 2000.0}, "outside its area CCD"),
+            ({"base temperature": -300.0}, "0 K"),
+            ({f"{M2} shift z": 1e9}, "too large"),
+            ({"base/forward/M9 shift z": 1.0}, "no such knob"),
+        ],
+    ),
 )
 def test_an_impossible_state_says_why_and_the_next_good_one_is_good(bench, first, knobs, cause):
     before, _ = bench.state(first)
@@ -298,7 +302,7 @@ def test_the_greeting_and_every_answer_are_json(bench, first):
     assert np.array_equal(pixels, image)
 
 
-@pytest.mark.parametrize("view", ["wavefront", "spot", "mtf", "focus"])
+@pytest.mark.parametrize("view", quick(1, ["wavefront", "spot", "mtf", "focus"]))
 def test_pictures_of_a_camera(bench, view):
     pictures = CameraPictures(bench.twin.experiment)
     assert pictures.draw(view, "forward", 0.5, bench.twin.state, 1, 1).startswith("<svg")

@@ -21,6 +21,7 @@ from scenes.specs.orbit.setup import resolve_angle, resolve_monitor
 from scenes.specs.resolved import resolve, resolve_camera, resolve_turntable
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
+from tests.tiers import quick
 from tests.twin.test_course import JOB as COURSE
 from twin.live.live_bench import LiveBench
 from twin.live.messages import MOST_FRAMES, AskedState
@@ -244,6 +245,7 @@ def test_a_run_of_uncertainty_opens_its_job(tmp_path):
     assert read_source(str(folder)).resolved == resolve(folder / "config.yaml")
 
 
+@pytest.mark.second
 def test_a_monitored_orbit_is_a_course_with_the_motions_of_its_mounts(pair, tmp_path):
     """States of the test itself: temperatures, swings and ramps; poses to rounding."""
     setup = resolve_monitor(SCENES / "orbit" / "monitor.yaml")
@@ -397,17 +399,20 @@ def test_folders_that_are_none_of_a_run(tmp_path):
 
 @pytest.mark.parametrize(
     "damage",
-    [
-        lambda text: "",
-        lambda text: text[: len(text) // 2],
-        lambda text: text.replace("cameras:", "camaras:"),
-        lambda text: text.replace("gf7:", "gf9:"),
-        lambda text: "\0\1\2" + text,
-        lambda text: "[" * 2000,
-        lambda text: "&a [*a]",
-        lambda text: "- a\n- b\n",
-        lambda text: text.replace("3 um", "3 parsec"),
-    ],
+    quick(
+        3,
+        [
+            lambda text: "",
+            lambda text: text[: len(text) // 2],
+            lambda text: text.replace("cameras:", "camaras:"),
+            lambda text: text.replace("gf7:", "gf9:"),
+            lambda text: "\0\1\2" + text,
+            lambda text: "[" * 2000,
+            lambda text: "&a [*a]",
+            lambda text: "- a\n- b\n",
+            lambda text: text.replace("3 um", "3 parsec"),
+        ],
+    ),
 )
 def test_a_damaged_config_is_told_with_its_place(tmp_path, damage):
     text = resolve(written(tmp_path, JOB)).to_yaml()

@@ -110,6 +110,7 @@ def test_turntable_exported_and_read_back(tmp_path: Path) -> None:
     ).read_bytes()
 
 
+@pytest.mark.second
 def test_distortion_exported_and_read_back(tmp_path: Path) -> None:
     simulated, measured = loop("distortion", tmp_path, "distortion.yaml")
     same(simulated, measured)

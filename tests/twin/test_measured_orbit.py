@@ -103,6 +103,7 @@ def example_file(folder, strip: bool):
     return file
 
 
+@pytest.mark.second
 def test_the_command_reads_what_it_exports(tmp_path) -> None:
     """As a user: --export, and the exported test file; the report knows no truth."""
     file, data = example_file(tmp_path, False), tmp_path / "data"

@@ -115,6 +115,7 @@ def test_a_further_beam_never_raises_a_sigma(bench: LayoutBench, facts: tuple[Be
         assert np.trace(many) < np.trace(few)
 
 
+@pytest.mark.second
 def test_beams_combined_are_the_layout_that_is_built(bench: LayoutBench, facts: tuple[BeamFacts, ...]) -> None:
     built = bench.try_layout((FIRST, SECOND))
     assert built.refused == ""
@@ -168,9 +169,7 @@ def test_information_of_frames_adds_and_light_counts_as_beams_do(bench: LayoutBe
     own = stated.scaled(shared.astype(float))
     one = Information(own, once, bench.rows, np.zeros(4))
     twice = replace(
-        one,
-        disturbances=replace(own, spots=np.concatenate([own.spots, own.spots])),
-        noise=np.kron(np.eye(2), once),
+        one, disturbances=replace(own, spots=np.concatenate([own.spots, own.spots])), noise=np.kron(np.eye(2), once)
     )
     brighter = replace(one, noise=once / 2.0)
     known = fisher(one)
@@ -410,8 +409,7 @@ def test_the_file_says_which_design_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "less", "pupil"),
-    [("gf7_pair_two", (12.0, 10.0), 1.3), ("gf7_pair_best", (18.0, 30.0), 1.4)],
+    ("name", "less", "pupil"), [("gf7_pair_two", (12.0, 10.0), 1.3), ("gf7_pair_best", (18.0, 30.0), 1.4)]
 )
 @pytest.mark.parametrize("disturbances", ["orbit", "launch"])
 @pytest.mark.slow

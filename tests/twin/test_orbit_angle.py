@@ -77,10 +77,7 @@ def true_angles() -> tuple[np.ndarray, np.ndarray]:
     normal = {name: np.linalg.svd(directions(name, np.linspace(100.0, 11899.0, 60)))[2][2] for name in LINES}
     pairs = (("forward", "nadir"), ("nadir", "backward"))
     dihedral = [angle(normal[a], normal[b]) for a, b in pairs]
-    return (
-        np.array([angle(centre[a], centre[b]) for a, b in pairs]),
-        np.array([min(v, np.pi - v) for v in dihedral]),
-    )
+    return (np.array([angle(centre[a], centre[b]) for a, b in pairs]), np.array([min(v, np.pi - v) for v in dihedral]))
 
 
 @pytest.mark.parametrize("effects", [NO_EFFECTS, LightEffects()], ids=["no effects", "effects corrected"])
@@ -352,11 +349,3 @@ def test_bad_input(case: str, tmp_path: Path) -> None:
     path = write(tmp_path, old, new)
     line = refused(run, "angle", path, key, words)
     assert key.split(".")[-1] in path.read_text("utf-8").splitlines()[line - 1]
-
-
-def test_help() -> None:
-    for arguments in ((), ("angle",)):
-        result = run(*arguments, "--help")
-        assert result.exit_code == 0
-        assert "Usage" in result.stdout
-    assert "Exit codes" in run("--help").stdout

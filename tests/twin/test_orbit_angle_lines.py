@@ -14,6 +14,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.setup import AngleSetup, resolve_angle
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.angle.angle_flight import AngleCamera, AnglePass, angle_camera, fly
@@ -249,7 +250,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(3, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
     path = write(tmp_path, old, new)

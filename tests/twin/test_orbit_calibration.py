@@ -19,6 +19,7 @@ from scenes.specs.load import ORBIT, SCENES
 from scenes.specs.orbit.angle import LINES, EffectsSpec
 from scenes.specs.orbit.flight import ThermalDriftSpec
 from scenes.specs.orbit.setup import CalibrationSetup, resolve_calibration
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 from twin.orbit.calibration.calibration_numbers import CALIBRATION
 from twin.orbit.calibration.calibration_run import run_calibration, true_values
@@ -557,9 +558,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=pytest.mark.second) if case == "few readings" else case for case in BAD]
-)
+@pytest.mark.parametrize("case", quick(4, sorted(BAD, key="few readings".__eq__)))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     old, new, key, words = BAD[case]
     path = write(tmp_path, old, new)

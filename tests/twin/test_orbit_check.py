@@ -218,6 +218,7 @@ def checked_readings(files: tuple[Path, dict[str, Any]]) -> dict[str, tuple[Any,
     return asked(stated, True)
 
 
+@pytest.mark.second
 def test_the_command_says_it_in_its_exit_code_and_in_json(files, tmp_path: Path) -> None:
     folder, data = files
     path = folder / "check.yaml"

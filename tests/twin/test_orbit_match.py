@@ -122,6 +122,7 @@ def test_a_mirrored_image_and_a_window_change_nothing(flown: Simulation, files, 
         np.testing.assert_allclose(there.line[b] - 10.0, row.line[a], rtol=0, atol=0.02)
 
 
+@pytest.mark.second
 def test_the_command_exports_what_a_calibration_reads(files, tmp_path: Path) -> None:
     from scenes.specs.measured.orbit_data import OrbitDataSpec
     from scenes.yaml.spec import validate

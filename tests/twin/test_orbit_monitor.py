@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from analysis.orbit.forward_intersection import CalibratedLine, IntersectionError, Sightings, between, intersect_pair
 from optics.geometry.tree import Motion
 from scenes.specs.orbit.setup import MonitorSetup, resolve_monitor
+from tests.tiers import quick
 from tests.twin.commands import files, invoke, refused
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight.line_camera import traced_line_cameras
@@ -119,11 +120,7 @@ def test_true_parameters_reproduce_the_traced_line(case: str, quiet, backend, gf
     values = [float(v[0]) for v in (change.d_alpha, change.d_beta, change.d_gamma, change.d_f)]
     nominal, true = (traced_line_cameras(gf7_pair, backend, s)["forward"] for s in ({}, state))
     calibrated = CalibratedLine(
-        nominal.pixels,
-        nominal.directions,
-        nominal.origins,
-        gf7_pair.camera_axes("forward"),
-        change.nominal_distance,
+        nominal.pixels, nominal.directions, nominal.origins, gf7_pair.camera_axes("forward"), change.nominal_distance
     )
     pixel = np.linspace(0.0, nominal.pixels - 1.0, 201)
     moved = np.linalg.norm(true.look(pixel) - nominal.look(pixel), axis=1).max()
@@ -223,6 +220,7 @@ def test_noise_is_as_large_as_its_sigma(noisy) -> None:
     assert np.abs(noisy.parts["noise"] / noisy.sigma).max() < 4.9
 
 
+@pytest.mark.second
 def test_image_noise_is_the_floor(noisy) -> None:
     """0.3 pixels in both lines, by hand: each moves a point along the track by 0.3 lines of 0.63 m, and the height by
     the difference over base to height. 300 points: 4% of an RMS, five sigmas; 4% for the altitude."""
@@ -231,6 +229,7 @@ def test_image_noise_is_the_floor(noisy) -> None:
     assert noisy.cases["true"].height_rms == pytest.approx(expected, rel=0.25)
 
 
+@pytest.mark.second
 def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
     """The trace of the prism alone explains what the monitor is wrong by, and heights with it."""
     flight, parts = noisy.flight, noisy.parts
@@ -244,6 +243,7 @@ def test_a_prism_looks_like_a_camera_that_has_turned(noisy) -> None:
     assert left == pytest.approx(whole, abs=1e-3)  # products of two arcseconds
 
 
+@pytest.mark.second
 def test_causes_add_up(noisy) -> None:
     """Each entry of the file alone, against all together, at the time that is looked at: linear but for products."""
     flight = noisy.flight
@@ -325,6 +325,7 @@ def test_shifts_that_contradict_the_disturbances_are_told(tmp_path: Path, backen
 # The command
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     import twin.orbit.__main__ as command
 
@@ -373,16 +374,11 @@ BAD = {
         ["base/forward/focal_plane"],
     ),
     "short orbit": ("after: 42 min", "after: 2401 s", "orbit.after", ["a minute before the first and after"]),
-    "no overlap": (
-        "ground: {",
-        "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {",
-        "cameras",
-        ["steering: yaw"],
-    ),
+    "no overlap": ("ground: {", "attitude: {offset: [0 deg, 0 deg, 15 deg]}\nground: {", "cameras", ["steering: yaw"]),
 }
 
 
-@pytest.mark.parametrize("case", BAD)
+@pytest.mark.parametrize("case", quick(1, BAD))
 def test_bad_input(case: str, tmp_path: Path) -> None:
     import twin.orbit.__main__ as command
 

@@ -154,6 +154,7 @@ def test_all_that_matters_can_be_seen(backend, instrument, name, seen):
 # --- how they look ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_colours(backend, gf7_pair, paths):
     """Light background, blue and orange light."""
     image = render_shot(gf7_pair, paths, backend, SMALL[0], seed=3).astype(int)

@@ -125,6 +125,7 @@ def test_a_learnt_shape_does_for_a_series_as_well(course, backend):
     assert found.smoothed.consistency.agrees
 
 
+@pytest.mark.second
 def test_the_report_shows_the_series(course, backend):
     found = course.measured(backend, course.text())
     section = next(one for one in recover_report(found).sections if one.title == "Series")

@@ -25,6 +25,7 @@ import twin.main_job.render_folder
 import twin.render as command
 from optics.numerics.threads import LIMIT
 from scenes.specs.load import EXAMPLES
+from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from twin.main_job.render_drawings import IRRADIANCE, SCENE, SUMMARY, _tried, drawings, without_failed
 from twin.main_job.render_job import render_job
@@ -358,13 +359,6 @@ def test_numbers_are_whole_however_narrow_the_terminal(ready, tmp_path, monkeypa
     assert f"{truth['cameras']['backward']['d_beta_arcsec']:.4f}" in result.stdout
 
 
-def test_help_teaches():
-    result = run("--help")
-    assert result.exit_code == 0
-    for word in ("--out", "--seed", "--frames", "--backend", "--force", "--json", "--quiet", "rotate", "Exit codes"):
-        assert word in result.stdout
-
-
 @pytest.mark.second
 def test_default_folder_counts_up(ready, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -499,7 +493,7 @@ TOO_MUCH = {
 }
 
 
-@pytest.mark.parametrize("case", TOO_MUCH)
+@pytest.mark.parametrize("case", quick(1, TOO_MUCH))
 def test_a_perturbation_that_loses_the_light_is_explained(case, tmp_path):
     job = tmp_path / "job.yaml"
     job.write_text(HEAD + "  " + TOO_MUCH[case])

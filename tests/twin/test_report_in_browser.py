@@ -8,6 +8,7 @@ import pytest
 
 from optics.geometry.tree import Motion
 from scenes.specs.resolved import resolve
+from tests.tiers import quick
 from twin.main_job.render_folder import render_report
 from twin.main_job.render_job import render_job
 from twin.main_job.verdict import judge
@@ -19,7 +20,7 @@ from twin.run.report import Report, Section
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra `test`)")
 CHROMIUM = shutil.which("chromium")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+pytestmark = [pytest.mark.second, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
 # software rendering, so that it needs no GPU
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -33,10 +34,7 @@ def run(backend):
 
 
 PLANE = "base/backward/focal_plane"
-MOTIONS = {
-    "turned": {PLANE: Motion(rotate=(0.0, 0.0, 1e-4))},
-    "shifted": {PLANE: Motion(shift=(0.0, 1e-5, 0.0))},
-}
+MOTIONS = {"turned": {PLANE: Motion(rotate=(0.0, 0.0, 1e-4))}, "shifted": {PLANE: Motion(shift=(0.0, 1e-5, 0.0))}}
 """What the view shows; the rest of the page is of the run."""
 
 
@@ -154,6 +152,7 @@ def test_nothing_overflows_and_all_can_be_read(request, open_page, which, width,
     assert reader.wrong == []
 
 
+@pytest.mark.second
 def test_words_of_the_main_report(run, report, open_page) -> None:
     reader = open_page(report, 1400, "light")
     assert reader.page.inner_text(".answer") == judge(run).verdict
@@ -162,7 +161,7 @@ def test_words_of_the_main_report(run, report, open_page) -> None:
     assert 300 < folded <= 2500 < reader.page.evaluate(WORDS)
 
 
-@pytest.mark.parametrize("width", [390, pytest.param(1400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("width", quick(0, [390, pytest.param(1400, marks=pytest.mark.slow)]))
 @pytest.mark.parametrize("motion", MOTIONS)
 def test_the_view_turns_and_its_motions_grow(reports, open_page, motion, width) -> None:
     reader = open_page(reports[motion], width, "light")
@@ -199,6 +198,7 @@ def test_the_view_turns_and_its_motions_grow(reports, open_page, motion, width) 
     assert reader.wrong == []
 
 
+@pytest.mark.second
 def test_a_drawing_stands_in_where_there_is_no_webgl(launcher, report) -> None:
     browser = launcher.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
     try:

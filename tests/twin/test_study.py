@@ -24,6 +24,7 @@ from distributed.core import rpc
 from distributed.security import Security
 
 import twin.study.__main__ as command
+from tests.tiers import quick
 from tests.twin.commands import files, invoke
 from tests.twin.study_bench import ROOT, children, chunks, same_bytes, start, wait_for, write_study
 from twin.study.runs.chunk_store import ChunkStore
@@ -116,7 +117,7 @@ def test_a_block_that_loses_a_run_keeps_the_others(done) -> None:
         assert len(data["df"].values[4 * BLOCK :]) == 10
 
 
-@pytest.mark.parametrize("chunk_blocks", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.parametrize("chunk_blocks", quick(0, [pytest.param(1, marks=pytest.mark.slow), 3]))
 def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_path, chunk_blocks) -> None:
     folder, _, _ = done
     # from the config.yaml, which needs no other file
@@ -144,6 +145,7 @@ def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch
     assert re.search(r"study.yaml:8: responses.df.sigma: states too much; allowed: the noise alone", result.stderr)
 
 
+@pytest.mark.second
 def test_nobody_else_can_talk_to_the_workers(workers) -> None:
     """Whoever may send them a task runs programs as this user: without the study's own key nobody may."""
     facts = workers.client.scheduler_info(n_workers=-1)
@@ -179,6 +181,7 @@ async def greet(address: str, security: Security | None) -> object:
         return await asyncio.wait_for(it.identity(), 5)
 
 
+@pytest.mark.second
 def test_a_corrupt_chunk_is_computed_again(done) -> None:
     """A damaged chunk, a half-written file and a torn line of the index; afterwards every byte is as it was."""
     folder, path, _ = done

@@ -5,6 +5,7 @@ import math
 import pytest
 
 from scenes.specs.study import ResponseSpec
+from tests.tiers import quick
 from twin.study.runs.base_job import BlockResult, leaf, with_values
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
@@ -29,7 +30,9 @@ def numbers(tree, path=()):
     return {path: tree} if isinstance(tree, int | float) and not isinstance(tree, bool) else {}
 
 
-@pytest.mark.parametrize(("command", "file"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)])
+@pytest.mark.parametrize(
+    ("command", "file"), [*quick(0, QUICK), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLOW)]
+)
 def test_two_seeds(tmp_path, backend, command, file) -> None:
     """Both runs are good, have the same keys, and numbers that noise changes; what the base's seed gives comes back."""
     path = tmp_path / "study.yaml"

@@ -55,6 +55,7 @@ class Here:
         return self._done.pop(0)
 
 
+@pytest.mark.second
 def test_a_wrong_shape_in_the_detector_stops_the_study(tmp_path, monkeypatch) -> None:
     """Once a block is stored: what was done before is kept, the message says in which runs, the trace where."""
     plan = Plan.of(resolve_study(write_study(tmp_path / "in")))

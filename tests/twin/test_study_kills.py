@@ -128,13 +128,6 @@ def test_runs_that_kill_their_worker_are_named(tmp_path, monkeypatch) -> None:
     assert dict(os.environ) == before
 
 
-def test_five_kills(undisturbed, tmp_path) -> None:
-    path, expected = undisturbed
-    hit = kill_at_random(path, tmp_path / "run", np.random.default_rng(1), 5)
-    assert sum(hit.values()) >= 3, hit
-    check_result(path, tmp_path / "run", expected)
-
-
 def test_a_command_that_is_killed_is_resumed(undisturbed, tmp_path) -> None:
     path, expected = undisturbed
     folder = tmp_path / "run"

@@ -85,6 +85,7 @@ def test_the_same_block_gives_the_same_bits(study, backend) -> None:
     assert one == two
 
 
+@pytest.mark.second
 def test_a_lost_run_fails_alone(study, backend) -> None:
     """A mirror shifted by 3 mm loses the beam; a value outside the schema is refused; the run between them is good."""
     place = ("job", "perturb", "base/forward/M2", "shift", 2)

@@ -7,6 +7,7 @@ import re
 import numpy as np
 import pytest
 
+from tests.tiers import quick
 from tests.twin.policed_page import breaches
 from tests.twin.study_data import columns, dataset, study_of
 from twin.study.report import study_plots
@@ -127,7 +128,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", quick(2, CASES))
 def test_when_there_is_little_to_say(tmp_path, case) -> None:
     design, function, failed, expected = CASES[case]
     report = "{sobol: true, scatter: [[a, y]], pareto: [{x: a, y: y}], thresholds: {t: {response: y, at_most: 1}}}"

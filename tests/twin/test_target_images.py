@@ -25,6 +25,7 @@ from scenes.models.camera_model import LAUNCH_DISTANCE
 from scenes.models.shadow import imaging_shadows
 from scenes.specs.camera import BandSpec
 from scenes.specs.load import load_detector
+from tests.tiers import quick
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
@@ -239,7 +240,7 @@ def test_against_brute_force(before_gf7, backend):
         assert exact.min() < 0.05 < 0.95 < exact.max()
 
 
-@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("direction", quick(1, DIRECTIONS))
 def test_bars(sharp, aberrated, direction):
     """The contrast of Nyquist bars without noise, against the traced pupil, sharp and aberrated."""
     design = BarDesign.build(sharp, direction)

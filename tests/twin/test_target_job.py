@@ -54,6 +54,7 @@ def mtf(folder):
     return json.loads((folder / "run" / "mtf.json").read_text())
 
 
+@pytest.mark.second
 def test_files(folder, mtf):
     found = files(folder / "run")
     assert {f"{image}.tiff" for image in IMAGES} | {f"{image}.png" for image in IMAGES} | {"mtf.json"} <= found
@@ -68,6 +69,7 @@ def test_files(folder, mtf):
     assert pages[:, -30:].mean() == pytest.approx(9600.0 * (1.0 - lost) + 100.0, rel=0.002)
 
 
+@pytest.mark.second
 def test_measured_agrees_with_truth(mtf):
     assert mtf["frames"] == FRAMES
     camera, truth = mtf["cameras"]["one"], mtf["truth"]["cameras"]["one"]
@@ -92,6 +94,7 @@ def test_measured_agrees_with_truth(mtf):
             assert drop[1] < 0.95 * drop[0]  # 30 um of M2 defocus the camera
 
 
+@pytest.mark.second
 def test_image_shift_is_where_the_edge_went(folder, mtf):
     """Edges measured in the files, and the columns of their windows on the line, move as the chief rays do."""
     for place in PLACES:
@@ -110,6 +113,7 @@ def test_image_shift_is_where_the_edge_went(folder, mtf):
         assert moved == pytest.approx(true["along"], abs=FAR * sigma + 0.7)
 
 
+@pytest.mark.second
 def test_terminal_and_report(folder, mtf):
     said = (folder / "said.txt").read_text()
     truth = mtf["truth"]["cameras"]["one"]["places"]
@@ -125,6 +129,7 @@ def test_terminal_and_report(folder, mtf):
     assert "Test targets and MTF" in page
 
 
+@pytest.mark.second
 def test_no_two_images_share_their_noise(folder):
     """Before and after, places and targets: differences of two frames, which hold no pattern, are uncorrelated."""
     for names in (sorted(IMAGES), [f"images/one_{side}_{when}" for side in ("left", "right") for when in STATES]):

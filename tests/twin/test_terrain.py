@@ -129,6 +129,7 @@ def test_light_by_hand() -> None:
     assert expected < apparent(grey, Terrain.flat(0.0), light).coefficients[0, 0]
 
 
+@pytest.mark.second
 def test_control_errors() -> None:
     """Without noise and smoothing the map shows the ground moved by its error; the elevation model's errors have their
     sigma: 3 km x 2.5 km hold 75 independent patches of 200 m, 5 sigma of the rms are 40%."""

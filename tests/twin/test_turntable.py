@@ -115,6 +115,7 @@ def test_class_of_the_paper() -> None:
     assert 8.0 < np.mean([s.rejected for s in series]) < 20.0
 
 
+@pytest.mark.second
 def test_held_out_residuals_and_sigmas() -> None:
     """40 tables with two quick fits: below the paper's 0.2 arcsec at angles that no fit saw, and what is left after
     correction has the variance that is stated, over the whole region and as a slope over the camera's field.

@@ -22,7 +22,7 @@ OUTSIDE = "a motion outside the family of the model"
 
 
 @pytest.fixture(scope="module")
-def job(backend, tmp_path_factory):
+def job(experiment, tmp_path_factory):
     """Runs a job by what it perturbs, with no disturbances stated unless ``more`` says so; each once."""
     place, done = tmp_path_factory.mktemp("jobs"), {}
 
@@ -34,7 +34,8 @@ def job(backend, tmp_path_factory):
             file.write_text(
                 f"instrument: {instrument}\nperturb: {perturb}\n{more}\nrender: {{frames: {frames}, seed: 3}}\n"
             )
-            done[key] = render_job(resolve(file), backend)
+            resolved, built = resolve(file), experiment(instrument)
+            done[key] = render_job(resolved, built.backend, experiment=built.stating(resolved))
         return done[key]
 
     return run

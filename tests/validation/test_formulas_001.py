@@ -59,11 +59,13 @@ def test_formulas_of_paper_001(formulas, identifier, value, accuracy, verdict):
     assert "weak" not in result.how
 
 
+@pytest.mark.second
 def test_artefacts_show_what_was_selected(backend):
     (one,) = run_checks(select([formulas_group.GROUP], "001.eq2.cos2"), backend, 3).runs
     assert [(a.name, [row[0] for row in a.rows]) for a in one.artefacts] == [("cameras", ["001.eq2.cos2"])]
 
 
+@pytest.mark.second
 def test_the_same_seed_gives_the_same_numbers_and_another_other_noise(formulas, backend):
     chosen = select([formulas_group.GROUP], "001.eq5")
     again, other = (run_checks(chosen, backend, seed).results[0] for seed in (3, 4))

@@ -9,6 +9,7 @@ import pytest
 
 from analysis.turntable.angle_fits import FITS
 from optics.numerics.backend import load_backend
+from tests.tiers import quick
 from twin.validation import registry
 from twin.validation.checks.check import CONFIRMED, CONSISTENT, CORRECTED, NOT_CHECKABLE, REFUTED, REPRODUCED, UNDECIDED
 from twin.validation.paper_004 import distortion_checks, focus_checks, turntable_checks
@@ -110,6 +111,7 @@ def test_every_equation_and_table_has_rows(prefix):
     assert any(identifier.startswith(f"004.{prefix}.") for identifier in STATED)
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(
     ("identifier", "value", "accuracy", "verdict"),
     [
@@ -153,6 +155,7 @@ def test_parameters_that_adjustments_tie_together(ties, largest):
     assert focus_checks.coupled(change * focus_checks.LIMITS) == largest
 
 
+@pytest.mark.second
 def test_only_what_is_needed_runs(monkeypatch):
     def build(*_):
         raise AssertionError("not asked for")
@@ -166,11 +169,14 @@ def test_only_what_is_needed_runs(monkeypatch):
 
 @pytest.mark.parametrize(
     ("identifier", "which", "part", "keys"),
-    [
-        ("004.turntable.repeat", 0, ("dividing_error", "reference"), ("repeatability", "noise")),
-        ("004.turntable.repeat", 1, ("reference",), ("gross_error",)),
-        ("004.turntable.chauvenet", 0, ("dividing_error", "reference"), ("repeatability", "noise")),
-    ],
+    quick(
+        1,
+        [
+            ("004.turntable.repeat", 1, ("reference",), ("gross_error",)),
+            ("004.turntable.repeat", 0, ("dividing_error", "reference"), ("repeatability", "noise")),
+            ("004.turntable.chauvenet", 0, ("dividing_error", "reference"), ("repeatability", "noise")),
+        ],
+    ),
 )
 def test_a_row_fails_where_it_says_that_its_inputs_end(identifier, which, part, keys, monkeypatch):
     """The stated limits come from a formula; tables with such inputs, simulated, just agree and just do not."""
@@ -218,6 +224,7 @@ def test_nearest_camera_without_distortion(tilt):
     assert np.max(np.abs(found.rest)) < 1e-14
 
 
+@pytest.mark.second
 def test_reading_of_one_table_can_be_repeated():
     name = "004.turntable.repeat"
     alone = results(name, 3)[name].measured

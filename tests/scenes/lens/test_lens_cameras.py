@@ -259,6 +259,7 @@ def run(*arguments: object) -> tuple[int, str]:
     return result.exit_code, result.output
 
 
+@pytest.mark.second
 def test_the_command(tmp_path: Path, backend) -> None:
     (tmp_path / "tma.zmx").write_text(TMA, "utf-16")
     (tmp_path / "two.yaml").write_text(BATOID, "utf-8")
