@@ -8,7 +8,7 @@ which ``optics.waves.pupil_shadow`` takes out of the pupil exactly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,20 +17,21 @@ from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectan
 from optics.geometry.polygon import area, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
-from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate, without
+from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
 from optics.waves.pupil_stack import products, to_terms
 
 DEGREE = 10
 """Of the polynomials from the stop to a surface."""
 
-ROUND_SIDES = 48
-"""Of the polygon that stands for a round edge and has its area."""
+ROUND_SIDES = (48, 96, 192)
+"""Of the polygon that stands for a round edge and has its area, the fewest that do: where circles nearly touch or nearly
+coincide, what is between two of them is thinner than what is between a circle and its polygon."""
 
-_ANGLE = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
-_DISK = np.sqrt(_ANGLE[1] / np.sin(_ANGLE[1])) * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
-"""The polygon of a disk of radius 1, (ROUND_SIDES, 2)."""
+FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
+"""Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the more.
+They are right to a third of it."""
 
-MOST_PIECES = 120
+MOST_PIECES = 160
 """Of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
@@ -100,7 +101,67 @@ class StopOutlines:
         return np.stack([widened(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
 
 
-def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNodes) -> StopOutlines:
+def settled_shadows(
+    outlines: Callable[[int], StopOutlines], count: int, further: Sequence[np.ndarray] = ()
+) -> tuple[np.ndarray, float]:
+    """Shadows of ``count`` pupils with as many sides of round edges as they need.
+
+    Args:
+        outlines: of the edges, by the number of sides that stand for a round one.
+        count: B.
+        further: as of ``StopOutlines.shadows``.
+
+    Returns:
+        Pieces as of ``StopOutlines.shadows``, and how much of the stop their shares are right to.
+
+    Raises:
+        UnphysicalError: as of ``StopOutlines.shadows``, or edges that all sides are too few for.
+    """
+    few, *more = ROUND_SIDES
+    pieces = outlines(few).shadows(count, further)
+    share = shares_of_stop(pieces)
+    for sides_of_round in more:
+        finer = outlines(sides_of_round).shadows(count, further)
+        before, share = share, shares_of_stop(finer)
+        change = float(np.max(np.abs(share - before), initial=0.0))
+        if change < FINE_SHARE:
+            return pieces, change
+        pieces = finer
+        if change < COARSE_SHARE:
+            return pieces, change / 3.0
+    raise UnphysicalError(
+        f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of half "
+        "as many: edges all but coincide"
+    )
+
+
+def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
+    """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
+    points, weights = nodes_in_shadows(pieces, 2)
+    return np.asarray(np.sum(weights, axis=-1) / np.pi) if points.size else np.zeros(len(pieces))
+
+
+def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature over the part within the stop of pieces of shadows, with ``count`` nodes along each side of a box.
+
+    Args:
+        pieces: convex polygons that do not overlap, counterclockwise, (B, K, V, 2).
+        count: nodes.
+
+    Returns:
+        Points, complex, (B, Q), and weights of the area.
+    """
+    if not pieces.shape[1]:
+        return np.zeros((len(pieces), 0), complex), np.zeros((len(pieces), 0))
+    tiles, _ = tiled(pieces)
+    flat = tiles.reshape(-1, *tiles.shape[2:])
+    points, weights = quadrature_within(flat, np.ones((len(flat), 1), complex), count)
+    return points.reshape(len(pieces), -1), weights.reshape(len(pieces), -1)
+
+
+def outlines_on_stop(
+    places: np.ndarray, edges: Sequence[Edge], nodes: PupilNodes, round_sides: int = ROUND_SIDES[0]
+) -> StopOutlines:
     """The edges of one surface as B images see them.
 
     Args:
@@ -108,6 +169,7 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
             edges stop, too.
         edges: of the surface; light comes through where all let it.
         nodes: quadrature over the stop's unit disk.
+        round_sides: of the polygon that stands for a round edge.
 
     Raises:
         UnphysicalError: places that no polynomials follow, as of a surface near a focus.
@@ -122,12 +184,12 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
         )
     clear, blocked = [], []
     for edge in edges:
-        for outlines, blocks in _outlines(edge):
+        for outlines, blocks in _outlines(edge, round_sides):
             seen = [_on_the_stop(outline, terms) for outline in outlines]
             if edge.blocks and isinstance(edge.shape, Circle) and edge.shape.inner and _covers(edge, edge.shape, terms):
                 # a ring that reaches beyond every beam lets light through its hole alone
                 hole = Edge(Circle(edge.shape.inner, edge.shape.centre), turn=edge.turn)
-                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole))[0]]
+                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole, round_sides))[0]]
             elif blocks:
                 blocked += seen
             elif len(seen) == 1:
@@ -140,18 +202,24 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
     """Whether the disk within the outer edge of a ring holds all of the stop in every image."""
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.turn)
-    (outline,), _ = next(_outlines(disk))
+    (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
     rim = _window(len(terms), 1.0, RIM_SIDES)
     inside = intersect(rim, *sides(_on_the_stop(outline, terms)))
     return bool(np.all(area(rim) - area(inside) < SMALLEST))
 
 
-def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
+def _disk(count: int) -> np.ndarray:
+    """The polygon of a disk of radius 1, which has its area, (count, 2)."""
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.asarray(np.sqrt(angle[1] / np.sin(angle[1])) * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], bool]]:
     """Convex outlines (V, 2) on the surface, and whether light is stopped in them or outside of all of them."""
-    shape = edge.shape
+    shape, unit = edge.shape, _disk(round_sides)
     match shape:
         case Circle():
-            outer = shape.radius * _DISK
+            outer = shape.radius * unit
             if not shape.inner:
                 yield _turned([outer], edge), edge.blocks
             elif edge.blocks:
@@ -161,9 +229,9 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
                 yield _turned(list(sectors), edge), True
             else:
                 yield _turned([outer], edge), False
-                yield _turned([shape.inner * _DISK], edge), True
+                yield _turned([shape.inner * unit], edge), True
         case Ellipse():
-            yield _turned([_DISK * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+            yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
         case Rectangle():
             corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
             yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks

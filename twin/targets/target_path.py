@@ -7,6 +7,7 @@ sense, so that its image is ``f / focal_length`` times its size and upright in t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -24,10 +25,11 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
-from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
+from optics.waves.edge_shadow import StopOutlines, outlines_on_stop, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
+from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams
 
@@ -37,6 +39,11 @@ RINGS = 14
 DEGREES = (DEGREE, 10, 12, 14)
 """Of the polynomials of a pupil that edges cut, the first that do: outside of the light, in the middle of an obscured
 beam, wavefronts may bend much more than in it.
+"""
+
+SMALL_RESIDUAL = 1e-4
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of DEGREES may leave more.
+Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
 """
 
 MAP_POINTS = 7
@@ -249,27 +256,41 @@ class TargetPath:
             taken = self.shadows.cast(beams).pieces
         if self.model.edges:
             others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-            taken = self._edges(placed, systems, rays.launched, directions).shadows(len(directions), others)
+            seen = self._edges(placed, systems, rays.launched, directions)
+            taken, _ = settled_shadows(seen, len(directions), others)
         turned = turned.in_lengths_of(systems.size)
-        *tried, last = DEGREES if self.model.edges else (DEGREE,)
-        for degree in tried:
+        if not self.model.edges:
+            return fit_pupils(turned, self.nodes, DEGREE, taken)
+        points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
+        lit = ~covered(taken, points, SMALLEST)
+        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in self._cut_pupils(turned, taken, lit))
+
+    def _cut_pupils(self, field: PupilField, taken: np.ndarray, lit: np.ndarray) -> tuple[PupilFunction, ...]:
+        """Pupils with shadows (B, K, V, 2), by polynomials of the lowest degree that follows the lit nodes, (B, N)."""
+        for degree in DEGREES:
             with suppress(RoughWavefrontError):
-                return fit_pupils(turned, self.nodes, degree, taken)
-        return fit_pupils(turned, self.nodes, last, taken)
+                return fit_pupils(field, self.nodes, degree, taken, lit, SMALL_RESIDUAL)
+        return fit_pupils(field, self.nodes, DEGREES[-1], taken, lit)
 
     def _edges(
         self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
-    ) -> StopOutlines:
-        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop."""
-        found = StopOutlines()
+    ) -> Callable[[int], StopOutlines]:
+        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop, by sides of round ones."""
         cut = {name: self.model.mirrors.index(name) for name in self.model.edges}
         sent = make_rays(self.backend, launched, np.broadcast_to(directions[:, None], launched.shape))
         traced = trace(self.backend, systems, sent, keep=tuple(cut.values()))
+        places = {}
         for name, number in cut.items():
             size = placed.scale[0, placed.index[f"{self.root}/{name}"]].real
-            places = np.asarray(traced.hit(number) / size)[..., :2]
-            found += outlines_on_stop(places, self.model.edges[name], self.nodes)
-        return found
+            places[name] = np.asarray(traced.hit(number) / size)[..., :2]
+
+        def outlines(round_sides: int) -> StopOutlines:
+            found = StopOutlines()
+            for name, place in places.items():
+                found += outlines_on_stop(place, self.model.edges[name], self.nodes, round_sides)
+            return found
+
+        return outlines
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""
