@@ -18,7 +18,7 @@ from optics.geometry.polygon import area, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
-from optics.waves.pupil_stack import products, to_terms
+from optics.waves.pupil_stack import LOOSELY, products, to_terms
 
 DEGREE = 10
 """Of the polynomials from the stop to a surface."""
@@ -160,7 +160,11 @@ def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.nda
 
 
 def outlines_on_stop(
-    places: np.ndarray, edges: Sequence[Edge], nodes: PupilNodes, round_sides: int = ROUND_SIDES[0]
+    places: np.ndarray,
+    edges: Sequence[Edge],
+    nodes: PupilNodes,
+    round_sides: int = ROUND_SIDES[0],
+    lit: np.ndarray | None = None,
 ) -> StopOutlines:
     """The edges of one surface as B images see them.
 
@@ -170,13 +174,31 @@ def outlines_on_stop(
         edges: of the surface; light comes through where all let it.
         nodes: quadrature over the stop's unit disk.
         round_sides: of the polygon that stands for a round edge.
+        lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing is
+            left to be cut, and the polynomials follow it loosely.
 
     Raises:
         UnphysicalError: places that no polynomials follow, as of a surface near a focus.
     """
+    known = np.all(np.isfinite(places), axis=-1)
+    lit = known if lit is None else lit & known
+    middle = np.mean(places, axis=1, keepdims=True, where=lit[..., None])
+    # far outside of the light polynomials say nothing of where an edge would be
+    around = middle + _AROUND * (places - middle)
+    edges = [edge for edge in edges if not _idle(edge, around, lit)]
+    if not edges:
+        return StopOutlines()
+    beam = 2.0 * np.max(np.abs(places - middle), axis=(1, 2), where=lit[..., None], initial=0.0)
+
+    def missed(terms: np.ndarray) -> float:
+        off = np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]
+        return float(np.max(off, where=lit, initial=0.0))
+
     terms = to_terms(nodes, DEGREE) @ places
-    beam = np.ptp(places, axis=1).max(axis=-1)
-    worst = float(np.max(np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]))
+    worst = missed(terms)
+    if not worst < WORST_FIT and not np.all(lit):
+        terms = _followed_places(places, nodes, lit, known)
+        worst = missed(terms)
     if not worst < WORST_FIT:
         raise UnphysicalError(
             f"rays meet a surface with edges at places that polynomials of degree {DEGREE} miss by {worst:.2g} of the "
@@ -197,6 +219,25 @@ def outlines_on_stop(
             else:
                 blocked += _outside(seen, len(places))
     return StopOutlines(tuple(clear), tuple(blocked))
+
+
+def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
+    """Whether a clear edge without a hole lets all of the light through that comes to places (B, N, 2), those lit."""
+    if edge.blocks or getattr(edge.shape, "inner", 0.0):
+        return False
+    return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
+
+
+def _followed_places(places: np.ndarray, nodes: PupilNodes, lit: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Coefficients of polynomials through places (B, N, 2), which follow those that are not lit, (B, N), loosely."""
+    design = products(nodes.x, nodes.y, DEGREE)
+    weight = nodes.weight * np.where(lit, 1.0, np.where(known, LOOSELY, 0.0))
+    turned = np.swapaxes(design * weight[..., None], 1, 2)
+    return np.linalg.solve(turned @ design, turned @ np.where(known[..., None], places, 0.0))
+
+
+_AROUND = 1.1
+"""Times the light about its middle: a clear edge beyond stops nothing of it, as nodes stand nearer to each other."""
 
 
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:

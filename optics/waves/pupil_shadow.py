@@ -265,8 +265,11 @@ def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[
     whole = np.where(empty[:, None, None], part, part[:, :1])  # an empty polygon has no sides that could bound it
     if fewest:
         normal, limit = sides(before)
-        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
-        pieces = difference(part, before, np.argsort(off)[::-1])
+        # beyond the other sides there is nothing of it
+        height = np.einsum("bvx,bwx->bwv", part[..., :2], normal)
+        beyond = np.flatnonzero(np.any(height > limit[..., None], axis=(0, 2)))
+        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in beyond]
+        pieces = difference(part, before, beyond[np.argsort(off)[::-1]])
     else:
         pieces = difference(part, before)
     # of a polygon that is empty but for rounding the sides are there, and would leave the part a second time

@@ -41,7 +41,7 @@ LEAST_SHADOW = 2
 """Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
 function is then right to 2e-6, and to 5e-5 with shadows."""
 
-_LOOSELY = 1e-2
+LOOSELY = 1e-2
 """Weight of a node in a shadow, of one in the light. """
 
 _EDGE_SAMPLES = 32
@@ -117,7 +117,7 @@ class PupilStack:
         place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
         design = products(place[:, 0], place[:, 1], degree) * root[:, None]
         both = np.stack([eikonal, density], axis=-1) * root[:, None]
-        counted = np.ones(1) if lit is None else np.where(lit, 1.0, _LOOSELY)[..., None]
+        counted = np.ones(1) if lit is None else np.where(lit, 1.0, LOOSELY)[..., None]
         turned = np.swapaxes(design * counted, 1, 2)
         solution = np.linalg.solve(turned @ design, turned @ both)
         told, weight = (both - design @ solution) ** 2, np.sum(nodes.weight)

@@ -53,8 +53,8 @@ class PupilRaster:
         overlap[0, 0] = 1.0
         return np.asarray(overlap)
 
-    def frequencies(self, count: int) -> np.ndarray:
-        """From 0 to the raster's width, each a shift of whole cells, cycles/m, and the shifts, (count,)."""
+    def shifts(self, count: int) -> np.ndarray:
+        """From 0 to the raster's width, whole cells, at most (count,)."""
         return np.unique(np.linspace(0, len(self.share) - 1, count).astype(int))
 
     def mtf(self, shifts: np.ndarray, perfect: bool = False) -> np.ndarray:
@@ -105,7 +105,7 @@ def raster(telescope: Any, wavelength: float, heading: np.ndarray, radius: float
         i, j = np.indices((DEGREE + 1, DEGREE + 1))
         return np.asarray(both[..., (i + j <= DEGREE).ravel()])
 
-    near = known & np.all(np.abs(cosines - middle) < 1.2 * half, axis=-1)
+    near = known & np.all(np.abs(cosines - middle) < 1.0 * half, axis=-1)
     solution = np.linalg.lstsq(terms(cosines[near]), few[near], rcond=None)[0]
     step = 2.0 * half / cells
     grid = half * (2.0 * (np.arange(cells) + 0.5) / cells - 1.0)

@@ -27,10 +27,12 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
+from optics.numerics.quadrature import PupilNodes
+from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import fit_wavefront, orthonormal_parts, path_to_sphere
+from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts, path_to_sphere
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction
 from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
@@ -58,6 +60,12 @@ SPOT_RINGS = 8
 WORST_LIGHT = 5e-3
 """Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
 
+RAYS_ACCURACY = 2e-3
+"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront error."""
+
+SHARPEST = 1e-4
+"""Rms wavefront error of which shares are told, waves; of less there is rounding of paths in it."""
+
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
 
@@ -72,17 +80,23 @@ class Wavefront:
         x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
             line, y along the track.
         map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light that
-            comes through; their names are ``optics.geometry.zernike``'s.
+        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light
+            that comes through; their names are ``optics.geometry.zernike``'s.
         parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
-            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Their
-            squares and that of ``residual`` sum to that of ``rms``.
-        rms: waves, exact for smooth wavefronts; where edges cut the beam right to 0.2 %.
+            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a
+            ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of
+            ``residual`` sum to that of ``rms``.
+        rms: waves, exact for smooth wavefronts; ``accuracy`` says how far.
         peak_to_valley: waves, over the map and the edge.
         residual: rms that the Zernike terms leave, waves.
         strehl: Strehl ratio, from the mean phasor over the stop.
         vignetted: share of the stop's area whose light other apertures and bodies stop.
         place: of the chief ray on the line CCD, (along the line, along the track), metres.
+        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a whole
+            one, NaN for any other.
+        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer quadrature,
+            whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the light. 0 for
+            a free beam.
     """
 
     field: Field
@@ -98,6 +112,22 @@ class Wavefront:
     strehl: float
     vignetted: float
     place: tuple[float, float]
+    hole: float = 0.0
+    accuracy: float = 0.0
+
+    @property
+    def polynomials(self) -> str:
+        """What ``parts`` are numbers of."""
+        if self.hole == 0.0:
+            return "Zernike circle terms"
+        if np.isfinite(self.hole):
+            return f"annular Zernike terms, hole {self.hole:.4f} of the stop"
+        return "terms orthonormal over the light of this pupil"
+
+    @property
+    def orthonormal_terms(self) -> dict[str, float]:
+        """Name of each term -> waves rms of its part, of ``polynomials``."""
+        return {zernike.name(j): float(c) for j, c in enumerate(self.parts, start=1)}
 
     @property
     def terms(self) -> dict[str, float]:
@@ -126,6 +156,7 @@ class Wavefront:
                 "wavelength_m": self.wavelength,
                 "rms_waves": self.rms,
                 "strehl": self.strehl,
+                **({} if self.hole == 0.0 else {"polynomials": self.polynomials, "parts_waves": self.parts}),
             },
         )
 
@@ -317,39 +348,94 @@ class CameraOptics:
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
+        exact = self._exact_fits(fields, rays.valid[:, own] @ nodes.share, terms)
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
             lit = rays.valid[k]
             weight = nodes.weight * lit[own]
             level = zernike.fit(3, nodes.x, nodes.y, error[k, own], weight)
+            known = exact[k]
+            level = level if known is None else known.fit.level
             flat = error[k] - zernike.basis(3, *stop.T) @ level
-            fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(edge) :]
-            # over a part of the disk the terms share tilt among them; what is level there was taken out above
-            rms = float(fit.rms if np.all(lit) else np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
-            phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
-            out.append(
-                Wavefront(
-                    field=(float(where[0]), float(where[1])),
-                    wavelength=wavelength,
-                    x=axis,
-                    y=axis,
-                    map=table,
-                    coefficients=fit.coefficients,
-                    parts=orthonormal_parts(nodes.x, nodes.y, weight, flat[own], terms),
-                    rms=rms,
-                    peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
-                    residual=float(fit.residual_rms),
-                    strehl=float(np.abs(phasor) ** 2),
-                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)),
-                    place=self._place(rays, k),
-                )
+            judged = _judged(nodes, weight, flat[own], terms, bool(np.all(lit))) if known is None else known.fit
+            light = float(np.sum(weight) / np.sum(nodes.weight)) if known is None else known.light
+            wave = Wavefront(
+                field=(float(where[0]), float(where[1])),
+                wavelength=wavelength,
+                x=axis,
+                y=axis,
+                map=table,
+                coefficients=judged.coefficients,
+                parts=judged.parts,
+                rms=judged.rms,
+                peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
+                residual=judged.residual_rms,
+                strehl=judged.strehl,
+                vignetted=1.0 - light,
+                place=self._place(rays, k),
+                hole=(np.nan if self.cut is not None or self.model.edges else 0.0) if known is None else known.hole,
+                accuracy=(RAYS_ACCURACY if self.cut is not None or self.model.edges else 0.0)
+                if known is None
+                else known.accuracy,
             )
+            out.append(wave)
         return tuple(out)
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
         """Wavefront error at one field, as ``wavefronts``."""
         return self.wavefronts([field], points)[0]
+
+    def _exact_fits(
+        self, fields: Sequence[Field] | np.ndarray, light: np.ndarray, terms: int
+    ) -> tuple[_ExactFit | None, ...]:
+        """Statistics over the light of beams that edges or bodies cut, without a raster.
+
+        Args:
+            fields: F.
+            light: share of each stop that traced rays come through, (F,).
+            terms: of Zernike.
+
+        Returns:
+            For each field, None where nothing cuts the beams, the shadows are not known, or a finer quadrature tells other
+            numbers.
+        """
+        if self.cut is None and not self.model.edges:
+            return (None,) * len(light)
+        return tuple(
+            self._exact_fit(one, float(share), terms)
+            for one, share in zip(self.directions(fields)[:, None], light, strict=True)
+        )
+
+    def _exact_fit(self, direction: np.ndarray, light: float, terms: int) -> _ExactFit | None:
+        """``_exact_fits`` of one direction (1, 3)."""
+        try:
+            pieces, error = self.path.shadows_on_stop(self.state, direction)
+        except UnphysicalError:
+            return None
+        stops = [LitStop.of(pieces, rings, count) for rings, count in ((RINGS, 6), (RINGS + 4, 8))]
+        if abs(float(stops[1].light[0]) - light) > WORST_LIGHT:
+            return None
+        points = [np.stack([stop.x[0], stop.y[0]], axis=-1) for stop in stops]
+        every = np.concatenate([np.zeros((1, 2)), *points])
+        rays = self.path.rays(self.state, direction, every, edges=False)
+        # boxes about shadows reach a little beyond the stop, which ends these rays; their paths are as of others
+        if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
+            return None
+        error_of = -self._path(rays)[0] / self.model.spec.wavelength
+        fits, start = [], 1
+        for stop in stops:
+            end = start + stop.x.shape[1]
+            try:
+                fits.append(fit_part(stop.x[0], stop.y[0], stop.weight[0], error_of[start:end], terms))
+            except UnphysicalError:
+                return None
+            start = end
+        coarse, fine = fits
+        change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
+        if not change < RAYS_ACCURACY:
+            return None
+        return _ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
 
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
         """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
@@ -458,6 +544,34 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
+
+
+@dataclass(frozen=True, eq=False)
+class _ExactFit:
+    """Statistics of a wavefront over the light of a cut beam, the share of the stop that is lit, the hole of a ring (as of
+    ``Wavefront``), and how far they are right.
+    """
+
+    fit: PartFit
+    light: float
+    hole: float
+    accuracy: float
+
+
+def _judged(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
+    """Statistics of a levelled wavefront (N,) at nodes with weights that may be 0, waves; ``free``: none of them is."""
+    fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
+    # over a part of the disk the terms share tilt among them; what is level there was taken out before
+    rms = fit.rms if free else np.sqrt(np.sum(weight * flat**2) / np.sum(weight))
+    phasor = np.sum(weight * np.exp(2j * np.pi * flat)) / np.sum(weight)
+    return PartFit(
+        np.zeros(3),
+        fit.coefficients,
+        orthonormal_parts(nodes.x, nodes.y, weight, flat, terms),
+        float(rms),
+        float(fit.residual_rms),
+        float(np.abs(phasor) ** 2),
+    )
 
 
 def rim(count: int) -> np.ndarray:

@@ -172,12 +172,12 @@ class TargetPath:
         return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
 
     def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
-        """Rays of beams of directions (F, 3), world, through points (N, 2) of the stop in units of its radius.
+        """Rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
 
         Args:
             state: of the assembly.
             directions: of the light.
-            points: of the stop.
+            points: of the stop, (N, 2); without ``edges`` also of each beam, (F, N, 2).
             edges: whether edges of the camera's surfaces and bodies in the beams stop rays.
 
         Raises:
@@ -244,26 +244,47 @@ class TargetPath:
             ValueError: it is vignetted.
         """
         placed, systems, rays = self._imaging(state, directions)
+        taken, _ = self._taken(placed, systems, rays, directions)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
+        turned = turned.in_lengths_of(systems.size)
+        if not self.model.edges or taken is None:
+            return fit_pupils(turned, self.nodes, DEGREE, taken)
+        points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
+        lit = ~covered(taken, points, SMALLEST)
+        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in self._cut_pupils(turned, taken, lit))
+
+    def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
+        """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
+
+        Returns:
+            Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and how much of its area their
+            shares are right to.
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+            UnphysicalError: edges that no polygons follow.
+        """
+        taken, error = self._taken(*self._imaging(state, directions), directions)
+        return (np.zeros((len(directions), 0, 3, 2)) if taken is None else taken), error
+
+    def _taken(
+        self, placed: PlacedBodies, systems: SystemBatch, rays: ImagingRays, directions: np.ndarray
+    ) -> tuple[np.ndarray | None, float]:
+        """``shadows_on_stop`` of traced beams; None for free ones."""
         taken = None
         if self.shadows is not None:
             owner = np.zeros(len(directions), dtype=int)
             beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
             taken = self.shadows.cast(beams).pieces
-        if self.model.edges:
-            others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-            seen = self._edges(placed, systems, rays.launched, directions)
-            taken, _ = settled_shadows(seen, len(directions), others)
-        turned = turned.in_lengths_of(systems.size)
         if not self.model.edges:
-            return fit_pupils(turned, self.nodes, DEGREE, taken)
-        points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
-        lit = ~covered(taken, points, SMALLEST)
-        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in self._cut_pupils(turned, taken, lit))
+            return taken, 0.0
+        others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
+        seen = self._edges(placed, systems, rays.launched, directions)
+        return settled_shadows(seen, len(directions), others)
 
     def _cut_pupils(self, field: PupilField, taken: np.ndarray, lit: np.ndarray) -> tuple[PupilFunction, ...]:
         """Pupils with shadows (B, K, V, 2), by polynomials of the lowest degree that follows the lit nodes, (B, N)."""
@@ -285,9 +306,12 @@ class TargetPath:
             places[name] = np.asarray(traced.hit(number) / size)[..., :2]
 
         def outlines(round_sides: int) -> StopOutlines:
-            found = StopOutlines()
+            found, lit = StopOutlines(), None
             for name, place in places.items():
-                found += outlines_on_stop(place, self.model.edges[name], self.nodes, round_sides)
+                edges = self.model.edges[name]
+                found += outlines_on_stop(place, edges, self.nodes, round_sides, lit)
+                through = np.all([edge.passes(place[..., 0], place[..., 1]) for edge in edges], axis=0)
+                lit = through if lit is None else lit & through
             return found
 
         return outlines
