@@ -24,6 +24,7 @@ from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
@@ -59,6 +60,15 @@ SPOT_RINGS = 8
 
 WORST_LIGHT = 5e-3
 """Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
+
+ROUNDING = 1e-6
+"""By which shares and Strehl ratios may leave 0 to 1: what quadratures over pieces of shadows are right to."""
+
+MTF_ROUNDING = 1e-3
+"""By which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: what its quadrature is held to."""
+
+MOST_ERROR = 1e6
+"""Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
 
 RAYS_ACCURACY = 2e-3
 """What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront error."""
@@ -379,6 +389,7 @@ class CameraOptics:
                 if known is None
                 else known.accuracy,
             )
+            _hold_wavefront(wave)
             out.append(wave)
         return tuple(out)
 
@@ -485,6 +496,7 @@ class CameraOptics:
         light = self.directions(fields)
         places = self.path.places(self.state, light)
         pupils = self.path.pupils(self.state, light, places)
+        hold_within("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
             lit = self.rays(fields, np.stack([nodes.x, nodes.y], axis=-1)).valid @ nodes.share
@@ -529,6 +541,7 @@ class CameraOptics:
             )
             own = (float(where[0]), float(where[1]))
             out.append(Mtf(own, frequency, values, limit, colours, self.nyquist))
+            _hold_mtf(out[-1])
         return tuple(out)
 
     def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
@@ -544,6 +557,38 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
+
+
+def _hold_wavefront(wave: Wavefront) -> None:
+    """Hold a wavefront's numbers to what any has.
+
+    Raises:
+        UnphysicalError: one cannot be; with what it is.
+    """
+    hold_within("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
+    hold_within("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
+    hold_within("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
+    square = float(np.sum(wave.parts**2)) + wave.residual**2
+    hold_equal(
+        "the squares of the parts of a wavefront error and of what they leave",
+        square,
+        wave.rms**2,
+        "the square of the whole",
+        1e-6 * wave.rms**2 + ROUNDING**2,
+    )
+
+
+def _hold_mtf(mtf: Mtf) -> None:
+    """Hold an MTF to what any has: by Schwarz' inequality no error raises one of the same light.
+
+    Raises:
+        UnphysicalError: it cannot be; with what it is.
+    """
+    hold_within("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
+    hold_within("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)
+    hold_below("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
+    still = mtf.frequency == 0.0
+    hold_equal("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)
 
 
 @dataclass(frozen=True, eq=False)

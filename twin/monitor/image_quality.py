@@ -21,10 +21,12 @@ import numpy as np
 
 from optics.geometry import zernike
 from optics.geometry.aperture import Circle
+from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
@@ -33,6 +35,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
+from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE, line_body
@@ -61,6 +64,19 @@ _DARKEST = 0.99
 COLOURS = 5
 """Gauss' wavelengths of a band. At one frequency inside of all cut-offs four are right to 1e-7; cut-offs inside the
 band need more, but there the MTF is next to nothing."""
+
+_ROUNDING = 1e-5
+"""By which shares may leave 0 to 1, and an error at best focus that on the line CCD, in waves."""
+
+_MTF_ROUNDING = 1e-3
+"""By which an MTF may leave 0 to 1."""
+
+_MOST_WAVES = 1e6
+"""Wavefront error beyond which a number is none of an image, waves rms."""
+
+_FEW, _APART = quadrature.even_disk(500), 0.02
+"""Points of the stop by which the area of shadows is held to their outlines; they count a share to 1 %. Shares of the stop's
+area and of the light differ by as little: the light is nearly even."""
 
 AT_ONCE = 40
 """States traced in one launch, to bound memory: 40 take 60 MB."""
@@ -189,6 +205,7 @@ def image_quality(
 
     Raises:
         ValueError: no field, or one outside of the line.
+        UnphysicalError: a number that cannot be.
     """
     if not fields or not np.all(np.abs(fields) <= 1.0):
         raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
@@ -365,12 +382,47 @@ class _CameraBench:
             if len(good):
                 smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
                 otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
         values = np.stack([wfe, refocused, defocus, *mtf, lost])
+        self._hold(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
+
+    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
+        """Hold numbers (_COLUMNS, B) to what any camera has.
+
+        Raises:
+            UnphysicalError: one cannot be; with the camera and what it is.
+        """
+        # a beam that something cuts or all but stops is told by its reason, and not by numbers
+        told = values[:, (dark == 0.0) & (values[5] <= _DARKEST)]
+        wfe, refocused, _, *mtf, lost = told
+        of = f"of camera {self.name}"
+        hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
+        hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
+        hold_below(
+            f"a wavefront error {of} at best focus", refocused, wfe * (1.0 + _ROUNDING), "that on the line CCD", _ROUNDING
+        )
+        hold_within(f"an MTF {of}", np.array(mtf), 0.0, 1.0, _MTF_ROUNDING)
+        if shadows is None or not shadows.owners:
+            return
+        shares = np.array(list(shadows.shares().values()))
+        hold_within(f"the share of the stop {of} that a body takes", shares, 0.0, 1.0, _ROUNDING)
+        together = np.sum(shares, axis=0)
+        hold_within(f"the share of the stop {of} that bodies take together", together, 0.0, 1.0, _ROUNDING)
+        points = np.stack([_FEW.x, _FEW.y], axis=-1)
+        counted = np.mean(covered(shadows.pieces, points, SMALLEST), axis=-1)
+        hold_equal(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
+        hold_equal(
+            f"the share of the stop {of} that bodies take",
+            together[(dark == 0.0) & (values[5] <= _DARKEST)],
+            lost,
+            "that of the light",
+            _APART,
+        )
 
     def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
         """Keep how the pupils of states look of which all fields are lit."""
