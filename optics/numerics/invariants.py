@@ -1,4 +1,4 @@
-"""What numbers of a result must be whatever the instrument: held at run time, so that nonsense is an error and no number."""
+"""What numbers of a result must be, whatever the instrument; held at run time, so that nonsense is an error."""
 
 from __future__ import annotations
 
@@ -72,5 +72,6 @@ def hold_equal(what: str, values: np.ndarray | float, others: np.ndarray | float
     if np.any(off > apart):
         k = int(np.argmax(off))
         raise UnphysicalError(
-            f"{what} came out as {own.flat[k]:.6g}, but {to} as {second.flat[k]:.6g}: they differ by more than {apart:g}"
+            f"{what} came out as {own.flat[k]:.6g}, but {to} as {second.flat[k]:.6g}: they differ by more than "
+            f"{apart:g}"
         )

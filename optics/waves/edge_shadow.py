@@ -24,12 +24,12 @@ DEGREE = 10
 """Of the polynomials from the stop to a surface."""
 
 ROUND_SIDES = (48, 96, 192)
-"""Of the polygon that stands for a round edge and has its area, the fewest that do: where circles nearly touch or nearly
-coincide, what is between two of them is thinner than what is between a circle and its polygon."""
+"""Of the polygon that stands for a round edge and has its area, the fewest that do: where circles nearly touch or
+nearly coincide, what is between two of them is thinner than what is between a circle and its polygon."""
 
 FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
-"""Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the more.
-They are right to a third of it."""
+"""Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the
+more. They are right to a third of it."""
 
 MOST_PIECES = 160
 """Of a shadow: the time of a transfer function grows with the square of their number."""
@@ -130,8 +130,8 @@ def settled_shadows(
         if change < COARSE_SHARE:
             return pieces, change / 3.0
     raise UnphysicalError(
-        f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of half "
-        "as many: edges all but coincide"
+        f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of "
+        "half as many: edges all but coincide"
     )
 
 
@@ -174,8 +174,8 @@ def outlines_on_stop(
         edges: of the surface; light comes through where all let it.
         nodes: quadrature over the stop's unit disk.
         round_sides: of the polygon that stands for a round edge.
-        lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing is
-            left to be cut, and the polynomials follow it loosely.
+        lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing
+            is left to be cut, and the polynomials follow it loosely.
 
     Raises:
         UnphysicalError: places that no polynomials follow, as of a surface near a focus.
@@ -223,7 +223,7 @@ def outlines_on_stop(
 
 def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
     """Whether a clear edge without a hole lets all of the light through that comes to places (B, N, 2), those lit."""
-    if edge.blocks or getattr(edge.shape, "inner", 0.0):
+    if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False
     return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
 

@@ -1,7 +1,7 @@
 """The part of a stop that light comes through: a quadrature over it, and whether it is a ring.
 
-Of a smooth integrand the whole disk is integrated by Gauss' rule, and what shadows take is taken off again, each of them
-by a rule of its own that ends at their sides. So edges leave no raster.
+Of a smooth integrand the whole disk is integrated by Gauss' rule, and what shadows take is taken off again, each of
+them by a rule of its own that ends at their sides. So edges leave no raster.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from optics.numerics import quadrature
 from optics.waves.edge_shadow import nodes_in_shadows
 
 ROUND = 1e-4
-"""By how much the second moment of a shadow may exceed that of a disk about the stop's middle with its area: of all shapes
-it has the least."""
+"""By how much the second moment of a shadow may exceed that of a disk about the stop's middle with its area: of all
+shapes it has the least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +56,8 @@ class LitStop:
 
 
 def holes(pieces: np.ndarray) -> np.ndarray:
-    """Radius of the hole of each stop whose shadow is one disk about its middle, in units of the stop's, (F,); 0 where there
-    is no shadow, NaN where it is another.
+    """Radius of the hole of each stop whose shadow is one disk about its middle, in units of the stop's, (F,); 0 where
+    there is no shadow, NaN where it is another.
 
     Args:
         pieces: convex polygons that do not overlap, (F, K, V, 2).

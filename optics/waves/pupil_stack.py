@@ -101,8 +101,8 @@ class PupilStack:
             degree: of the polynomials.
             shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
             rim_sides: of the polygon that stands for the edge where a shadow reaches over it.
-            lit: which nodes lie outside of the shadows, (B, N); None for all. The polynomials follow the others loosely:
-                what is said of the light there is taken off again.
+            lit: which nodes lie outside of the shadows, (B, N); None for all. The polynomials follow the others
+                loosely: what is said of the light there is taken off again.
 
         Raises:
             ValueError: too few nodes for the degree.

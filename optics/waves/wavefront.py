@@ -142,8 +142,8 @@ class PartFit:
 
     Attributes:
         level: piston and the two tilts that were taken out, coefficients of Z1 to Z3, (3,).
-        coefficients: of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike over
-            the part.
+        coefficients: of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike
+            over the part.
         parts: as of ``orthonormal_parts``, (last,).
         rms: of the path differences.
         residual_rms: that the terms leave.
@@ -159,8 +159,8 @@ class PartFit:
 
 
 def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int) -> PartFit:
-    """Fit Z1..Z_last to a wavefront over a part of the unit disk by a quadrature whose weights may be negative, as of what
-    shadows take off again.
+    """Fit Z1..Z_last to a wavefront over a part of the unit disk by a quadrature whose weights may be negative, as of
+    what shadows take off again.
 
     Args:
         x: near the unit disk, (N,).
@@ -170,7 +170,8 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
         last: highest Noll index.
 
     Raises:
-        UnphysicalError: a quadrature over which the terms have no squares above zero: too few nodes, or next to no area.
+        UnphysicalError: a quadrature over which the terms have no squares above zero: too few nodes, or next to no
+            area.
     """
     share = weight / np.sum(weight)
     basis = zernike.basis(last, x, y)
@@ -180,7 +181,9 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
         try:
             root = np.linalg.cholesky(own.T @ (share[:, None] * own))
         except np.linalg.LinAlgError as error:
-            raise UnphysicalError(f"{count} Zernike terms are not independent over the light that comes through") from error
+            raise UnphysicalError(
+                f"{count} Zernike terms are not independent over the light that comes through"
+            ) from error
         parts = np.linalg.solve(root, own.T @ (share * values))
         return parts, np.linalg.solve(root.T, parts)
 
@@ -191,5 +194,10 @@ def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.nd
     left = float(share @ (flat - basis @ coefficients) ** 2)
     phasor = share @ np.exp(2j * np.pi * flat)
     return PartFit(
-        level, coefficients, parts, float(np.sqrt(max(square, 0.0))), float(np.sqrt(max(left, 0.0))), float(abs(phasor) ** 2)
+        level,
+        coefficients,
+        parts,
+        float(np.sqrt(max(square, 0.0))),
+        float(np.sqrt(max(left, 0.0))),
+        float(abs(phasor) ** 2),
     )

@@ -1,5 +1,5 @@
-"""Obscured telescopes against other people's software: MTF by an FFT of batoid's rays over the true pupil, poppy's spider,
-annular Zernike terms of batoid.
+"""Obscured telescopes against other people's software: MTF by an FFT of batoid's rays over the true pupil, poppy's
+spider, annular Zernike terms of batoid.
 """
 
 import warnings
@@ -38,8 +38,8 @@ OWN: dict[str, str | Path] = {
 }
 FIELDS = ((0.0, 0.0), (0.7, 0.0), (1.0, 0.0), (1.0, 1.0), (-1.0, -1.0))
 TOLD = 1e-3
-"""What the MTF is to be right to. The raster's own error, of 384 cells with their shares at edges, is some 1e-4, and 6e-4 for
-a vane along its rows."""
+"""What the MTF is to be right to. The raster's own error, of 384 cells with their shares at edges, is some 1e-4, and
+6e-4 for a vane along its rows."""
 LSST = "LSST/LSST_r.yaml", 622e-9, 8.36, 1.75
 HSC = "HSC/HSC.yaml", 750e-9, 8.2, 0.75
 """File of batoid, wavelength and pupil, metres, radius of the field, degrees."""
@@ -63,7 +63,9 @@ def batoids_telescope(backend: Backend, name: str, wavelength: float, pupil: flo
     path = Path(batoid.__file__).parent / "data" / name
     end = np.radians(largest)
     lens = replace(read_batoid(path, wavelength), fields=((0.0, 0.0), (0.0, end), (0.0, -end), (end, 0.0)))
-    return CameraOptics.alone(derive_camera(camera_of(lens, "telescope", backend, Width(pupil)).camera, backend), backend)
+    return CameraOptics.alone(
+        derive_camera(camera_of(lens, "telescope", backend, Width(pupil)).camera, backend), backend
+    )
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +150,7 @@ def test_psf_as_by_an_fft_of_batoids_pupil(backend, folder, name) -> None:
 
 @pytest.mark.second
 def test_a_spider_as_poppy_has_it(backend) -> None:
-    """MTF and encircled energy of the perfect wavefront behind the disk and four vanes of the Ritchey-Chretien telescope."""
+    """MTF and encircled energy of the perfect wavefront behind the Ritchey-Chretien telescope's disk and four vanes."""
     poppy = pytest.importorskip("poppy")
     import astropy.units as u
 
@@ -209,12 +211,16 @@ def test_despace_of_lsst_in_annular_defocus(backend) -> None:
     """0.0153 um of annular Z4 for each um of M2 along the axis, as batoid has it."""
     optics = batoids_telescope(backend, *LSST)
     peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / LSST[0]))
-    steps = [optics.perturbed({"camera/M2": Motion(shift=(0.0, 0.0, dz))}).wavefront((0.0, 0.0)) for dz in (1e-6, -1e-6)]
+    steps = [
+        optics.perturbed({"camera/M2": Motion(shift=(0.0, 0.0, dz))}).wavefront((0.0, 0.0)) for dz in (1e-6, -1e-6)
+    ]
     slope = 0.5 * (steps[0].parts[3] - steps[1].parts[3]) * LSST[1] / 1e-6
     assert abs(slope) == pytest.approx(0.0153, abs=1e-4)
     eps = steps[0].hole
     moved = [
-        batoid.zernike(peer.withGloballyShiftedOptic("M2", [0.0, 0.0, dz]), 0.0, 0.0, LSST[1], jmax=11, eps=eps, nx=256)[4]
+        batoid.zernike(
+            peer.withGloballyShiftedOptic("M2", [0.0, 0.0, dz]), 0.0, 0.0, LSST[1], jmax=11, eps=eps, nx=256
+        )[4]
         for dz in (1e-6, -1e-6)
     ]
     # batoid's z runs against the light's

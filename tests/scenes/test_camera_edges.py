@@ -100,8 +100,8 @@ def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> No
     fields = ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.0))
     waves = cut.wavefronts(fields, points=3)
     rms = np.array([wave.rms for wave in waves])
-    # maps over the field and through focus trace the same rays, one to the image and one to the focal plane: rounding of
-    # metres of path; these 10 000 are right to what they stand for in a wavefront, too
+    # maps over the field and through focus trace the same rays, one to the image and one to the focal plane: rounding
+    # of metres of path; these 10 000 are right to what they stand for in a wavefront, too
     close = {"rtol": 1e-6, "atol": 1e-8}
     mapped = FieldBeams.field_errors(cut.model, backend, fields, 5)
     np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)

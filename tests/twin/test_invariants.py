@@ -1,4 +1,4 @@
-"""What no number of a camera can be is an error with its cause, whatever made it; each one is broken here on purpose."""
+"""What no number of a camera can be is an error with its cause; each such number is made here on purpose."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def test_an_mtf_above_one_or_above_the_perfect_one_is_none(telescope, monkeypatc
     assert np.all(mtf.values <= mtf.limit + 1e-9)
     true = camera_optics.polychromatic_transfer
     monkeypatch.setattr(camera_optics, "polychromatic_transfer", lambda *given: 1.1 * true(*given))
-    with pytest.raises(UnphysicalError, match="an MTF came out as 1.1"):
+    with pytest.raises(UnphysicalError, match=r"an MTF came out as 1\.1"):
         telescope.mtf((1.0, 0.0), few)
 
     def swapped(pupil, *given):
@@ -84,7 +84,7 @@ def test_shares_of_bodies_beyond_the_stop_are_none(backend, gf7_pair, monkeypatc
     with pytest.raises(UnphysicalError, match=r"that a body takes came out as 2\.4e\+24"):
         image_quality(gf7_pair, backend, [{}], (1.0,))
     monkeypatch.setattr(shadow.Shadows, "shares", lambda self: {k: 0.5 * v for k, v in true(self).items()})
-    with pytest.raises(UnphysicalError, match="that bodies take came out as .* but that of points in it"):
+    with pytest.raises(UnphysicalError, match=r"that bodies take came out as .* but that of points in it"):
         image_quality(gf7_pair, backend, [{}], (1.0,))
 
 

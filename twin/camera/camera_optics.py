@@ -26,9 +26,9 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
-from optics.numerics.quadrature import PupilNodes
 from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
@@ -71,7 +71,8 @@ MOST_ERROR = 1e6
 """Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
 
 RAYS_ACCURACY = 2e-3
-"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront error."""
+"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront
+error."""
 
 SHARPEST = 1e-4
 """Rms wavefront error of which shares are told, waves; of less there is rounding of paths in it."""
@@ -90,8 +91,8 @@ class Wavefront:
         x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
             line, y along the track.
         map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light
-            that comes through; their names are ``optics.geometry.zernike``'s.
+        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the
+            light that comes through; their names are ``optics.geometry.zernike``'s.
         parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
             those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a
             ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of
@@ -102,11 +103,11 @@ class Wavefront:
         strehl: Strehl ratio, from the mean phasor over the stop.
         vignetted: share of the stop's area whose light other apertures and bodies stop.
         place: of the chief ray on the line CCD, (along the line, along the track), metres.
-        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a whole
-            one, NaN for any other.
-        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer quadrature,
-            whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the light. 0 for
-            a free beam.
+        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a
+            whole one, NaN for any other.
+        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer
+            quadrature, whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the
+            light. 0 for a free beam.
     """
 
     field: Field
@@ -124,6 +125,11 @@ class Wavefront:
     place: tuple[float, float]
     hole: float = 0.0
     accuracy: float = 0.0
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether edges or bodies take some of the light."""
+        return self.hole != 0.0
 
     @property
     def polynomials(self) -> str:
@@ -166,7 +172,7 @@ class Wavefront:
                 "wavelength_m": self.wavelength,
                 "rms_waves": self.rms,
                 "strehl": self.strehl,
-                **({} if self.hole == 0.0 else {"polynomials": self.polynomials, "parts_waves": self.parts}),
+                **({} if not self.is_cut else {"polynomials": self.polynomials, "parts_waves": self.parts}),
             },
         )
 
@@ -408,8 +414,8 @@ class CameraOptics:
             terms: of Zernike.
 
         Returns:
-            For each field, None where nothing cuts the beams, the shadows are not known, or a finer quadrature tells other
-            numbers.
+            For each field, None where nothing cuts the beams, the shadows are not known, or a finer quadrature tells
+            other numbers.
         """
         if self.cut is None and not self.model.edges:
             return (None,) * len(light)
@@ -593,8 +599,8 @@ def _hold_mtf(mtf: Mtf) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _ExactFit:
-    """Statistics of a wavefront over the light of a cut beam, the share of the stop that is lit, the hole of a ring (as of
-    ``Wavefront``), and how far they are right.
+    """Statistics of a wavefront over the light of a cut beam, the share of the stop that is lit, the hole of a ring (as
+    of ``Wavefront``), and how far they are right.
     """
 
     fit: PartFit

@@ -75,8 +75,8 @@ _MOST_WAVES = 1e6
 """Wavefront error beyond which a number is none of an image, waves rms."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
-"""Points of the stop by which the area of shadows is held to their outlines; they count a share to 1 %. Shares of the stop's
-area and of the light differ by as little: the light is nearly even."""
+"""Points of the stop by which the area of shadows is held to their outlines; they count a share to 1 %. Shares of the
+stop's area and of the light differ by as little: the light is nearly even."""
 
 AT_ONCE = 40
 """States traced in one launch, to bound memory: 40 take 60 MB."""
@@ -404,7 +404,11 @@ class _CameraBench:
         hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
         hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
         hold_below(
-            f"a wavefront error {of} at best focus", refocused, wfe * (1.0 + _ROUNDING), "that on the line CCD", _ROUNDING
+            f"a wavefront error {of} at best focus",
+            refocused,
+            wfe * (1.0 + _ROUNDING),
+            "that on the line CCD",
+            _ROUNDING,
         )
         hold_within(f"an MTF {of}", np.array(mtf), 0.0, 1.0, _MTF_ROUNDING)
         if shadows is None or not shadows.owners:

@@ -42,8 +42,8 @@ beam, wavefronts may bend much more than in it.
 """
 
 SMALL_RESIDUAL = 1e-4
-"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of DEGREES may leave more.
-Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of DEGREES may leave
+more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
 """
 
 MAP_POINTS = 7
@@ -296,7 +296,7 @@ class TargetPath:
     def _edges(
         self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
     ) -> Callable[[int], StopOutlines]:
-        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop, by sides of round ones."""
+        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop, by the sides of a circle."""
         cut = {name: self.model.mirrors.index(name) for name in self.model.edges}
         sent = make_rays(self.backend, launched, np.broadcast_to(directions[:, None], launched.shape))
         traced = trace(self.backend, systems, sent, keep=tuple(cut.values()))
