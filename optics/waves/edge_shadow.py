@@ -72,11 +72,6 @@ class StopOutlines:
         """
         # each image by itself: what is one piece in one of them may be many in another
         each = [self._of_one(number, further) for number in range(count)]
-        if max(map(len, each)) > MOST_PIECES:
-            raise UnphysicalError(
-                f"edges cut the pupil into {max(map(len, each))} pieces of shadow, more than {MOST_PIECES}, which its "
-                "transfer function does not take"
-            )
         pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
         for number, one in enumerate(each):
@@ -118,7 +113,7 @@ def settled_shadows(
         UnphysicalError: as of ``StopOutlines.shadows``, or edges that all sides are too few for.
     """
     few, *more = ROUND_SIDES
-    pieces = outlines(few).shadows(count, further)
+    pieces = _few_enough(outlines(few).shadows(count, further))
     share = shares_of_stop(pieces)
     for sides_of_round in more:
         finer = outlines(sides_of_round).shadows(count, further)
@@ -126,13 +121,23 @@ def settled_shadows(
         change = float(np.max(np.abs(share - before), initial=0.0))
         if change < FINE_SHARE:
             return pieces, change
-        pieces = finer
+        pieces = _few_enough(finer)
         if change < COARSE_SHARE:
             return pieces, change / 3.0
     raise UnphysicalError(
         f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of "
         "half as many: edges all but coincide"
     )
+
+
+def _few_enough(pieces: np.ndarray) -> np.ndarray:
+    """Pieces of shadows (B, K, V, 2). Raises UnphysicalError where there are too many for a transfer function."""
+    if pieces.shape[1] > MOST_PIECES:
+        raise UnphysicalError(
+            f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, more than {MOST_PIECES}, which its transfer "
+            "function does not take"
+        )
+    return pieces
 
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:

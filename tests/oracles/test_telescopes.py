@@ -86,7 +86,7 @@ def as_its_raster(optics: CameraOptics, field: tuple[float, float], grid: PupilR
     np.testing.assert_allclose(mtf.limit, grid.mtf(shifts, perfect=True), rtol=0, atol=TOLD)
     # frequencies up to the cut-off and beyond, and a contrast that says something
     assert np.all(mtf.values[:, -1] < 1e-9)
-    assert np.min(mtf.values[:, 4]) > 0.02
+    assert np.min(mtf.values[:, 1]) > 0.2
     (pupil,) = optics.pupils([field])
     assert pupil.transfer_error < TOLD
 
@@ -116,6 +116,19 @@ def test_mtf_of_hsc_on_its_axis(backend) -> None:
         warnings.simplefilter("ignore")
         peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / HSC[0]))
     as_its_raster(optics, (0.0, 0.0), its_raster(optics, peer, (0.0, 0.0), 1.02))
+
+
+def test_a_paraboloid_is_written_as_one(backend, folder) -> None:
+    """batoid divides by zero where a ray runs along the axis of a quadric with conic -1: it had no light."""
+    _, peer = own_telescope(backend, "cassegrain", folder)
+    x = np.linspace(-0.19, 0.19, 39)
+    start, way = np.stack([x, 0.01 + 0.0 * x, 5.0 + 0.0 * x]), np.zeros((3, len(x)))
+    way[2] = -1.0
+    rays = batoid.RayVector(*start, *way)
+    rays.wavelength[:] = 650e-9
+    peer.trace(rays)
+    assert np.count_nonzero(~(rays.failed | rays.vignetted)) > 10
+    assert np.all(np.isfinite(rays.r))
 
 
 @pytest.mark.second

@@ -136,6 +136,36 @@ def test_parts_of_a_whole_pupil_are_its_coefficients(bare) -> None:
     np.testing.assert_allclose(wave.parts[3:], wave.coefficients[3:], rtol=0, atol=1e-9 * wave.rms)
 
 
+def test_a_ring_has_annular_terms_and_a_spider_its_own(cut, backend) -> None:
+    """Defocus over the ring that an edge of M1 leaves is that of the whole stop times 1 - e^2."""
+    ring = CameraOptics.alone(camera_at(with_edges("{blocks: circle, radius: 75 mm}"), "z: 300.2 mm"), backend)
+    wave = ring.wavefront()
+    assert wave.hole == pytest.approx(0.5, abs=1e-4)
+    assert wave.polynomials == "annular Zernike terms, hole 0.5000 of the stop"
+    whole = CameraOptics.alone(camera_at(camera(BARE), "z: 300.2 mm"), backend).wavefront()
+    assert whole.polynomials == "Zernike circle terms"
+    # r^2 over a ring spreads by (1 - e^2) / sqrt 12, over the whole stop by 1 / sqrt 12
+    assert wave.parts[3] == pytest.approx(0.75 * whole.parts[3], rel=2e-3)
+    assert wave.accuracy < 1e-4
+    spider = cut.wavefront((1.0, 0.0))
+    assert np.isnan(spider.hole)
+    assert spider.polynomials == "terms orthonormal over the light of this pupil"
+    assert list(spider.orthonormal_terms) == list(spider.terms)
+
+
+def test_where_no_polygons_follow_the_edges_rays_stand_for_the_light(cut, monkeypatch) -> None:
+    exact = cut.wavefront((1.0, 0.0))
+
+    def refused(*given):
+        raise UnphysicalError("no polygons")
+
+    monkeypatch.setattr(type(cut.path), "shadows_on_stop", refused)
+    counted = cut.wavefront((1.0, 0.0))
+    assert counted.accuracy == RAYS_ACCURACY > exact.accuracy
+    assert counted.rms == pytest.approx(exact.rms, rel=RAYS_ACCURACY)
+    assert counted.vignetted == pytest.approx(exact.vignetted, abs=1e-3)
+
+
 def camera_at(spec: CameraSpec, image: str) -> CameraSpec:
     plain = {**spec.plain(), "image": {"z": image.removeprefix("z: ")}}
     return CameraSpec.model_validate(plain)

@@ -296,7 +296,7 @@ class TargetPath:
     def _edges(
         self, placed: PlacedBodies, systems: SystemBatch, launched: np.ndarray, directions: np.ndarray
     ) -> Callable[[int], StopOutlines]:
-        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them on the stop, by the sides of a circle."""
+        """Edges of the camera's surfaces as beams launched at (F, N, 3) see them, by the sides of a circle."""
         cut = {name: self.model.mirrors.index(name) for name in self.model.edges}
         sent = make_rays(self.backend, launched, np.broadcast_to(directions[:, None], launched.shape))
         traced = trace(self.backend, systems, sent, keep=tuple(cut.values()))
