@@ -32,7 +32,8 @@ from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
-from twin.camera.camera_optics import RAYS_ACCURACY, CameraOptics
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import field_curves, through_focus
 
 PAGE = (ROOT / "docs/prescriptions.md").read_text("utf-8")

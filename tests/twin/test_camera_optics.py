@@ -11,8 +11,9 @@ from scenes.models.camera_model import field_direction
 from scenes.models.camera_sharpness import FieldBeams
 from scenes.specs.load import load_camera
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
-from twin.camera.camera_optics import RAYS_ACCURACY, CameraOptics
+from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_view import CameraView
+from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import band_factors, band_wavelengths

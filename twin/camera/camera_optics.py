@@ -26,20 +26,19 @@ from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.physical_error import UnphysicalError
-from optics.numerics.quadrature import PupilNodes
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
-from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts, path_to_sphere
+from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction
 from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
+from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, counted_fit, exact_fit
 from twin.run.reference_frames import frames_text
 from twin.targets.target_path import LineRays, TargetPath
 
@@ -58,9 +57,6 @@ MAP_POINTS = 65
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
 
-WORST_LIGHT = 5e-3
-"""Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
-
 ROUNDING = 1e-6
 """By which shares and Strehl ratios may leave 0 to 1: what quadratures over pieces of shadows are right to."""
 
@@ -69,13 +65,6 @@ MTF_ROUNDING = 1e-3
 
 MOST_ERROR = 1e6
 """Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
-
-RAYS_ACCURACY = 2e-3
-"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront
-error."""
-
-SHARPEST = 1e-4
-"""Rms wavefront error of which shares are told, waves; of less there is rounding of paths in it."""
 
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
@@ -364,18 +353,21 @@ class CameraOptics:
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
-        exact = self._exact_fits(fields, rays.valid[:, own] @ nodes.share, terms)
+        light, is_cut = rays.valid[:, own] @ nodes.share, self.cut is not None or bool(self.model.edges)
+        sight = self.directions(fields)[:, None]
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
             lit = rays.valid[k]
             weight = nodes.weight * lit[own]
             level = zernike.fit(3, nodes.x, nodes.y, error[k, own], weight)
-            known = exact[k]
+            known = None
+            if is_cut:
+                known = exact_fit(self.path, self.state, sight[k], RINGS, float(light[k]), self._path, terms)
             level = level if known is None else known.fit.level
             flat = error[k] - zernike.basis(3, *stop.T) @ level
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(edge) :]
-            judged = _judged(nodes, weight, flat[own], terms, bool(np.all(lit))) if known is None else known.fit
-            light = float(np.sum(weight) / np.sum(nodes.weight)) if known is None else known.light
+            judged = counted_fit(nodes, weight, flat[own], terms, bool(np.all(lit))) if known is None else known.fit
+            through = float(np.sum(weight) / np.sum(nodes.weight)) if known is None else known.light
             wave = Wavefront(
                 field=(float(where[0]), float(where[1])),
                 wavelength=wavelength,
@@ -388,12 +380,10 @@ class CameraOptics:
                 peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
                 residual=judged.residual_rms,
                 strehl=judged.strehl,
-                vignetted=1.0 - light,
+                vignetted=1.0 - through,
                 place=self._place(rays, k),
-                hole=(np.nan if self.cut is not None or self.model.edges else 0.0) if known is None else known.hole,
-                accuracy=(RAYS_ACCURACY if self.cut is not None or self.model.edges else 0.0)
-                if known is None
-                else known.accuracy,
+                hole=(np.nan if is_cut else 0.0) if known is None else known.hole,
+                accuracy=(RAYS_ACCURACY if is_cut else 0.0) if known is None else known.accuracy,
             )
             _hold_wavefront(wave)
             out.append(wave)
@@ -402,57 +392,6 @@ class CameraOptics:
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
         """Wavefront error at one field, as ``wavefronts``."""
         return self.wavefronts([field], points)[0]
-
-    def _exact_fits(
-        self, fields: Sequence[Field] | np.ndarray, light: np.ndarray, terms: int
-    ) -> tuple[_ExactFit | None, ...]:
-        """Statistics over the light of beams that edges or bodies cut, without a raster.
-
-        Args:
-            fields: F.
-            light: share of each stop that traced rays come through, (F,).
-            terms: of Zernike.
-
-        Returns:
-            For each field, None where nothing cuts the beams, the shadows are not known, or a finer quadrature tells
-            other numbers.
-        """
-        if self.cut is None and not self.model.edges:
-            return (None,) * len(light)
-        return tuple(
-            self._exact_fit(one, float(share), terms)
-            for one, share in zip(self.directions(fields)[:, None], light, strict=True)
-        )
-
-    def _exact_fit(self, direction: np.ndarray, light: float, terms: int) -> _ExactFit | None:
-        """``_exact_fits`` of one direction (1, 3)."""
-        try:
-            pieces, error = self.path.shadows_on_stop(self.state, direction)
-        except UnphysicalError:
-            return None
-        stops = [LitStop.of(pieces, rings, count) for rings, count in ((RINGS, 6), (RINGS + 4, 8))]
-        if abs(float(stops[1].light[0]) - light) > WORST_LIGHT:
-            return None
-        points = [np.stack([stop.x[0], stop.y[0]], axis=-1) for stop in stops]
-        every = np.concatenate([np.zeros((1, 2)), *points])
-        rays = self.path.rays(self.state, direction, every, edges=False)
-        # boxes about shadows reach a little beyond the stop, which ends these rays; their paths are as of others
-        if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
-            return None
-        error_of = -self._path(rays)[0] / self.model.spec.wavelength
-        fits, start = [], 1
-        for stop in stops:
-            end = start + stop.x.shape[1]
-            try:
-                fits.append(fit_part(stop.x[0], stop.y[0], stop.weight[0], error_of[start:end], terms))
-            except UnphysicalError:
-                return None
-            start = end
-        coarse, fine = fits
-        change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
-        if not change < RAYS_ACCURACY:
-            return None
-        return _ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
 
     def spots(self, fields: Sequence[Field] | np.ndarray, defocus: float = 0.0) -> tuple[Spot, ...]:
         """Spots at fields (F, 2) on the line CCD moved by ``defocus`` metres downstream. Raises as ``rays``."""
@@ -595,34 +534,6 @@ def _hold_mtf(mtf: Mtf) -> None:
     hold_below("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
     still = mtf.frequency == 0.0
     hold_equal("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)
-
-
-@dataclass(frozen=True, eq=False)
-class _ExactFit:
-    """Statistics of a wavefront over the light of a cut beam, the share of the stop that is lit, the hole of a ring (as
-    of ``Wavefront``), and how far they are right.
-    """
-
-    fit: PartFit
-    light: float
-    hole: float
-    accuracy: float
-
-
-def _judged(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
-    """Statistics of a levelled wavefront (N,) at nodes with weights that may be 0, waves; ``free``: none of them is."""
-    fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
-    # over a part of the disk the terms share tilt among them; what is level there was taken out before
-    rms = fit.rms if free else np.sqrt(np.sum(weight * flat**2) / np.sum(weight))
-    phasor = np.sum(weight * np.exp(2j * np.pi * flat)) / np.sum(weight)
-    return PartFit(
-        np.zeros(3),
-        fit.coefficients,
-        orthonormal_parts(nodes.x, nodes.y, weight, flat, terms),
-        float(rms),
-        float(fit.residual_rms),
-        float(np.abs(phasor) ** 2),
-    )
 
 
 def rim(count: int) -> np.ndarray:
