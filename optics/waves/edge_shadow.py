@@ -8,7 +8,7 @@ which ``optics.waves.pupil_shadow`` takes out of the pupil exactly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,21 +17,22 @@ from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectan
 from optics.geometry.polygon import area, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
-from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, separate, without
-from optics.waves.pupil_stack import products, to_terms
+from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
+from optics.waves.pupil_stack import LOOSELY, products, to_terms
 
 DEGREE = 10
 """Degree of the polynomials that map the stop to a surface."""
 
-ROUND_SIDES = 48
-"""Sides of the polygon that approximates a round edge and has its area."""
+ROUND_SIDES = (48, 96, 192)
+"""Of the polygon that stands for a round edge and has its area, the fewest that do: where circles nearly touch or
+nearly coincide, what is between two of them is thinner than what is between a circle and its polygon."""
 
-_ANGLE = 2.0 * np.pi * np.arange(ROUND_SIDES) / ROUND_SIDES
-_DISK = np.sqrt(_ANGLE[1] / np.sin(_ANGLE[1])) * np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
-"""The polygon of a disk of radius 1, (ROUND_SIDES, 2)."""
+FINE_SHARE, COARSE_SHARE = 3e-4, 3e-3
+"""Change of a shadow's share of the stop by twice as many sides: up to the first the fewer do, up to the second the
+more. They are right to a third of it."""
 
-MOST_PIECES = 120
-"""Most pieces of a shadow: the time of a transfer function grows with the square of their number."""
+MOST_PIECES = 160
+"""Of a shadow: the time of a transfer function grows with the square of their number."""
 
 _WINDOW, _WINDOW_SIDES = 1.2, 16
 """Polygon about the stop's unit disk to which outlines are cut before their corners are followed to their rays."""
@@ -71,11 +72,6 @@ class StopOutlines:
         """
         # each image by itself: what is one piece in one of them may be many in another
         each = [self._of_one(number, further) for number in range(count)]
-        if max(map(len, each)) > MOST_PIECES:
-            raise UnphysicalError(
-                f"edges cut the pupil into {max(map(len, each))} pieces of shadow, more than {MOST_PIECES}, which its "
-                "transfer function does not take"
-            )
         pieces, corners = (max(shape[k] for shape in (one.shape for one in each)) for k in (0, 1))
         out = np.zeros((count, pieces, corners, 2))
         for number, one in enumerate(each):
@@ -100,7 +96,81 @@ class StopOutlines:
         return np.stack([widened(piece[None], width)[0] for piece in every]) if every else np.zeros((0, 3, 2))
 
 
-def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNodes) -> StopOutlines:
+def settled_shadows(
+    outlines: Callable[[int], StopOutlines], count: int, further: Sequence[np.ndarray] = ()
+) -> tuple[np.ndarray, float]:
+    """Shadows of ``count`` pupils with as many sides of round edges as they need.
+
+    Args:
+        outlines: of the edges, by the number of sides that stand for a round one.
+        count: B.
+        further: as of ``StopOutlines.shadows``.
+
+    Returns:
+        Pieces as of ``StopOutlines.shadows``, and how much of the stop their shares are right to.
+
+    Raises:
+        UnphysicalError: as of ``StopOutlines.shadows``, or edges that all sides are too few for.
+    """
+    few, *more = ROUND_SIDES
+    pieces = _few_enough(outlines(few).shadows(count, further))
+    share = shares_of_stop(pieces)
+    for sides_of_round in more:
+        finer = outlines(sides_of_round).shadows(count, further)
+        before, share = share, shares_of_stop(finer)
+        change = float(np.max(np.abs(share - before), initial=0.0))
+        if change < FINE_SHARE:
+            return pieces, change
+        pieces = _few_enough(finer)
+        if change < COARSE_SHARE:
+            return pieces, change / 3.0
+    raise UnphysicalError(
+        f"polygons of {more[-1]} sides for its round edges take {change:.2g} more or less of the pupil than those of "
+        "half as many: edges all but coincide"
+    )
+
+
+def _few_enough(pieces: np.ndarray) -> np.ndarray:
+    """Pieces of shadows (B, K, V, 2). Raises UnphysicalError where there are too many for a transfer function."""
+    if pieces.shape[1] > MOST_PIECES:
+        raise UnphysicalError(
+            f"edges cut the pupil into {pieces.shape[1]} pieces of shadow, more than {MOST_PIECES}, which its transfer "
+            "function does not take"
+        )
+    return pieces
+
+
+def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
+    """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
+    points, weights = nodes_in_shadows(pieces, 2)
+    return np.asarray(np.sum(weights, axis=-1) / np.pi) if points.size else np.zeros(len(pieces))
+
+
+def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrature over the part within the stop of pieces of shadows, with ``count`` nodes along each side of a box.
+
+    Args:
+        pieces: convex polygons that do not overlap, counterclockwise, (B, K, V, 2).
+        count: nodes.
+
+    Returns:
+        Points, complex, (B, Q), and weights of the area.
+    """
+    if not pieces.shape[1]:
+        return np.zeros((len(pieces), 0), complex), np.zeros((len(pieces), 0))
+    tiles, _ = tiled(pieces)
+    flat = tiles.reshape(-1, *tiles.shape[2:])
+    points, weights = quadrature_within(flat, np.ones((len(flat), 1), complex), count)
+    return points.reshape(len(pieces), -1), weights.reshape(len(pieces), -1)
+
+
+def outlines_on_stop(
+    places: np.ndarray,
+    edges: Sequence[Edge],
+    nodes: PupilNodes,
+    round_sides: int = ROUND_SIDES[0],
+    lit: np.ndarray | None = None,
+) -> StopOutlines:
     """The edges of one surface as B images see them.
 
     Args:
@@ -108,13 +178,32 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
             edges stop, too.
         edges: of the surface; light comes through where all let it.
         nodes: quadrature over the stop's unit disk.
+        round_sides: of the polygon that stands for a round edge.
+        lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing
+            is left to be cut, and the polynomials follow it loosely.
 
     Raises:
         UnphysicalError: places that no polynomials follow, as of a surface near a focus.
     """
+    known = np.all(np.isfinite(places), axis=-1)
+    lit = known if lit is None else lit & known
+    middle = np.mean(places, axis=1, keepdims=True, where=lit[..., None])
+    # far outside of the light polynomials say nothing of where an edge would be
+    around = middle + _AROUND * (places - middle)
+    edges = [edge for edge in edges if not _idle(edge, around, lit)]
+    if not edges:
+        return StopOutlines()
+    beam = 2.0 * np.max(np.abs(places - middle), axis=(1, 2), where=lit[..., None], initial=0.0)
+
+    def missed(terms: np.ndarray) -> float:
+        off = np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]
+        return float(np.max(off, where=lit, initial=0.0))
+
     terms = to_terms(nodes, DEGREE) @ places
-    beam = np.ptp(places, axis=1).max(axis=-1)
-    worst = float(np.max(np.linalg.norm(products(nodes.x, nodes.y, DEGREE) @ terms - places, axis=-1) / beam[:, None]))
+    worst = missed(terms)
+    if not worst < WORST_FIT and not np.all(lit):
+        terms = _followed_places(places, nodes, lit, known)
+        worst = missed(terms)
     if not worst < WORST_FIT:
         raise UnphysicalError(
             f"rays meet a surface with edges at places that polynomials of degree {DEGREE} miss by {worst:.2g} of the "
@@ -122,12 +211,12 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
         )
     clear, blocked = [], []
     for edge in edges:
-        for outlines, blocks in _outlines(edge):
+        for outlines, blocks in _outlines(edge, round_sides):
             seen = [_on_the_stop(outline, terms) for outline in outlines]
             if edge.blocks and isinstance(edge.shape, Circle) and edge.shape.inner and _covers(edge, edge.shape, terms):
                 # a ring that reaches beyond every beam lets light through its hole alone
                 hole = Edge(Circle(edge.shape.inner, edge.shape.centre), turn=edge.turn)
-                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole))[0]]
+                clear += [_on_the_stop(outline, terms) for outline in next(_outlines(hole, round_sides))[0]]
             elif blocks:
                 blocked += seen
             elif len(seen) == 1:
@@ -137,21 +226,46 @@ def outlines_on_stop(places: np.ndarray, edges: Sequence[Edge], nodes: PupilNode
     return StopOutlines(tuple(clear), tuple(blocked))
 
 
+def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
+    """Whether a clear edge without a hole lets all of the light through that comes to places (B, N, 2), those lit."""
+    if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
+        return False
+    return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
+
+
+def _followed_places(places: np.ndarray, nodes: PupilNodes, lit: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Coefficients of polynomials through places (B, N, 2), which follow those that are not lit, (B, N), loosely."""
+    design = products(nodes.x, nodes.y, DEGREE)
+    weight = nodes.weight * np.where(lit, 1.0, np.where(known, LOOSELY, 0.0))
+    turned = np.swapaxes(design * weight[..., None], 1, 2)
+    return np.linalg.solve(turned @ design, turned @ np.where(known[..., None], places, 0.0))
+
+
+_AROUND = 1.1
+"""Times the light about its middle: a clear edge beyond stops nothing of it, as nodes stand nearer to each other."""
+
+
 def _covers(edge: Edge, ring: Circle, terms: np.ndarray) -> bool:
     """Whether the disk within the outer edge of a ring holds all of the stop in every image."""
     disk = Edge(replace(ring, inner=0.0), edge.blocks, edge.turn)
-    (outline,), _ = next(_outlines(disk))
+    (outline,), _ = next(_outlines(disk, ROUND_SIDES[0]))
     rim = _window(len(terms), 1.0, RIM_SIDES)
     inside = intersect(rim, *sides(_on_the_stop(outline, terms)))
     return bool(np.all(area(rim) - area(inside) < SMALLEST))
 
 
-def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
+def _disk(count: int) -> np.ndarray:
+    """The polygon of a disk of radius 1, which has its area, (count, 2)."""
+    angle = 2.0 * np.pi * np.arange(count) / count
+    return np.asarray(np.sqrt(angle[1] / np.sin(angle[1])) * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def _outlines(edge: Edge, round_sides: int) -> Iterator[tuple[list[np.ndarray], bool]]:
     """Convex outlines (V, 2) on the surface, and whether light is stopped in them or outside of all of them."""
-    shape = edge.shape
+    shape, unit = edge.shape, _disk(round_sides)
     match shape:
         case Circle():
-            outer = shape.radius * _DISK
+            outer = shape.radius * unit
             if not shape.inner:
                 yield _turned([outer], edge), edge.blocks
             elif edge.blocks:
@@ -161,9 +275,9 @@ def _outlines(edge: Edge) -> Iterator[tuple[list[np.ndarray], bool]]:
                 yield _turned(list(sectors), edge), True
             else:
                 yield _turned([outer], edge), False
-                yield _turned([shape.inner * _DISK], edge), True
+                yield _turned([shape.inner * unit], edge), True
         case Ellipse():
-            yield _turned([_DISK * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
+            yield _turned([unit * np.array([shape.half_x, shape.half_y])], edge), edge.blocks
         case Rectangle():
             corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
             yield _turned([_divided(corners * np.array([shape.half_x, shape.half_y]))], edge), edge.blocks

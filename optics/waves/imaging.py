@@ -46,7 +46,7 @@ def aim_collimated(
         direction: of the light, world, unit, (3,) or (B, 3).
         launch: a world point of the beam before the first mirror, (3,) or (B, 3), metres; rays start on the plane
             wavefront through it.
-        target: stop coordinates, (N, 2), metres of its nominal size.
+        target: stop coordinates, (N, 2) or of each system (B, N, 2), metres of its nominal size.
         first: world vector (3,) near which the first axis of the wavefront lies, not along the beam; by default the
             coordinate axis least along it, which is not the same for all directions.
 
@@ -65,7 +65,8 @@ def aim_collimated(
     axes = transverse_axes(along, across)
     fan = RayFan(origin, along, axes, moves_position=True)
     middle, slope = aim(backend, to_stop, fan, np.zeros((1, 2)), tolerance=AIM_TOLERANCE)
-    near = middle + np.einsum("bnij,pj->bpi", np.linalg.inv(slope), target)
+    way = "bnij,pj->bpi" if target.ndim == 2 else "bnij,bpj->bpi"
+    near = middle + np.einsum(way, np.linalg.inv(slope), target)
     q, _ = aim(backend, to_stop, fan, target, near, slope, AIM_TOLERANCE)
     return fan.at(q)[0], axes[:, 0]
 

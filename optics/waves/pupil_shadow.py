@@ -7,6 +7,7 @@ once. All of these are intersections of convex regions, and the integrand is smo
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -140,17 +141,24 @@ class PupilShadow:
         near = np.hypot(near[..., 0], near[..., 1]) - size[:, None, None] < most[:, None, None, None]
         full_at = np.nonzero(inside & full[:, None, None])
         b, s, g, k = np.nonzero(~inside & near & full[:, None, None])
-        cut_points, cut_weights = quadrature_within(self.pieces[b, k] - away[b, s, g][:, None], self.radius[b], count)
+        corners = self._corners
+        cut_points, cut_weights = np.empty((len(b), count**2), complex), np.empty((len(b), count**2))
+        for some, (many,) in _alike(corners[b, k]):
+            moved = self.pieces[b[some], k[some], :many] - away[b[some], s[some], g[some]][:, None]
+            cut_points[some], cut_weights[some] = quadrature_within(moved, self.radius[b[some]], count)
         cut_points += (sign[g] * shift[b, s])[:, None]
         pair = self._pairs(moves, full)
-        normal, limit = sides(self.pieces.reshape(-1, *self.pieces.shape[2:]))
-        normal, limit = (a.reshape(*self.pieces.shape[:2], *a.shape[1:]) for a in (normal, limit))
-        normal, limit, move = normal[pair[0], pair[3]], limit[pair[0], pair[3]], moves[pair[0], pair[1]]
-        limit = limit + np.einsum("fwx,fx->fw", normal, move)
-        shared = intersect(self.pieces[pair[0], pair[2]], normal, limit)
-        shared_points, shared_weights = quadrature(shared, count)
-        if not np.all(np.abs(np.sum(shared_weights, axis=-1) - np.abs(area(shared))) < _ROOM):
-            raise ArithmeticError("what two shadows share came out of another size than it has")
+        shared_points, shared_weights = np.empty((len(pair[0]), count**2), complex), np.empty((len(pair[0]), count**2))
+        for some, (many, others) in _alike(corners[pair[0], pair[2]], corners[pair[0], pair[3]]):
+            at, step, first, second = (index[some] for index in pair)
+            windows = self.pieces[:, :, :others]
+            normal, limit = sides(windows.reshape(-1, *windows.shape[2:]))
+            normal, limit = (a.reshape(*windows.shape[:2], *a.shape[1:])[at, second] for a in (normal, limit))
+            limit = limit + np.einsum("fwx,fx->fw", normal, moves[at, step])
+            shared = intersect(self.pieces[at, first, :many], normal, limit)
+            shared_points[some], shared_weights[some] = quadrature(shared, count)
+            if not np.all(np.abs(np.sum(shared_weights[some], axis=-1) - np.abs(area(shared))) < _ROOM):
+                raise ArithmeticError("what two shadows share came out of another size than it has")
         return ShadowParts(
             pupil=np.concatenate([full_at[0], b, pair[0]]),
             step=np.concatenate([full_at[1], s, pair[1]]),
@@ -161,6 +169,13 @@ class PupilShadow:
             weights=np.concatenate([-weights[full_at[0], full_at[3]], -cut_weights, shared_weights]),
         )
 
+    @cached_property
+    def _corners(self) -> np.ndarray:
+        """Corners of each piece without those that repeat its last, (B, K)."""
+        apart = np.any(self.pieces[:, :, 1:] != self.pieces[:, :, :-1], axis=-1)
+        last = self.pieces.shape[2] - 1 - np.argmax(apart[..., ::-1], axis=-1)
+        return np.asarray(np.where(np.any(apart, axis=-1), last + 1, 1))
+
     def _pairs(self, moves: np.ndarray, full: np.ndarray) -> tuple[np.ndarray, ...]:
         """Pupils, steps and numbers of two pieces of which the second, moved by (B, S, 2), may meet the first."""
         low, high = self.pieces.min(axis=2), self.pieces.max(axis=2)
@@ -168,6 +183,22 @@ class PupilShadow:
         apart = (high[:, None, :, None] <= moved_low) | (moved_high <= low[:, None, :, None])
         both = full[:, None, :, None] & full[:, None, None]
         return np.nonzero(~np.any(apart, axis=-1) & both)
+
+
+_LIKE = (12, 20, 32, 52)
+"""Numbers of corners up to which polygons are worked on together: one with hundreds of them makes all as slow."""
+
+
+def _alike(*corners: np.ndarray) -> Iterator[tuple[np.ndarray | slice, tuple[int | None, ...]]]:
+    """Which of F sets of polygons have like numbers of corners, (F,) each, and bounds of these; None: all of them."""
+    if max((int(np.max(one, initial=0)) for one in corners), default=0) <= _LIKE[0]:
+        yield slice(None), (None,) * len(corners)
+        return
+    bounds = [np.searchsorted(_LIKE, one) for one in corners]
+    code = np.ravel_multi_index(tuple(bounds), (len(_LIKE) + 1,) * len(corners))
+    for value in np.unique(code):
+        which = np.unravel_index(value, (len(_LIKE) + 1,) * len(corners))
+        yield np.flatnonzero(code == value), tuple(_LIKE[k] if k < len(_LIKE) else None for k in which)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +267,11 @@ def without(part: np.ndarray, before: np.ndarray, fewest: bool = False) -> list[
     whole = np.where(empty[:, None, None], part, part[:, :1])  # an empty polygon has no sides that could bound it
     if fewest:
         normal, limit = sides(before)
-        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in range(limit.shape[1])]
-        pieces = difference(part, before, np.argsort(off)[::-1])
+        # beyond the other sides there is nothing of it
+        height = np.einsum("bvx,bwx->bwv", part[..., :2], normal)
+        beyond = np.flatnonzero(np.any(height > limit[..., None], axis=(0, 2)))
+        off = [float(np.mean(area(clip(part, -normal[:, w], -limit[:, w])))) for w in beyond]
+        pieces = difference(part, before, beyond[np.argsort(off)[::-1]])
     else:
         pieces = difference(part, before)
     # of a polygon that is empty but for rounding the sides are there, and would leave the part a second time

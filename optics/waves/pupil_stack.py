@@ -31,6 +31,16 @@ DEGREE = 8
 """Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
 every Zernike term to seventh order on each mirror it leaves 2e-5."""
 
+CUT_DEGREES = (DEGREE, 10, 12, 14)
+"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Outside the light, in the middle
+of an obscured beam, a polynomial wavefront may bend much more than inside.
+"""
+
+CUT_RESIDUAL = 1e-4
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may leave
+more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
+"""
+
 WORST_RESIDUAL = 1e-3
 """Rms eikonal that a fit may leave, wavelengths; it changes the transfer function by about (2 pi)^2 of its square,
 4e-5, where the overlap averages over it."""
@@ -40,6 +50,9 @@ LEAST_ACROSS = 10
 LEAST_SHADOW = 2
 """Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
 function is then right to 2e-6, and to 5e-5 with shadows."""
+
+LOOSELY = 1e-2
+"""Weight of a node in a shadow, of one in the light. """
 
 _EDGE_SAMPLES = 32
 _AT_ONCE = 2**14
@@ -85,6 +98,7 @@ class PupilStack:
         degree: int = DEGREE,
         shadows: np.ndarray | None = None,
         rim_sides: int = FEW_SIDES,
+        lit: np.ndarray | None = None,
     ) -> PupilStack:
         """Fit pupils traced at nodes of the stop, all of which carry light.
 
@@ -97,6 +111,8 @@ class PupilStack:
             degree: of the polynomials.
             shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
             rim_sides: of the polygon that stands for the edge where a shadow reaches over it.
+            lit: which nodes lie outside of the shadows, (B, N); None for all. The polynomials follow the others
+                loosely: what is said of the light there is taken off again.
 
         Raises:
             ValueError: too few nodes for the degree.
@@ -111,9 +127,13 @@ class PupilStack:
         place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
         design = products(place[:, 0], place[:, 1], degree) * root[:, None]
         both = np.stack([eikonal, density], axis=-1) * root[:, None]
-        turned = np.swapaxes(design, 1, 2)
+        counted = np.ones(1) if lit is None else np.where(lit, 1.0, LOOSELY)[..., None]
+        turned = np.swapaxes(design * counted, 1, 2)
         solution = np.linalg.solve(turned @ design, turned @ both)
-        rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=1) / np.sum(nodes.weight))
+        told, weight = (both - design @ solution) ** 2, np.sum(nodes.weight)
+        if lit is not None:
+            told, weight = told * lit[..., None], (lit @ nodes.weight)[:, None]
+        rest = np.sqrt(np.sum(told, axis=1) / weight)
         level = i + j < 2
         plane = (design[..., level] @ solution[:, level, :1])[..., 0]
         bent = (both[..., 0] - plane) / root
@@ -395,6 +415,8 @@ class PupilFunction:
         eikonal_residual: rms eikonal that the fit leaves, metres.
         amplitude_residual: rms of what the fit leaves of the amplitude, share of its mean.
         shadow: what bodies in the beam take of the pupil (one pupil's), None if nothing stands there.
+        finer: further nodes along each direction that its transfer function takes.
+        transfer_error: change of that from fewer nodes; NaN where nobody has looked.
     """
 
     centre: np.ndarray
@@ -405,6 +427,8 @@ class PupilFunction:
     eikonal_residual: float = 0.0
     amplitude_residual: float = 0.0
     shadow: PupilShadow | None = field(default=None, repr=False)
+    finer: int = 0
+    transfer_error: float = np.nan
 
     def normalised(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Normalised shift, complex, of shifts (x, y) of the direction cosines, any equal shapes."""
@@ -457,7 +481,12 @@ class RoughWavefrontError(PhysicalError, ValueError):
 
 
 def fit_pupils(
-    field: PupilField, nodes: PupilNodes, degree: int = DEGREE, shadows: np.ndarray | None = None
+    field: PupilField,
+    nodes: PupilNodes,
+    degree: int = DEGREE,
+    shadows: np.ndarray | None = None,
+    lit: np.ndarray | None = None,
+    worst_residual: float = WORST_RESIDUAL,
 ) -> tuple[PupilFunction, ...]:
     """Smooth pupils of B images.
 
@@ -466,6 +495,8 @@ def fit_pupils(
         nodes: quadrature over the stop's unit disk, without a hole.
         degree: of the polynomials for the map from the stop, the eikonal and the amplitude.
         shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
+        lit: which nodes lie outside of the shadows, (B, N), as of ``PupilStack.fit``.
+        worst_residual: rms eikonal that the fit may leave in the light, wavelengths.
 
     Returns:
         B pupils.
@@ -484,13 +515,13 @@ def fit_pupils(
         )
     with one_blas_thread():
         stack = PupilStack.fit(
-            field.u, field.v, field.eikonal, field.amplitude, nodes, degree, shadows, rim_sides=RIM_SIDES
+            field.u, field.v, field.eikonal, field.amplitude, nodes, degree, shadows, rim_sides=RIM_SIDES, lit=lit
         )
     worst = int(np.argmax(stack.residual))
-    if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
+    if stack.residual[worst] > worst_residual * field.wavelength:
         raise RoughWavefrontError(
             f"polynomials of degree {degree} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
-            f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}); raise the degree, with nodes enough for it"
+            f"the wavefront of image {worst} (at most {worst_residual:g}); raise the degree, with nodes enough for it"
         )
     return tuple(
         PupilFunction(

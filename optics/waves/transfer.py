@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -128,9 +128,10 @@ def _correlate(
         s, k = shift[which], wave[which]
         own = []
         if part != "shadow":
-            own.append(pupil.edge.overlap(s, right[:, which], left[:, which], gauss(across), gauss(along)))
+            rules = gauss(across + 3 * pupil.finer // 2), gauss(along + pupil.finer)
+            own.append(pupil.edge.overlap(s, right[:, which], left[:, which], *rules))
         if pupil.shadow is not None and part != "clear":
-            nodes = pupil.shadow.least_nodes + max(across - LEAST_ACROSS, along - LEAST_ALONG)
+            nodes = pupil.shadow.least_nodes + max(across - LEAST_ACROSS, along - LEAST_ALONG) + pupil.finer // 8
             taken, area = pupil.shadow.overlap(s[None], nodes)
             own.append((taken[0], area[0]))
         points, weight = (np.concatenate(arrays, axis=1) for arrays in zip(*own, strict=True))
@@ -190,6 +191,62 @@ def _pieces(
         some = most[: max(1, room // rows)]
         yield used[some], rows, count
         start += len(some)
+
+
+FINER = (4, 8, 16, 32)
+"""Further nodes that are tried."""
+
+SETTLED = 2e-4
+"""Change of a transfer function by further nodes below which there are enough."""
+
+WORST_TRANSFER = 1e-3
+"""Change of that kind beyond which no transfer function is told."""
+
+_TRIED = np.array([[x, 0.0] for x in (0.12, 0.3, 0.55, 0.8)] + [[0.0, y] for y in (0.2, 0.4, 0.6, 0.9)])
+"""Frequencies at which nodes are compared, of the cut-off along both axes."""
+
+
+def with_nodes_enough(pupil: PupilFunction, wavelength: float) -> PupilFunction:
+    """A pupil with a shadow, and the further nodes that its transfer function asks for.
+
+    What edges leave of a wavefront may be smooth where its continuation into the dark is not, and the clear pupil is
+    integrated over both. Nodes are added until that changes nothing.
+
+    Args:
+        pupil: of an image.
+        wavelength: metres.
+
+    Returns:
+        The pupil with ``finer`` and ``transfer_error``, the change from fewer nodes.
+
+    Raises:
+        UnphysicalError: the most nodes are too few.
+    """
+    if pupil.shadow is None:
+        return pupil
+    frequency = _TRIED * pupil.cutoff(np.eye(2), wavelength)
+    shift = wavelength * pupil.normalised(frequency[:, 0], frequency[:, 1])
+
+    def values(one: PupilFunction, shift: np.ndarray, part: Part) -> np.ndarray:
+        return _correlate(one, shift, np.full(len(shift), wavelength), np.zeros(1), part)
+
+    before, error = values(pupil, shift, "clear"), np.inf
+    for finer in FINER:
+        one = replace(pupil, finer=finer)
+        now = values(one, shift, "clear")
+        error, before = float(np.max(np.abs(now - before))), now
+        if error < SETTLED:
+            # of shadows, which are small and many, at fewer frequencies
+            few = shift[1::4]
+            change = values(replace(one, finer=2 * finer), few, "shadow") - values(one, few, "shadow")
+            error += float(np.max(np.abs(change)))
+            break
+    if not error < WORST_TRANSFER:
+        raise UnphysicalError(
+            f"the transfer function of a pupil that edges cut still changes by {error:.2g} with further nodes (at most "
+            f"{WORST_TRANSFER:g}): its wavefront is too steep in what is dark"
+        )
+    return replace(one, transfer_error=error)
 
 
 TABLE_TAIL = 1e-6

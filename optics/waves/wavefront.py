@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.geometry import zernike
+from optics.numerics.physical_error import UnphysicalError
 
 
 def eikonal(position: np.ndarray, direction: np.ndarray, path: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -133,3 +134,70 @@ def orthonormal_parts(
     root = np.sqrt(weight[lit] / np.sum(weight))
     q, r = np.linalg.qr(zernike.basis(last, x[lit], y[lit]) * root[:, None])
     return np.asarray(np.sign(np.diag(r)) * (q.T @ (difference[lit] * root)))
+
+
+@dataclass(frozen=True, eq=False)
+class PartFit:
+    """A wavefront over a part of the unit disk, piston and tilt taken out.
+
+    Attributes:
+        level: piston and the two tilts that were taken out, coefficients of Z1 to Z3, (3,).
+        coefficients: of Zernike terms in Noll's order, (last,), by least squares; they share among them what is alike
+            over the part.
+        parts: as of ``orthonormal_parts``, (last,).
+        rms: of the path differences.
+        residual_rms: that the terms leave.
+        strehl: square of the mean phasor, for path differences in waves.
+    """
+
+    level: np.ndarray
+    coefficients: np.ndarray
+    parts: np.ndarray
+    rms: float
+    residual_rms: float
+    strehl: float
+
+
+def fit_part(x: np.ndarray, y: np.ndarray, weight: np.ndarray, difference: np.ndarray, last: int) -> PartFit:
+    """Fit Z1..Z_last to a wavefront over a part of the unit disk by a quadrature whose weights may be negative, as of
+    what shadows take off again.
+
+    Args:
+        x: near the unit disk, (N,).
+        y: likewise.
+        weight: of the area, (N,), with a positive sum.
+        difference: of optical paths, waves, (N,).
+        last: highest Noll index.
+
+    Raises:
+        UnphysicalError: a quadrature over which the terms have no squares above zero: too few nodes, or next to no
+            area.
+    """
+    share = weight / np.sum(weight)
+    basis = zernike.basis(last, x, y)
+
+    def orthonormal(count: int, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        own = basis[:, :count]
+        try:
+            root = np.linalg.cholesky(own.T @ (share[:, None] * own))
+        except np.linalg.LinAlgError as error:
+            raise UnphysicalError(
+                f"{count} Zernike terms are not independent over the light that comes through"
+            ) from error
+        parts = np.linalg.solve(root, own.T @ (share * values))
+        return parts, np.linalg.solve(root.T, parts)
+
+    _, level = orthonormal(3, difference)
+    flat = difference - basis[:, :3] @ level
+    parts, coefficients = orthonormal(last, flat)
+    square = float(share @ flat**2)
+    left = float(share @ (flat - basis @ coefficients) ** 2)
+    phasor = share @ np.exp(2j * np.pi * flat)
+    return PartFit(
+        level,
+        coefficients,
+        parts,
+        float(np.sqrt(max(square, 0.0))),
+        float(np.sqrt(max(left, 0.0))),
+        float(abs(phasor) ** 2),
+    )

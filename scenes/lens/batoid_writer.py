@@ -109,6 +109,9 @@ def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
         base = {"type": "Quadric", "R": 1.0 / shape.curvature, "conic": shape.conic}
         if any(shape.even):
             base = {**base, "type": "Asphere", "coefs": [float(a) for a in shape.even]}
+        elif shape.conic == -1.0:
+            # where a ray runs along the axis of a Quadric with this conic, batoid divides by zero
+            base = {"type": "Paraboloid", "R": 1.0 / shape.curvature}
     elif any(shape.even):
         for pair, value in polynomial_of(Surface(even=shape.even)).items():
             freeform[pair] = freeform.get(pair, 0.0) + value

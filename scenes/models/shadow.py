@@ -9,7 +9,7 @@ them no substrates.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -27,7 +27,7 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
+from optics.waves.edge_shadow import StopOutlines, outlines_on_stop, settled_shadows
 from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, quadrature_within, separate, tiled
 from optics.waves.pupil_stack import products, to_terms
@@ -116,17 +116,17 @@ class Shadows:
         points, weights = (a.reshape(count, -1) if pieces.shape[1] else np.zeros((count, 0)) for a in (points, weights))
         return cls(pieces, owners, points, weights, areas)
 
-    def and_edges(self, outlines: StopOutlines, name: str) -> Shadows:
+    def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
         """These shadows together with those of edges of surfaces.
 
         Args:
-            outlines: of the edges.
+            outlines: of the edges, as ``edge_outlines`` gives them.
             name: under which ``shares`` tells what the edges take beside all bodies.
 
         Raises:
             UnphysicalError: they cut a pupil into too many pieces.
         """
-        pieces = outlines.shadows(len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
+        pieces, _ = settled_shadows(outlines, len(self.pieces), tuple(np.moveaxis(self.pieces, 1, 0)))
         whole = Shadows.within(pieces, (name,) * pieces.shape[1])
         bodies = self.shares()
         rest = np.sum(whole.areas, axis=-1) / np.pi - sum(bodies.values())
@@ -270,8 +270,10 @@ def no_shadows(count: int) -> Shadows:
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
-def edge_outlines(beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> StopOutlines:
-    """The edges of a camera's surfaces as its images see them on the stop.
+def edge_outlines(
+    beams: TracedBeams, model: CameraModel, camera: str, backend: Backend
+) -> Callable[[int], StopOutlines]:
+    """The edges of a camera's surfaces as its images see them on the stop, by the sides that stand for a circle.
 
     Args:
         beams: to the images.
@@ -279,21 +281,29 @@ def edge_outlines(beams: TracedBeams, model: CameraModel, camera: str, backend: 
         camera: its name in the assembly, that its elements' names begin with.
         backend: where to trace.
 
-    Raises:
-        UnphysicalError: rays meet a surface at places that no polynomials follow.
+    The outlines raise UnphysicalError where rays meet a surface at places that no polynomials follow.
     """
     cut = {name: model.mirrors.index(name) for name in model.edges}
     launched = beams.rays.launched
     heading = np.broadcast_to(beams.heading, (len(launched), 3))[:, None]
     sent = make_rays(backend, launched, np.broadcast_to(heading, launched.shape))
     traced = trace(backend, beams.systems, sent, keep=tuple(cut.values()))
-    found = StopOutlines()
+    places = {}
     for name, number in cut.items():
         body = beams.assembly.elements[f"{camera}/{name}"].body
         size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
-        places = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
-        found += outlines_on_stop(places, model.edges[name], beams.nodes)
-    return found
+        places[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
+
+    def outlines(round_sides: int) -> StopOutlines:
+        found, lit = StopOutlines(), None
+        for name, place in places.items():
+            edges = model.edges[name]
+            found += outlines_on_stop(place, edges, beams.nodes, round_sides, lit)
+            through = np.all([edge.passes(place[..., 0], place[..., 1]) for edge in edges], axis=0)
+            lit = through if lit is None else lit & through
+        return found
+
+    return outlines
 
 
 @lru_cache(maxsize=8)

@@ -8,7 +8,16 @@ from optics.geometry.polygon import area, covered
 from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
 from optics.waves import edge_shadow
-from optics.waves.edge_shadow import StopOutlines, outlines_on_stop
+from optics.waves.edge_shadow import (
+    FINE_SHARE,
+    ROUND_SIDES,
+    StopOutlines,
+    nodes_in_shadows,
+    outlines_on_stop,
+    settled_shadows,
+    shares_of_stop,
+)
+from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import separate
 from tests.tiers import quick
 
@@ -96,9 +105,63 @@ def test_too_many_pieces_and_rays_that_no_polynomials_follow_are_refused(monkeyp
         outlines_on_stop(np.stack([NODES.x, np.sign(NODES.y)], axis=-1)[None], [Edge(Circle(0.3), True)], NODES)
     monkeypatch.setattr(edge_shadow, "MOST_PIECES", 3)
     with pytest.raises(UnphysicalError, match="pieces of shadow"):
-        shadows([Edge(Circle(0.05), True), *VANES])
+        settled_shadows(by_sides([Edge(Circle(0.3), True), *VANES]), 1)
 
 
 def test_edges_that_stop_nothing_leave_no_shadow() -> None:
     assert shadows([Edge(Circle(1.0)), Edge(Circle(0.02, (3.0, 0.0)), True)]).shape[1] == 0
     assert StopOutlines().shadows(2).shape == (2, 0, 3, 2)
+
+
+def by_sides(edges: list[Edge]):
+    """Outlines on a stop that rays meet as they meet the surface, one image, by the sides of a round edge."""
+    places = np.stack([NODES.x, NODES.y], axis=-1)[None]
+    return lambda count: outlines_on_stop(places, edges, NODES, count)
+
+
+def test_circles_that_nearly_coincide_get_more_sides() -> None:
+    """Between two circles that all but coincide lies less than between a circle and its polygon."""
+    one, error = settled_shadows(by_sides([Edge(Circle(0.5), True)]), 1)
+    assert error < 1e-6
+    assert shares_of_stop(one)[0] == pytest.approx(0.25, abs=1e-6)
+    # one circle twice, by polygons whose corners are not the same: what both let through is smaller than either
+    twice = [Edge(Circle(0.8)), Edge(Circle(0.8), turn=np.pi / ROUND_SIDES[0])]
+    few = shares_of_stop(by_sides(twice)(ROUND_SIDES[0]).shadows(1))[0]
+    many, error = settled_shadows(by_sides(twice), 1)
+    assert few - 0.36 > FINE_SHARE > error > 0.0
+    assert shares_of_stop(many)[0] == pytest.approx(0.36, abs=error)
+
+
+def test_edges_that_no_sides_are_enough_for_are_refused(monkeypatch) -> None:
+    monkeypatch.setattr(edge_shadow, "FINE_SHARE", 1e-12)
+    monkeypatch.setattr(edge_shadow, "COARSE_SHARE", 1e-12)
+    with pytest.raises(UnphysicalError, match="edges all but coincide"):
+        settled_shadows(by_sides([Edge(Circle(0.5, (0.8, 0.0)), True)]), 1)
+
+
+def test_clear_edges_beyond_the_light_are_followed_nowhere() -> None:
+    """What an edge before it has stopped is no matter of the next: its rays there may go anywhere."""
+    lit = np.hypot(NODES.x, NODES.y) < 0.6
+    wild = np.stack([NODES.x, NODES.y], axis=-1) * np.where(lit, 1.0, 5.0 * np.cos(40.0 * NODES.x))[:, None]
+    edges = [Edge(Circle(0.9))]
+    with pytest.raises(UnphysicalError, match="polynomials of degree"):
+        outlines_on_stop(wild[None], edges, NODES)
+    assert not outlines_on_stop(wild[None], edges, NODES, lit=lit[None]).clear
+
+
+def test_a_stop_without_its_shadows() -> None:
+    """Area and moments of a ring, and whether it is one: a vane or a shift makes it none."""
+    ring = settled_shadows(by_sides([Edge(Circle(0.6), True)]), 1)[0]
+    stop = LitStop.of(ring, 6, 6)
+    assert stop.light[0] == pytest.approx(1.0 - 0.36, abs=1e-6)
+    fourth = float(stop.weight[0] @ (stop.x[0] ** 2 + stop.y[0] ** 2) ** 2)
+    assert fourth == pytest.approx(np.pi / 3.0 * (1.0 - 0.6**6), rel=1e-4)
+    assert holes(ring)[0] == pytest.approx(0.6, abs=1e-4)
+    assert holes(np.zeros((1, 0, 3, 2)))[0] == 0.0
+    for edges in (
+        [Edge(Circle(0.6), True), Edge(Ray(0.01), True)],
+        [Edge(Circle(0.6, (0.02, 0.0)), True)],
+        [Edge(Circle(0.95))],
+    ):
+        assert np.isnan(holes(settled_shadows(by_sides(edges), 1)[0])[0])
+    assert nodes_in_shadows(np.zeros((2, 0, 3, 2)), 4)[0].shape == (2, 0)

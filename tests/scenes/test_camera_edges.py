@@ -34,6 +34,7 @@ from tests.tiers import quick
 from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import field_curves, through_focus
 
 PAGE = (ROOT / "docs/prescriptions.md").read_text("utf-8")
@@ -103,12 +104,15 @@ def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> No
     fields = ((-1.0, 0.0), (1.0, 0.0), (1.0, 1.0))
     waves = cut.wavefronts(fields, points=3)
     rms = np.array([wave.rms for wave in waves])
-    # both ways trace the same rays, one to the focal plane and one to the image: rounding of metres of path
+    # maps over the field and through focus trace the same rays, one to the image and one to the focal plane: rounding
+    # of metres of path; these 10 000 are right to what they stand for in a wavefront, too
     close = {"rtol": 1e-6, "atol": 1e-8}
-    np.testing.assert_allclose(FieldBeams.field_errors(cut.model, backend, fields, 5), rms, **close)
+    mapped = FieldBeams.field_errors(cut.model, backend, fields, 5)
+    np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
     np.testing.assert_allclose(field_curves(cut, False, 3).error[[0, 2]], rms[:2], **close)
     focus = through_focus(cut, backend, fields, False)
-    np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], rms, **close)
+    np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], mapped, **close)
+    assert all(wave.accuracy < 1e-4 for wave in waves)
     for wave in waves:
         assert np.sum(wave.parts**2) + wave.residual**2 == pytest.approx(wave.rms**2, rel=1e-9)
 
@@ -134,6 +138,36 @@ def test_terms_over_a_ring_are_those_of_mahajan(hole: float) -> None:
 def test_parts_of_a_whole_pupil_are_its_coefficients(bare) -> None:
     wave = bare.wavefront((1.0, 1.0))
     np.testing.assert_allclose(wave.parts[3:], wave.coefficients[3:], rtol=0, atol=1e-9 * wave.rms)
+
+
+def test_a_ring_has_annular_terms_and_a_spider_its_own(cut, backend) -> None:
+    """Defocus over the ring that an edge of M1 leaves is that of the whole stop times 1 - e^2."""
+    ring = CameraOptics.alone(camera_at(with_edges("{blocks: circle, radius: 75 mm}"), "z: 300.2 mm"), backend)
+    wave = ring.wavefront()
+    assert wave.hole == pytest.approx(0.5, abs=1e-4)
+    assert wave.polynomials == "annular Zernike terms, hole 0.5000 of the stop"
+    whole = CameraOptics.alone(camera_at(camera(BARE), "z: 300.2 mm"), backend).wavefront()
+    assert whole.polynomials == "Zernike circle terms"
+    # r^2 over a ring spreads by (1 - e^2) / sqrt 12, over the whole stop by 1 / sqrt 12
+    assert wave.parts[3] == pytest.approx(0.75 * whole.parts[3], rel=2e-3)
+    assert wave.accuracy < 1e-4
+    spider = cut.wavefront((1.0, 0.0))
+    assert np.isnan(spider.hole)
+    assert spider.polynomials == "terms orthonormal over the light of this pupil"
+    assert list(spider.orthonormal_terms) == list(spider.terms)
+
+
+def test_where_no_polygons_follow_the_edges_rays_stand_for_the_light(cut, monkeypatch) -> None:
+    exact = cut.wavefront((1.0, 0.0))
+
+    def refused(*given):
+        raise UnphysicalError("no polygons")
+
+    monkeypatch.setattr(type(cut.path), "shadows_on_stop", refused)
+    counted = cut.wavefront((1.0, 0.0))
+    assert counted.accuracy == RAYS_ACCURACY > exact.accuracy
+    assert counted.rms == pytest.approx(exact.rms, rel=RAYS_ACCURACY)
+    assert counted.vignetted == pytest.approx(exact.vignetted, abs=1e-3)
 
 
 def camera_at(spec: CameraSpec, image: str) -> CameraSpec:

@@ -13,6 +13,7 @@ from scenes.specs.load import load_camera
 from tests.oracles.test_reference_cameras import bundle, rms_spot, wavefront_error
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_view import CameraView
+from twin.camera.cut_wavefront import RAYS_ACCURACY
 from twin.camera.field_maps import through_focus
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import band_factors, band_wavelengths
@@ -102,9 +103,11 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
     waves = view.wavefronts(fields, points=3)
     whole = CameraOptics.within(gf7_pair, "forward", backend, obstruction=False)
     rms = [wave.rms for wave in waves]
-    np.testing.assert_allclose(FieldBeams.field_errors(view.model, backend, fields, 5, view.cut), rms, rtol=1e-6)
+    # maps are of 10 000 rays
+    mapped = FieldBeams.field_errors(view.model, backend, fields, 5, view.cut)
+    np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
     focus = through_focus(view, backend, fields, False)
-    np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], rms, rtol=1e-6)
+    np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], mapped, rtol=1e-6)
     quality = image_quality(gf7_pair, backend, [{}], fields=(0.0,)).cameras["forward"]
     taken = sum(float(share[0, 0]) for share in quality.bodies.values())
     assert waves[0].vignetted == pytest.approx(taken, abs=1e-3)

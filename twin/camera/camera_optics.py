@@ -25,19 +25,21 @@ from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
-from optics.waves.wavefront import fit_wavefront, orthonormal_parts, path_to_sphere
+from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction
 from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
+from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, counted_fit, exact_fit
 from twin.run.reference_frames import frames_text
 from twin.targets.target_path import LineRays, TargetPath
 
@@ -56,8 +58,14 @@ MAP_POINTS = 65
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
 
-WORST_LIGHT = 5e-3
-"""Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
+ROUNDING = 1e-6
+"""By which shares and Strehl ratios may leave 0 to 1: what quadratures over pieces of shadows are right to."""
+
+MTF_ROUNDING = 1e-3
+"""By which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: what its quadrature is held to."""
+
+MOST_ERROR = 1e6
+"""Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
 
 MOST_RAYS = 500_000
 """Traced at once, to bound memory."""
@@ -77,17 +85,23 @@ class Wavefront:
         x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
             line, y along the track.
         map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the light that
-            comes through; their names are ``optics.geometry.zernike``'s.
+        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the
+            light that comes through; their names are ``optics.geometry.zernike``'s.
         parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
-            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Their
-            squares and that of ``residual`` sum to that of ``rms``.
-        rms: waves, exact for smooth wavefronts; where edges cut the beam right to 0.2 %.
+            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a
+            ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of
+            ``residual`` sum to that of ``rms``.
+        rms: waves, exact for smooth wavefronts; ``accuracy`` says how far.
         peak_to_valley: waves, over the map and the edge.
         residual: rms that the Zernike terms leave, waves.
         strehl: Strehl ratio, from the mean phasor over the stop.
         vignetted: share of the stop's area whose light other apertures and bodies stop.
         place: of the chief ray on the line CCD, (along the line, along the track), metres.
+        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a
+            whole one, NaN for any other.
+        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer
+            quadrature, whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the
+            light. 0 for a free beam.
     """
 
     field: Field
@@ -103,6 +117,27 @@ class Wavefront:
     strehl: float
     vignetted: float
     place: tuple[float, float]
+    hole: float = 0.0
+    accuracy: float = 0.0
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether edges or bodies take some of the light."""
+        return self.hole != 0.0
+
+    @property
+    def polynomials(self) -> str:
+        """What ``parts`` are numbers of."""
+        if self.hole == 0.0:
+            return "Zernike circle terms"
+        if np.isfinite(self.hole):
+            return f"annular Zernike terms, hole {self.hole:.4f} of the stop"
+        return "terms orthonormal over the light of this pupil"
+
+    @property
+    def orthonormal_terms(self) -> dict[str, float]:
+        """Name of each term -> waves rms of its part, of ``polynomials``."""
+        return {zernike.name(j): float(c) for j, c in enumerate(self.parts, start=1)}
 
     @property
     def terms(self) -> dict[str, float]:
@@ -131,6 +166,7 @@ class Wavefront:
                 "wavelength_m": self.wavelength,
                 "wfe_rms_waves": self.rms,
                 "strehl": self.strehl,
+                **({} if not self.is_cut else {"polynomials": self.polynomials, "parts_waves": self.parts}),
             },
         )
 
@@ -331,34 +367,40 @@ class CameraOptics:
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
+        light, is_cut = rays.valid[:, own] @ nodes.share, self.cut is not None or bool(self.model.edges)
+        sight = self.directions(fields)[:, None]
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
             lit = rays.valid[k]
             weight = nodes.weight * lit[own]
             level = zernike.fit(3, nodes.x, nodes.y, error[k, own], weight)
+            known = None
+            if is_cut:
+                known = exact_fit(self.path, self.state, sight[k], RINGS, float(light[k]), self._path, terms)
+            level = level if known is None else known.fit.level
             flat = error[k] - zernike.basis(3, *stop.T) @ level
-            fit = fit_wavefront(nodes.x, nodes.y, weight, flat[own], terms)
             table = np.full(inside.shape, np.nan)
             table[inside] = np.where(lit, flat, np.nan)[1 + nodes.count + len(edge) :]
-            # over a part of the disk the terms share tilt among them; what is level there was taken out above
-            rms = float(fit.rms if np.all(lit) else np.sqrt(np.sum(weight * flat[own] ** 2) / np.sum(weight)))
-            phasor = np.sum(weight * np.exp(2j * np.pi * flat[own])) / np.sum(weight)
-            out.append(
-                Wavefront(
-                    field=(float(where[0]), float(where[1])),
-                    wavelength=wavelength,
-                    x=axis,
-                    y=axis,
-                    map=table,
-                    coefficients=fit.coefficients,
-                    parts=orthonormal_parts(nodes.x, nodes.y, weight, flat[own], terms),
-                    rms=rms,
-                    peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
-                    residual=float(fit.residual_rms),
-                    strehl=float(np.abs(phasor) ** 2),
-                    vignetted=float(1.0 - np.sum(weight) / np.sum(nodes.weight)),
-                    place=self._place(rays, k),
-                )
+            judged = counted_fit(nodes, weight, flat[own], terms, bool(np.all(lit))) if known is None else known.fit
+            through = float(np.sum(weight) / np.sum(nodes.weight)) if known is None else known.light
+            wave = Wavefront(
+                field=(float(where[0]), float(where[1])),
+                wavelength=wavelength,
+                x=axis,
+                y=axis,
+                map=table,
+                coefficients=judged.coefficients,
+                parts=judged.parts,
+                rms=judged.rms,
+                peak_to_valley=float(np.ptp(flat[1:][lit[1:]])),
+                residual=judged.residual_rms,
+                strehl=judged.strehl,
+                vignetted=1.0 - through,
+                place=self._place(rays, k),
+                hole=(np.nan if is_cut else 0.0) if known is None else known.hole,
+                accuracy=(RAYS_ACCURACY if is_cut else 0.0) if known is None else known.accuracy,
             )
+            _hold_wavefront(wave)
+            out.append(wave)
         return tuple(out)
 
     def wavefront(self, field: Field = (0.0, 0.0), points: int = MAP_POINTS) -> Wavefront:
@@ -449,6 +491,7 @@ class CameraOptics:
         light = self.directions(fields)
         places = self.path.places(self.state, light)
         pupils = self.path.pupils(self.state, light, places)
+        hold_within("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
             lit = self.rays(fields, np.stack([nodes.x, nodes.y], axis=-1)).valid @ nodes.share
@@ -493,6 +536,7 @@ class CameraOptics:
             )
             own = (float(where[0]), float(where[1]))
             out.append(Mtf(own, frequency, values, limit, colours, self.nyquist))
+            _hold_mtf(out[-1])
         return tuple(out)
 
     def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
@@ -508,6 +552,38 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
+
+
+def _hold_wavefront(wave: Wavefront) -> None:
+    """Hold a wavefront's numbers to what any has.
+
+    Raises:
+        UnphysicalError: one cannot be; with what it is.
+    """
+    hold_within("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
+    hold_within("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
+    hold_within("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
+    square = float(np.sum(wave.parts**2)) + wave.residual**2
+    hold_equal(
+        "the squares of the parts of a wavefront error and of what they leave",
+        square,
+        wave.rms**2,
+        "the square of the whole",
+        1e-6 * wave.rms**2 + ROUNDING**2,
+    )
+
+
+def _hold_mtf(mtf: Mtf) -> None:
+    """Hold an MTF to what any has: by Schwarz' inequality no error raises one of the same light.
+
+    Raises:
+        UnphysicalError: it cannot be; with what it is.
+    """
+    hold_within("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
+    hold_within("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)
+    hold_below("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
+    still = mtf.frequency == 0.0
+    hold_equal("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)
 
 
 def rim(count: int) -> np.ndarray:

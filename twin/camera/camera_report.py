@@ -166,10 +166,14 @@ def _wavefronts(run: CameraRun) -> Section:
         ["Strehl ratio", *(w.strehl for w in run.waves)],
     ]
     for j in range(4, _TOLD_TERMS + 1):
-        rows.append([f"Z{j} {zernike.name(j)}", *(float(w.coefficients[j - 1]) for w in run.waves)])
+        told = (w.parts if w.is_cut else w.coefficients for w in run.waves)
+        rows.append([f"Z{j} {zernike.name(j)}", *(float(terms[j - 1]) for terms in told)])
     caption = "Waves; Zernike terms in Noll's order, waves rms, piston and tilt taken out."
-    if run.optics.model.edges:
-        caption += " Fitted to the light that edges leave, where terms are not independent: one may exceed the rms."
+    cut = [w for w in run.waves if w.is_cut]
+    if cut:
+        sets = "; ".join(dict.fromkeys(w.polynomials for w in cut))
+        caption += f" The numbers are of these: {sets}. Circle terms fitted to the same light are in optics.json."
+        caption += f" The rms is right to {max(w.accuracy for w in cut):.1g} of itself, by a finer quadrature."
     table = Table("zernike", "Wavefront error by field", caption, heads, rows, (None, *[4] * len(run.waves)))
     kinds = ", ".join(f"{kind} {size:.3g}" for kind, size in run.limits[:3])
     text = f"At the worst field, {field_text(run.camera, run.worst[1])}: {kinds} waves rms."

@@ -406,9 +406,20 @@ _PERTURBED: Record[Perturbed] = Record(
 def _field_numbers(run: CameraRun) -> list[dict[str, Any]]:
     """Wavefront, spot and Zernike terms without piston and tilts of every field of ``GRID``."""
     return [
-        {**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:])}
+        {**_WAVE(wave), **_SPOT(spot), "zernike_waves": dict(list(wave.terms.items())[3:]), **_cut_numbers(wave)}
         for wave, spot in zip(run.waves, run.spots, strict=True)
     ]
+
+
+def _cut_numbers(wave: Wavefront) -> dict[str, Any]:
+    """What there is beside circle terms to tell of a beam that edges cut; nothing of a whole one."""
+    if not wave.is_cut:
+        return {}
+    return {
+        "wfe_accuracy": wave.accuracy,
+        "polynomials": wave.polynomials,
+        "orthonormal_waves": dict(list(wave.orthonormal_terms.items())[3:]),
+    }
 
 
 CAMERA: Record[CameraRun] = Record(
@@ -456,10 +467,12 @@ def camera_data(run: CameraRun) -> xr.Dataset:
     mtf = ("mtf_field", "direction", "frequency")
     share = "share of the half field"
     maps = np.stack([w.map for w in run.waves])
-    terms = np.stack([w.coefficients for w in run.waves])
+    terms, parts = (np.stack([getattr(w, name) for w in run.waves]) for name in ("coefficients", "parts"))
+    orthonormal = named("the same terms made orthonormal over the light of each pupil", rms)
     data: dict[str, Any] = {
         "wavefront": (("field", "y", "x"), maps, named("wavefront error over the stop", waves)),
         "zernike": (("field", "noll"), terms, named("Zernike terms of the wavefront error", rms)),
+        **({} if not any(w.is_cut for w in run.waves) else {"orthonormal": (("field", "noll"), parts, orthonormal)}),
         "field_share": (("field", "direction"), np.array(fields), named(share)),
         "wfe": (("field_along", "field_across"), run.errors, named("wavefront error over the field", rms)),
         "through_focus_wfe": (("mtf_field", "defocus"), run.focus.error, named("wavefront error through focus", rms)),

@@ -11,6 +11,7 @@ from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.models.obstruction import find_obstructions
 from scenes.models.scenery import measured_finishes
@@ -264,7 +265,10 @@ def _images(
     if not resolved.quality:
         return targets, None
     advance(QUALITY, 0, 1)
-    quality = image_quality(experiment.instrument, experiment.backend, [{}, state], obstruction=render.obstructed)
+    try:
+        quality = image_quality(experiment.instrument, experiment.backend, [{}, state], obstruction=render.obstructed)
+    except UnphysicalError as error:
+        raise _too_large(resolved, str(error)) from error
     advance(QUALITY, 1, 1)
     return targets, quality
 

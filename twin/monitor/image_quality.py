@@ -22,10 +22,12 @@ import numpy as np
 from analysis.short_repr import shows
 from optics.geometry import zernike
 from optics.geometry.aperture import Circle
+from optics.geometry.polygon import covered
 from optics.geometry.tree import State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.invariants import hold_below, hold_equal, hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
@@ -35,8 +37,8 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
-from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES
-from optics.waves.pupil_stack import DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
+from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
+from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE, line_body
 from scenes.models.instrument_model import Instrument
@@ -65,8 +67,8 @@ WAVELENGTH = 650e-9
 RINGS = 7
 """Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
-EDGED, EDGED_RINGS = (DEGREE, 10, 12, 14), 14
-"""Degrees of the polynomials of a pupil that edges of surfaces cut, the first that do, and rings of its quadrature."""
+EDGED_RINGS = 14
+"""Rings of the quadrature of a pupil that edges of surfaces cut, which takes polynomials of higher degrees."""
 
 _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
@@ -74,6 +76,19 @@ _DARKEST = 0.99
 COLOURS = 5
 """Gauss' wavelengths of a band. At one frequency inside of all cut-offs four are right to 1e-7; cut-offs inside the
 band need more, but there the MTF is next to nothing."""
+
+_ROUNDING = 1e-5
+"""By which shares may leave 0 to 1, and an error at best focus that on the line CCD, in waves."""
+
+_MTF_ROUNDING = 1e-3
+"""By which an MTF may leave 0 to 1."""
+
+_MOST_WAVES = 1e6
+"""Wavefront error beyond which a number is none of an image, waves rms."""
+
+_FEW, _APART = quadrature.even_disk(500), 0.02
+"""Points of the stop by which the area of shadows is held to their outlines; they count a share to 1 %. Shares of the
+stop's area and of the light differ by as little: the light is nearly even."""
 
 AT_ONCE = 40
 """States traced in one launch, to bound memory: 40 take 60 MB."""
@@ -204,6 +219,7 @@ def image_quality(
 
     Raises:
         ValueError: no field, or one outside of the line.
+        UnphysicalError: a number that cannot be.
     """
     if not fields or not np.all(np.abs(fields) <= 1.0):
         raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
@@ -283,7 +299,7 @@ class _CameraBench:
         self.stop = stop
         # edges leave rays in the dark, where the wavefront may bend more
         self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
-        self.degrees = EDGED if self.model.edges else (DEGREE,)
+        self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
         self.nodes = quadrature.disk(EDGED_RINGS if self.model.edges else RINGS)
         self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
         self.assembly = instrument.assembly
@@ -378,24 +394,67 @@ class _CameraBench:
             v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
             path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
             taken = None if pieces is None else pieces[lit]
+            free = None
+            if self.model.edges and taken is not None:
+                free = ~covered(taken, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+            colour = float(np.min(self.colours))
             for degree in self.degrees:
                 pupils = PupilStack.fit(
-                    u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides
+                    u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides, free
                 )
-                smooth = pupils.residual <= WORST_RESIDUAL * float(np.min(self.colours))
-                if np.all(smooth):
+                if np.all(pupils.residual <= CUT_RESIDUAL * colour):
                     break
+            smooth = pupils.residual <= WORST_RESIDUAL * colour
             lost[lit] = 1.0 - pupils.light
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
                 otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
         values = np.stack([wfe, refocused, defocus, *mtf, lost])
+        self._hold(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
+
+    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
+        """Hold numbers (_COLUMNS, B) to what any camera has.
+
+        Raises:
+            UnphysicalError: one cannot be; with the camera and what it is.
+        """
+        # a beam that something cuts or all but stops is told by its reason, and not by numbers
+        told = values[:, (dark == 0.0) & (values[5] <= _DARKEST)]
+        wfe, refocused, _, *mtf, lost = told
+        of = f"of camera {self.name}"
+        hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
+        hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
+        hold_below(
+            f"a wavefront error {of} at best focus",
+            refocused,
+            wfe * (1.0 + _ROUNDING),
+            "that on the line CCD",
+            _ROUNDING,
+        )
+        hold_within(f"an MTF {of}", np.array(mtf), 0.0, 1.0, _MTF_ROUNDING)
+        if shadows is None or not shadows.owners:
+            return
+        shares = np.array(list(shadows.shares().values()))
+        hold_within(f"the share of the stop {of} that a body takes", shares, 0.0, 1.0, _ROUNDING)
+        together = np.sum(shares, axis=0)
+        hold_within(f"the share of the stop {of} that bodies take together", together, 0.0, 1.0, _ROUNDING)
+        points = np.stack([_FEW.x, _FEW.y], axis=-1)
+        counted = np.mean(covered(shadows.pieces, points, SMALLEST), axis=-1)
+        hold_equal(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
+        hold_equal(
+            f"the share of the stop {of} that bodies take",
+            together[(dark == 0.0) & (values[5] <= _DARKEST)],
+            lost,
+            "that of the light",
+            _APART,
+        )
 
     def _note(self, pupils: PupilStack, lit: np.ndarray, which: np.ndarray) -> None:
         """Keep how the pupils of states look of which all fields are lit."""

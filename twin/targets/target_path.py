@@ -25,19 +25,16 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
+from optics.waves.edge_shadow import settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
+from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
+from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
-
-DEGREES = (DEGREE, 10, 12, 14)
-"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Outside the light, in the middle
-of an obscured beam, a polynomial wavefront may bend much more than inside.
-"""
 
 MAP_POINTS = 7
 MAP_ORDER = 4
@@ -167,12 +164,12 @@ class TargetPath:
         return np.asarray(rays.position[:, 0, 1::-1] / rays.size)
 
     def rays(self, state: State, directions: np.ndarray, points: np.ndarray, edges: bool = True) -> LineRays:
-        """Rays of beams of directions (F, 3), world, through points (N, 2) of the stop in units of its radius.
+        """Rays of beams of directions (F, 3), world, through points of the stop in units of its radius.
 
         Args:
             state: of the assembly.
             directions: of the light.
-            points: of the stop.
+            points: of the stop, (N, 2); without ``edges`` also of each beam, (F, N, 2).
             edges: whether edges of the camera's surfaces and bodies in the beams stop rays.
 
         Raises:
@@ -239,24 +236,52 @@ class TargetPath:
             ValueError: it is vignetted.
         """
         placed, systems, rays = self._imaging(state, directions)
+        taken, _ = self._taken(placed, systems, rays, directions)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
         field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
+        turned = turned.in_lengths_of(systems.size)
+        if not self.model.edges or taken is None:
+            return fit_pupils(turned, self.nodes, DEGREE, taken)
+        points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
+        lit = ~covered(taken, points, SMALLEST)
+        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in self._cut_pupils(turned, taken, lit))
+
+    def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
+        """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
+
+        Returns:
+            Convex polygons on the stop's unit disk that do not overlap, (F, K, V, 2), and how much of its area their
+            shares are right to.
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+            UnphysicalError: edges that no polygons follow.
+        """
+        taken, error = self._taken(*self._imaging(state, directions), directions)
+        return (np.zeros((len(directions), 0, 3, 2)) if taken is None else taken), error
+
+    def _taken(
+        self, placed: PlacedBodies, systems: SystemBatch, rays: ImagingRays, directions: np.ndarray
+    ) -> tuple[np.ndarray | None, float]:
+        """``shadows_on_stop`` of traced beams; None for free ones."""
         owner = np.zeros(len(directions), dtype=int)
         beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
         taken = None if self.shadows is None else self.shadows.cast(beams).pieces
-        if self.model.edges:
-            others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-            outlines = edge_outlines(beams, self.model, self.name, self.backend)
-            taken = outlines.shadows(len(directions), others)
-        turned = turned.in_lengths_of(systems.size)
-        *tried, last = DEGREES if self.model.edges else (DEGREE,)
-        for degree in tried:
+        if not self.model.edges:
+            return taken, 0.0
+        others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
+        seen = edge_outlines(beams, self.model, self.name, self.backend)
+        return settled_shadows(seen, len(directions), others)
+
+    def _cut_pupils(self, field: PupilField, taken: np.ndarray, lit: np.ndarray) -> tuple[PupilFunction, ...]:
+        """Pupils with shadows (B, K, V, 2), by polynomials of the lowest degree that follows the lit nodes, (B, N)."""
+        for degree in CUT_DEGREES:
             with suppress(RoughWavefrontError):
-                return fit_pupils(turned, self.nodes, degree, taken)
-        return fit_pupils(turned, self.nodes, last, taken)
+                return fit_pupils(field, self.nodes, degree, taken, lit, CUT_RESIDUAL)
+        return fit_pupils(field, self.nodes, CUT_DEGREES[-1], taken, lit)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""

@@ -1,0 +1,77 @@
+"""What numbers of a result must be, whatever the instrument; held at run time, so that nonsense is an error."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optics.numerics.physical_error import UnphysicalError
+
+
+def hold_within(what: str, values: np.ndarray | float, low: float, high: float, rounding: float) -> None:
+    """Hold values between bounds.
+
+    Args:
+        what: they are, for the message.
+        values: any shape; NaN where nothing is known.
+        low: smallest.
+        high: largest.
+        rounding: by which they may leave the bounds.
+
+    Raises:
+        UnphysicalError: one lies outside, or is infinite.
+    """
+    every = np.asarray(values, dtype=np.float64)
+    known = every[~np.isnan(every)]
+    off = np.maximum(low - known, known - high)
+    if np.any(off > rounding):
+        worst = float(known[int(np.argmax(off))])
+        raise UnphysicalError(
+            f"{what} came out as {worst:.6g}, which cannot be: it lies between {low:g} and {high:g}, to {rounding:g}"
+        )
+
+
+def hold_below(what: str, values: np.ndarray | float, bounds: np.ndarray | float, than: str, rounding: float) -> None:
+    """Hold values below others.
+
+    Args:
+        what: they are, for the message.
+        values: any shape; NaN where nothing is known.
+        bounds: of a shape that broadcasts.
+        than: what the bounds are.
+        rounding: by which values may exceed them.
+
+    Raises:
+        UnphysicalError: one exceeds its bound.
+    """
+    own, most = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(bounds, dtype=np.float64))
+    with np.errstate(invalid="ignore"):
+        off = np.where(np.isnan(own) | np.isnan(most), -np.inf, own - most)
+    if np.any(off > rounding):
+        k = int(np.argmax(off))
+        raise UnphysicalError(
+            f"{what} came out as {own.flat[k]:.6g}, which cannot be: it is at most {than}, {most.flat[k]:.6g}, to "
+            f"{rounding:g}"
+        )
+
+
+def hold_equal(what: str, values: np.ndarray | float, others: np.ndarray | float, to: str, apart: float) -> None:
+    """Hold values to what another way tells.
+
+    Args:
+        what: they are, for the message.
+        values: any shape; NaN where nothing is known.
+        others: of a shape that broadcasts.
+        to: what the others are.
+        apart: by which the two may differ.
+
+    Raises:
+        UnphysicalError: two differ by more.
+    """
+    own, second = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64))
+    off = np.where(np.isnan(own) | np.isnan(second), 0.0, np.abs(own - second))
+    if np.any(off > apart):
+        k = int(np.argmax(off))
+        raise UnphysicalError(
+            f"{what} came out as {own.flat[k]:.6g}, but {to} as {second.flat[k]:.6g}: they differ by more than "
+            f"{apart:g}"
+        )

@@ -1,0 +1,126 @@
+"""Statistics of the wavefront of one beam over the light that edges and bodies leave of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from optics.geometry.tree import State
+from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.quadrature import PupilNodes
+from optics.waves.lit_stop import LitStop, holes
+from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts
+from twin.targets.target_path import LineRays, TargetPath
+
+WORST_LIGHT = 5e-3
+"""Share of the light by which shadows of edges and traced rays may differ: 10 000 rays count a share to 1e-3."""
+
+RAYS_ACCURACY = 2e-3
+"""What numbers of a cut beam are right to where 10 000 rays stand for its light: as a share of an rms wavefront
+error."""
+
+SHARPEST = 1e-4
+"""Rms wavefront error of which shares are told, waves; of less there is rounding of paths in it."""
+
+_SHADOW_NODES = 6
+"""Along each side of a shadow's box."""
+
+_FINER_RINGS, _FINER_NODES = 4, 2
+"""More of both for the finer quadrature, by which numbers are held."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExactFit:
+    """What is known of a cut beam without a raster.
+
+    Attributes:
+        fit: of its wavefront.
+        light: share of the stop that comes through.
+        hole: of a ring, as of ``Wavefront``.
+        accuracy: as of ``Wavefront``.
+    """
+
+    fit: PartFit
+    light: float
+    hole: float
+    accuracy: float
+
+
+def exact_fit(
+    path: TargetPath,
+    state: State,
+    direction: np.ndarray,
+    rings: int,
+    light: float,
+    to_sphere: Callable[[LineRays], np.ndarray],
+    terms: int,
+) -> ExactFit | None:
+    """Fit a wavefront over the light of a beam by a quadrature that ends at the edges.
+
+    Args:
+        path: of the camera.
+        state: of its assembly.
+        direction: of the light, world, (1, 3).
+        rings: of the quadrature over the whole stop.
+        light: share of the stop that traced rays come through.
+        to_sphere: optical paths of rays to their reference spheres, (1, N), metres.
+        terms: of Zernike.
+
+    Returns:
+        None where the shadows are not known or not those of traced rays, rays in what is dark do not come to the image,
+        or a finer quadrature tells other numbers.
+
+    Raises:
+        AimError, BeamMissedError: the beam is lost.
+    """
+    try:
+        pieces, error = path.shadows_on_stop(state, direction)
+    except UnphysicalError:
+        return None
+    more = (0, 0), (_FINER_RINGS, _FINER_NODES)
+    stops = [LitStop.of(pieces, rings + r, _SHADOW_NODES + n) for r, n in more]
+    if abs(float(stops[1].light[0]) - light) > WORST_LIGHT:
+        return None
+    points = [np.stack([stop.x[0], stop.y[0]], axis=-1) for stop in stops]
+    every = np.concatenate([np.zeros((1, 2)), *points])
+    rays = path.rays(state, direction, every, edges=False)
+    # boxes about shadows reach a little beyond the stop, which ends these rays; their paths are as of others
+    if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
+        return None
+    waves = np.split(-to_sphere(rays)[0, 1:] / path.model.spec.wavelength, [len(points[0])])
+    try:
+        coarse, fine = (
+            fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in zip(stops, waves, strict=True)
+        )
+    except UnphysicalError:
+        return None
+    change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
+    if not change < RAYS_ACCURACY:
+        return None
+    return ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
+
+
+def counted_fit(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:
+    """Statistics of a levelled wavefront by the rays that come through.
+
+    Args:
+        nodes: of the stop, N.
+        weight: of the nodes, 0 where no light comes through, (N,).
+        flat: the wavefront without piston and tilt, waves, (N,).
+        terms: of Zernike.
+        free: whether none of the weights is 0.
+    """
+    fit = fit_wavefront(nodes.x, nodes.y, weight, flat, terms)
+    # over a part of the disk the terms share tilt among them; what is level there was taken out before
+    rms = fit.rms if free else np.sqrt(np.sum(weight * flat**2) / np.sum(weight))
+    phasor = np.sum(weight * np.exp(2j * np.pi * flat)) / np.sum(weight)
+    return PartFit(
+        np.zeros(3),
+        fit.coefficients,
+        orthonormal_parts(nodes.x, nodes.y, weight, flat, terms),
+        float(rms),
+        float(fit.residual_rms),
+        float(np.abs(phasor) ** 2),
+    )
