@@ -41,6 +41,7 @@ from scenes.models.shadow import ImagingShadows, Shadows, TracedBeams, imaging_s
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
+from scenes.specs.spectrum import SpectrumSpec
 from twin.sensors.line_ccd import band_factors
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
@@ -200,7 +201,6 @@ def image_quality(
         reasons = [""] * len(states)
         for start in range(0, len(states), AT_ONCE):
             bench.fill(list(states), np.arange(start, min(start + AT_ONCE, len(states))), out, reasons)
-        light = (float(np.min(bench.spectrum)), float(np.max(bench.spectrum)))
         cameras[name] = CameraQuality(
             wfe=out[0],
             wfe_refocused=out[1],
@@ -209,7 +209,7 @@ def image_quality(
             mtf_along_track=out[4],
             light_lost=out[5],
             nyquist=bench.nyquist,
-            wavelengths=light,
+            wavelengths=bench.ends,
             reasons=tuple(reasons),
             bodies=FrozenMap(bench.bodies(len(states))),
             pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
@@ -254,10 +254,9 @@ class _CameraBench:
         self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
         self.nyquist = 0.5 / line.pitch
         self.frequency = self.nyquist * np.eye(2)
-        self.spectrum = (spec.wavelength, spec.wavelength) if band is None else band.spectrum
-        first, last = self.spectrum
-        node, self.weights = quadrature.gauss(COLOURS if last > first else 1)
-        self.colours = 0.5 * (first + last) + 0.5 * (last - first) * node
+        light = SpectrumSpec.evenly(spec.wavelength, spec.wavelength) if band is None else band.spectrum
+        self.ends = light.ends
+        self.colours, self.weights = light.rule(COLOURS)
         x, y = self.frequency.T
         if band is None:
             self.detector = np.sinc(line.pitch * x) * np.sinc(line.pitch * y)
