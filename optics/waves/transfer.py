@@ -62,7 +62,11 @@ def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, def
 
 
 def polychromatic_transfer(
-    pupil: PupilFunction | Sequence[PupilFunction], frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray, defocus: np.ndarray
+    pupil: PupilFunction | Sequence[PupilFunction],
+    frequency: np.ndarray,
+    wavelengths: np.ndarray,
+    weights: np.ndarray,
+    defocus: np.ndarray,
 ) -> np.ndarray:
     """Optical transfer function of a band: mean over K wavelengths, as ``transfer``.
 

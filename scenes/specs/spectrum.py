@@ -24,9 +24,9 @@ WavelengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smalles
 MOST_LINES = 100
 MOST_SAMPLES = 20_000
 
-_PIECES, _NODES = 64, 8
-"""Pieces of an even band in a black body's light, and Gauss' nodes on each piece of a curve: Planck's law over a piece
-is a polynomial to rounding."""
+_PIECES, _NODES, _LEAST_POINTS = 64, 8, 512
+"""Pieces of an even band in a black body's light; Gauss' nodes on each piece of a curve, at least, over which Planck's
+law is a polynomial to rounding; and points of all pieces together, at least: far more than any rule has."""
 
 
 class SpectrumSpec(Spec):
@@ -189,7 +189,7 @@ def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
     corners, response = _corners(spectrum)
     if corners[0] == corners[-1]:
         return corners[:1], np.ones(1)
-    node, weight = gauss(_NODES)
+    node, weight = gauss(max(_NODES, -(-_LEAST_POINTS // (len(corners) - 1))))
     step = np.diff(corners)[:, None]
     points = (corners[:-1, None] + 0.5 * step * (node + 1.0)).ravel()
     weights = (0.5 * step * weight).ravel() * np.interp(points, corners, response)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from scenes.models.camera_model import lenses
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics, Field, Mtf
+from twin.run.quantity import Quantity, Record
 
 WORST_CHANGE = 5e-4
 """Largest change of an MTF by a rule of more wavelengths at which it is taken as it is."""
@@ -283,3 +285,107 @@ def judge_colours(
     except ValueError as error:  # colours too far apart, or a wavefront too rough at one of them
         return replace(out, without_mtf=str(error))
     return replace(out, mtfs=mtfs, psfs=psfs)
+
+
+@dataclass(frozen=True, eq=False)
+class _AtField:
+    """Colours at one of their fields."""
+
+    colours: Colours
+    number: int
+
+    def of(self, values: np.ndarray | None) -> Any:
+        """What stands for this field in an array (F, ...); None for none."""
+        return None if values is None else values[self.number]
+
+    @property
+    def mtf(self) -> np.ndarray | None:
+        """Over the light at Nyquist, along the line and along the track."""
+        if not self.colours.mtfs:
+            return None
+        mtf = self.colours.mtfs[self.number]
+        return mtf.at(mtf.nyquist)
+
+    @property
+    def strehl(self) -> float | None:
+        """Over the light."""
+        return self.colours.psfs[self.number].strehl if self.colours.psfs else None
+
+
+_FIELD: Record[_AtField] = Record(
+    "Colour at one field; along the line and along the track where there are two numbers.",
+    Quantity("field", lambda a: a.colours.fields[a.number], "shares of the half field, along the line and the track"),
+    Quantity(
+        "lateral_primary_um",
+        lambda a: a.of(a.colours.lateral_primary),
+        "chief ray of the shortest wavelength from that of the longest",
+        where_known=True,
+    ),
+    Quantity(
+        "lateral_secondary_um",
+        lambda a: a.of(a.colours.lateral_secondary),
+        "chief ray of the reference wavelength from the middle of both",
+        where_known=True,
+    ),
+    Quantity(
+        "axial_primary_um",
+        lambda a: a.of(a.colours.axial_primary),
+        "best focus of the shortest wavelength from that of the longest, downstream positive",
+        where_known=True,
+    ),
+    Quantity(
+        "axial_secondary_um",
+        lambda a: a.of(a.colours.axial_secondary),
+        "best focus of the reference wavelength from the middle of both",
+        where_known=True,
+    ),
+    Quantity("mtf_at_nyquist", lambda a: a.mtf, "of the optics over the light", where_known=True),
+    Quantity("strehl", lambda a: a.strehl, "Strehl ratio over the light", where_known=True),
+)
+
+COLOURS: Record[Colours] = Record(
+    "A camera over the wavelengths of its light.",
+    Quantity("shortest_nm", lambda c: c.spectrum.ends[0], "wavelength with light"),
+    Quantity("longest_nm", lambda c: c.spectrum.ends[1], "wavelength with light"),
+    Quantity("reference_nm", lambda c: c.reference, "wavelength from which colours count"),
+    Quantity("fields", lambda c: [_AtField(c, f) for f in range(len(c.fields))], "field by field", record=_FIELD),
+    Quantity(
+        "wavelengths_of_mtf",
+        lambda c: len(c.mtfs[0].wavelengths) if c.mtfs else None,
+        "of Gauss' rule, or all lines",
+        where_known=True,
+    ),
+    Quantity(
+        "mtf_error", lambda c: c.error if c.mtfs else None, "its change by more of them, at most", where_known=True
+    ),
+    Quantity("without_mtf", lambda c: c.without_mtf or None, "why there is none", where_known=True),
+)
+
+
+def colour_data(colours: Colours) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What optics.nc has of them: variables and coordinates."""
+    metres = {"units": "m"}
+    data: dict[str, Any] = {}
+    coords: dict[str, Any] = {}
+    if colours.lateral is not None and colours.axial is not None:
+        about = {**metres, "long_name": "chief ray's place from that of the reference wavelength"}
+        data["lateral_colour"] = (("mtf_field", "wavelength", "direction"), colours.lateral, about)
+        about = {**metres, "long_name": "best focus from the focal plane, downstream positive"}
+        data["axial_colour"] = (("mtf_field", "wavelength"), colours.axial, about)
+        coords["wavelength"] = ("wavelength", colours.wavelengths, {**metres, "long_name": "wavelength of the light"})
+    if colours.mtfs:
+        dims = ("mtf_field", "direction", "light_frequency")
+        data["light_mtf"] = (
+            dims,
+            np.stack([m.values for m in colours.mtfs]),
+            {"long_name": "modulation over the light"},
+        )
+        about = {"long_name": "the same without wavefront error, every wavelength in its place"}
+        data["light_mtf_limit"] = (dims, np.stack([m.limit for m in colours.mtfs]), about)
+        about = {"units": "1/m", "long_name": "spatial frequency in the image, cycles per length"}
+        coords["light_frequency"] = ("light_frequency", colours.mtfs[0].frequency, about)
+        about = {"units": "1/m2", "long_name": "irradiance of a point's image for unit light"}
+        data["psf"] = (("mtf_field", "row", "column"), np.stack([p.values for p in colours.psfs]), about)
+        about = {**metres, "long_name": "place of columns and rows from the design wavelength's chief ray"}
+        data["psf_place"] = (("mtf_field", "column"), np.stack([p.place for p in colours.psfs]), about)
+    return data, coords
