@@ -235,13 +235,22 @@ def spectral_psfs(
         # about the design wavelength's chief ray, as the pupils are
         reach = max(float(np.max(np.abs(np.array(spot[f].place) - design[f].place + spot[f].rays))) for spot in spots)
         half = max(0.25 * WINDOW * colours[ends[1]] / aperture, 1.5 * reach)
-        grid = Grid(-half, 2.0 * half / (PSF_POINTS - 1), PSF_POINTS)
-        values, limit = np.zeros((PSF_POINTS, PSF_POINTS)), 0.0
-        for pupil, colour, share in zip(pupils, colours, shares, strict=True):
-            field = _sampled(pupil, float(colour), half)
-            values += share * image(field, grid, grid, single=True)[0]
-            limit += share * float(np.sum(field.amplitude)) ** 2 / colour**2
-        out.append(Psf(design[f].field, grid.points(), values, float(np.max(values)) / limit))
+        sampled = [_sampled(pupil, float(colour), half) for pupil, colour in zip(pupils, colours, strict=True)]
+
+        def over_light(x: Grid, y: Grid, sampled: Sequence[PupilField] = sampled) -> np.ndarray:
+            return np.asarray(sum(w * image(one, x, y, single=True)[0] for w, one in zip(shares, sampled, strict=True)))
+
+        step = 2.0 * half / (PSF_POINTS - 1)
+        grid = Grid(-half, step, PSF_POINTS)
+        values = over_light(grid, grid)
+        row, column = np.unravel_index(int(np.argmax(values)), values.shape)
+        # the peak lies between points
+        x, y = (Grid(float(grid.points()[k]) - step, step / 8.0, 17) for k in (column, row))
+        peak = float(np.max(over_light(x, y)))
+        limit = sum(
+            w * float(np.sum(one.amplitude)) ** 2 / one.wavelength**2 for w, one in zip(shares, sampled, strict=True)
+        )
+        out.append(Psf(design[f].field, grid.points(), values, peak / limit))
     return tuple(out)
 
 

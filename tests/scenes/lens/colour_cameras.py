@@ -45,7 +45,7 @@ MAKSUTOV = (
 KINDS = {
     "achromat": {"focal": "1.1316 m", "pupil": "100 mm", "field": "0.5 deg", "mirrors": ACHROMAT, "image": "1141.2 mm"},
     "schmidt": {"focal": "1 m", "pupil": "200 mm", "field": "0.3 deg", "mirrors": SCHMIDT, "image": "1003.5 mm"},
-    "maksutov": {"focal": "0.4 m", "pupil": "60 mm", "field": "0.3 deg", "mirrors": MAKSUTOV, "image": "170.02 mm"},
+    "maksutov": {"focal": "0.4 m", "pupil": "90 mm", "field": "0.3 deg", "mirrors": MAKSUTOV, "image": "170.02 mm"},
 }
 
 
