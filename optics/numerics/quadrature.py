@@ -130,6 +130,39 @@ def gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
     return points, weights
 
 
+def gauss_of(points: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss' rule for sums over given points.
+
+    With n points it is exact for polynomials of degree below 2 n, however rough the weights are (Golub and Welsch,
+    Mathematics of Computation 23, 221 (1969); the recurrence by Lanczos' steps, each made orthogonal to all before).
+
+    Args:
+        points: (N,), N different ones.
+        weights: (N,), positive.
+        count: n; at most N are given.
+
+    Returns:
+        The rule's points, ascending, and weights, which sum to those given, (n,) each.
+    """
+    points, weights = np.asarray(points, float), np.asarray(weights, float)
+    count = min(count, len(points))
+    middle, half = 0.5 * (points.max() + points.min()), 0.5 * float(np.ptp(points)) or 1.0
+    x = (points - middle) / half
+    rows = np.zeros((count, len(x)))
+    diagonal, beside = np.zeros(count), np.zeros(count)
+    vector = np.sqrt(weights / np.sum(weights))
+    for k in range(count):
+        rows[k] = vector
+        vector = x * vector
+        diagonal[k] = rows[k] @ vector
+        for _ in range(2):
+            vector = vector - (rows[: k + 1] @ vector) @ rows[: k + 1]
+        beside[k] = np.linalg.norm(vector)
+        vector = vector / (beside[k] or 1.0)
+    found, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(beside[:-1], 1) + np.diag(beside[:-1], -1))
+    return middle + half * found, np.sum(weights) * vectors[0] ** 2
+
+
 def nodes_for(span: float, least: int) -> int:
     """Gauss nodes for exp(i phase) with a phase that runs over +-``span`` radians, and with a smooth amplitude.
 

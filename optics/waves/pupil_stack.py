@@ -37,8 +37,8 @@ of an obscured beam, a polynomial wavefront may bend much more than inside.
 """
 
 CUT_RESIDUAL = 1e-4
-"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may leave
-more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may
+leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
 """
 
 WORST_RESIDUAL = 1e-3

@@ -14,7 +14,7 @@ itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -62,12 +62,17 @@ def transfer(pupil: PupilFunction, frequency: np.ndarray, wavelength: float, def
 
 
 def polychromatic_transfer(
-    pupil: PupilFunction, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray, defocus: np.ndarray
+    pupil: PupilFunction | Sequence[PupilFunction],
+    frequency: np.ndarray,
+    wavelengths: np.ndarray,
+    weights: np.ndarray,
+    defocus: np.ndarray,
 ) -> np.ndarray:
     """Optical transfer function of a band: mean over K wavelengths, as ``transfer``.
 
     Args:
-        pupil: of the image, the same at all wavelengths.
+        pupil: of the image, the same at all wavelengths; or one for each of them, all about one point of the image, so
+            that the colours of an image that stand apart blur it.
         frequency: (M, 2), cycles/m.
         wavelengths: (K,), metres.
         weights: (K,) share of the signal (power x response) at each; they need not sum to 1.
@@ -78,7 +83,7 @@ def polychromatic_transfer(
 
     Raises:
         ValueError: other shapes, numbers that are not finite, weights that are negative or all zero, wavelengths that
-            are not positive.
+            are not positive, or other numbers of pupils and wavelengths.
     """
     frequency, defocus = np.asarray(frequency, float), np.asarray(defocus, float)
     if frequency.ndim != 2 or frequency.shape[1] != 2 or defocus.ndim != 1:
@@ -86,6 +91,12 @@ def polychromatic_transfer(
     if not np.all(np.isfinite(frequency)) or not np.all(np.isfinite(defocus)):
         raise ValueError("frequency and defocus must be finite")
     wavelengths, share = _band(wavelengths, weights)
+    if not isinstance(pupil, PupilFunction):
+        each = [
+            transfer(own, frequency, float(wavelength), defocus)
+            for own, wavelength in zip(pupil, wavelengths, strict=True)
+        ]
+        return np.asarray(np.einsum("k,kzm->zm", share, each))
     shift = wavelengths[:, None] * pupil.normalised(frequency[:, 0], frequency[:, 1])
     every = np.repeat(wavelengths, len(frequency))
     parts = _correlate(pupil, shift.ravel(), every, defocus).reshape(*shift.shape, len(defocus))

@@ -19,6 +19,8 @@ from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Polygon,
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.zernike import MAX_NOLL
+from optics.materials.glass import GLASSES
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import OVER, LensSurface, Note, Prescription, even_asphere, turned_over
 from scenes.lens.statements import Source, read_lines
@@ -55,6 +57,7 @@ class _Reader:
         self.surfaces: list[LensSurface] = []
         self.notes: list[Note] = []
         self.ambient = 1.0
+        self.named: dict[float, str] = {}
 
     def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
         """What is wrong at a key."""
@@ -161,7 +164,9 @@ class _Reader:
         if given.get("type") == "Baffle" and not (shape.is_plane and edges):
             self.notes.append(Note(self.line(key), name, "a baffle that is no plane, or without an edge: not carried"))
             return
-        surface = LensSurface(name, pose, shape, how, index / self.ambient, clear, self.line(key), edges=rest)
+        surface = LensSurface(
+            name, pose, shape, how, index / self.ambient, clear, self.line(key), self.named.get(index, ""), rest
+        )
         # the world turns over, and each surface's own frame with it
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
 
@@ -279,7 +284,11 @@ class _Reader:
                 return float(np.interp(w, x, y))
             case "SellmeierMedium":
                 b, c = ([self.number(medium, f"{n}{k}", key) for k in (1, 2, 3)] for n in "BC")
-                return math.sqrt(1.0 + sum(p * um * um / (um * um - q) for p, q in zip(b, c, strict=True)))
+                n = math.sqrt(1.0 + sum(p * um * um / (um * um - q) for p, q in zip(b, c, strict=True)))
+                for glass in GLASSES.values():
+                    if np.allclose([*b, *c], [*glass.b, *glass.c], rtol=1e-8, atol=0.0):
+                        self.named[n] = glass.name
+                return n
             case "SumitaMedium":
                 a = [self.number(medium, f"A{k}", key) for k in range(6)]
                 return math.sqrt(a[0] + a[1] * um**2 + sum(a[k] * um ** (-2 * (k - 1)) for k in range(2, 6)))
@@ -365,8 +374,18 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     if reader.ambient != 1.0:
         notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
     name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
+    # against another medium than that of the file's start the catalogue's dispersion is another
+    known = {own: GLASSES[own].index for own in reader.named.values()} if reader.ambient == 1.0 else {}
     return Prescription(
-        name, str(path), surfaces, stop, wavelength, (wavelength,), (), "none", None, math.inf, tuple(notes)
+        name,
+        str(path),
+        surfaces,
+        stop,
+        wavelength,
+        (wavelength,),
+        field_kind="none",
+        notes=tuple(notes),
+        glasses=FrozenMap(known),
     )
 
 

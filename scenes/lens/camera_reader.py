@@ -13,6 +13,8 @@ from optics.geometry.aperture import Circle
 from optics.geometry.pose import rotation_vector
 from optics.geometry.sag_terms import LAST_NOLL, SAG_TERMS, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
+from optics.materials.dispersion import CatalogueGlass
+from optics.materials.glass import GLASSES
 from optics.numerics.backend import Backend
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Interaction
@@ -40,6 +42,8 @@ LARGEST_TILT = math.radians(45.0)
 SAME = 1e-9
 """Farthest that a ray of the camera may meet the image from where the prescription's does, metres. Both are traced by
 the same code: what is left is the rounding of poses and numbers."""
+_SAME_INDEX = 1e-11
+"""Coefficients of one glass in two files agree to the digits that are printed of them."""
 _SINGLE_FIELD = math.radians(0.05)
 _RIM, _FINE_RIM = 12, 720
 _LIGHT = {Interaction.REFRACT: "refracts", Interaction.PASS: "passes"}
@@ -137,6 +141,8 @@ def _camera_of(lens: Prescription, name: str, backend: Backend, width: Width) ->
         "image": where,
         "line": {"pixels": 2, "pitch": format_quantity(width.pitch, LENGTH)},
     }
+    if any("glass" in surface for surface in surfaces.values()):
+        plain["medium"] = "air"  # which other programs take glasses against
     narrow = _derived(lens, plain, backend)
     pupil = _pupil(lens, narrow, plain, backend, width)
     focal = float(abs(narrow.first_order.scale[0, 0, 0]))
@@ -265,8 +271,21 @@ def _written(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     if surface.interaction in _LIGHT:
         out["light"] = _LIGHT[surface.interaction]
     if surface.interaction is Interaction.REFRACT:
-        out["index"] = surface.index
+        out |= _behind(lens, surface)
     return out
+
+
+def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
+    """Glass behind a surface where its dispersion is known and makes its index, else the index alone."""
+    known = lens.glasses.get(surface.glass)
+    if known is None or abs(known(lens.wavelength) - surface.index) > _SAME_INDEX:
+        return {"index": surface.index}
+    if isinstance(known, CatalogueGlass):
+        ends = [format_quantity(w, LENGTH) for w in (known.shortest, known.longest)]
+        coefficients = list(known.coefficients)
+        return {"glass": {"name": known.name, "formula": known.formula, "coefficients": coefficients, "range": ends}}
+    own = next((name for name, one in GLASSES.items() if one.index == known), None)
+    return {"index": surface.index} if own is None else {"glass": own}
 
 
 def _terms(lens: Prescription, surface: LensSurface, shape: Surface) -> dict[str, Any]:

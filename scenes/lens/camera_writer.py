@@ -24,7 +24,7 @@ def prescription_of(model: CameraModel) -> Prescription:
     """A camera as designed."""
     spec, behind, index = model.spec, {}, 1.0
     for name, mirror in spec.mirrors.items():
-        index = index if mirror.index is None else mirror.index
+        index = spec.index_behind(name) if mirror.light == "refracts" else index
         behind[name] = index
     surfaces = [
         LensSurface(

@@ -23,7 +23,17 @@ from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface
 from scenes.lens.codev_statements import CodevSurface, CodevSystem, statements, take
 from scenes.lens.prescription import LARGEST_ORDER, Prescription, Pupil, clear, even_asphere, polynomial
-from scenes.lens.statements import NO_GLASSES, Chain, Glasses, Source, Statement, index_of, read_lines, require_d_line
+from scenes.lens.statements import (
+    NO_GLASSES,
+    Chain,
+    Glasses,
+    Source,
+    Statement,
+    index_of,
+    named_glasses,
+    read_lines,
+    require_d_line,
+)
 
 
 def read_codev(path: str | Path, glasses: Glasses = NO_GLASSES) -> Prescription:
@@ -111,6 +121,7 @@ def _prescription(system: CodevSystem, glasses: Glasses) -> Prescription:
         fields=_fields(system),
         field_kind=system.field_kind,
         pupil=pupil,
+        glasses=named_glasses(glasses, chain.surfaces),
     )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from math import comb, pi, remainder
 from typing import Any
 
@@ -16,6 +16,7 @@ from optics.geometry.sag_terms import XYPolynomial, ZernikeSag
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.tree import Body, RigidTree
 from optics.geometry.zernike import cartesian_terms, monomials, noll_to_nm, triangle_index, triangle_size
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.units import ANGLE, LENGTH, Kind, format_quantity
@@ -372,6 +373,8 @@ class Prescription:
         object_distance: from the object to the frame's origin, metres; infinite for a scene.
         notes: what did not come along.
         round_field: the fields say how wide a round field about the axis is, of which a camera has the square in it.
+        glasses: of its surfaces by their names, those whose dispersion is known; called with a wavelength (metres) each
+            gives its index.
     """
 
     name: str
@@ -386,6 +389,7 @@ class Prescription:
     object_distance: float = float("inf")
     notes: tuple[Note, ...] = ()
     round_field: bool = False
+    glasses: Mapping[str, Callable[[float], float]] = field(default_factory=FrozenMap)
 
     @property
     def image(self) -> LensSurface:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -226,6 +226,12 @@ def index_of(source: Source, glasses: Glasses, name: str, wavelength: float, lin
         return found(wavelength)
     except ValueError as error:
         raise source.error(str(error), line) from None
+
+
+def named_glasses(glasses: Glasses, surfaces: Iterable[LensSurface]) -> Glasses:
+    """Those glasses of surfaces whose dispersion is known, by the names that the surfaces have for them."""
+    names = {surface.glass for surface in surfaces if surface.glass}
+    return FrozenMap({name: glasses[glass_key(name)] for name in sorted(names) if glass_key(name) in glasses})
 
 
 def require_d_line(source: Source, what: str, name: str, wavelength: float, line: int) -> None:

@@ -24,6 +24,7 @@ from scenes.lens.statements import (
     Statement,
     index_of,
     joined,
+    named_glasses,
     read_lines,
     require_d_line,
     statement_of,
@@ -292,6 +293,7 @@ def _prescription(system: _System, glasses: Glasses) -> Prescription:
         fields=_fields(system),
         field_kind=kinds[min(system.field_type, 4)],
         pupil=pupil,
+        glasses=named_glasses(glasses, chain.surfaces),
     )
 
 

@@ -10,7 +10,7 @@ to the image plane and toward the scene, X = Y x Z.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -18,9 +18,10 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Edge, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
-from optics.geometry.tree import Body, Motion, RigidTree, State
+from optics.geometry.tree import AT_REST, Body, Motion, RigidTree, State
 from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.aim import AimError, transverse_axes
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.first_order import FirstOrder, RayMatrix, first_order, ray_matrix
@@ -369,10 +370,42 @@ def lenses(spec: CameraSpec) -> dict[str, str]:
     return out
 
 
-def glass_indices(spec: CameraSpec) -> dict[str, float]:
-    """Lens -> its refractive index at the design wavelength."""
-    first = dict.fromkeys(lenses(spec).values())
-    return {name: index for name in first if (index := spec.mirrors[name].index) is not None}
+def glass_indices(spec: CameraSpec, wavelength: float | None = None) -> dict[str, float]:
+    """Lens -> its refractive index at a wavelength, metres; at that of the design by default.
+
+    Raises:
+        ValueError: a lens whose glass is not named, or not known there.
+    """
+    return {name: spec.index_behind(name, wavelength) for name in dict.fromkeys(lenses(spec).values())}
+
+
+def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> State:
+    """A state as light of another wavelength than the design's meets it: its lenses have other indices.
+
+    What the state itself says of an index, as heat does, is added to that of the wavelength.
+
+    Args:
+        spec: of the camera.
+        root: path of its body; empty for a bare camera.
+        state: body path -> motion.
+        wavelength: metres.
+
+    Returns:
+        The state, with the change of index of every lens; the same one for a camera without lenses, and at the design
+        wavelength.
+
+    Raises:
+        ValueError: as ``glass_indices``.
+    """
+    if wavelength == spec.wavelength or not lenses(spec):
+        return state
+    design = glass_indices(spec)
+    moved = dict(state)
+    for lens, index in glass_indices(spec, wavelength).items():
+        path = f"{root}/{lens}" if root else lens
+        motion = moved.get(path, AT_REST)
+        moved[path] = replace(motion, index=motion.index + (index - design[lens]))
+    return FrozenMap(moved)
 
 
 def _bare(spec: CameraSpec, surfaces: Mapping[str, Surface], apertures: Mapping[str, Aperture]) -> Assembly:

@@ -21,7 +21,7 @@ from optics.raytrace.aim import AimError
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import BeamMissedError, make_rays, require_some, trace
 from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import CameraModel, collimated, derive_camera, field_direction
+from scenes.models.camera_model import CameraModel, collimated, coloured, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import Spec
@@ -125,16 +125,21 @@ class FieldBeams:
         fields: tuple[tuple[float, float], ...],
         rings: int,
         cut: Cut | None = None,
+        wavelength: float | None = None,
     ) -> FieldBeams:
         """Trace them through the camera as designed; nothing but the stop, edges of surfaces and ``cut`` limits them.
+
+        ``wavelength`` is that of the light, metres; the design wavelength by default. Errors stay in waves of that.
 
         Raises:
             AimError, BeamMissedError: light of a field does not come through.
             InputError: edges stop all of it.
+            ValueError: a glass is not known at the wavelength.
         """
         spec, nodes = model.spec, stop_nodes(model, rings, cut is not None)
         bare = model.bare_assembly(apertures=False)
-        to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]])
+        states = [coloured(spec, "", {}, spec.wavelength if wavelength is None else wavelength)]
+        to_stop = assemble(bare, [model.mirrors[: model.mirrors.index(spec.stop) + 1]], states)
         directions = np.array([field_direction(spec, x * spec.field.x, y * spec.field.y) for x, y in fields])
         radius = float(model.apertures[spec.stop].bounds[1])
         points = radius * np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)])
@@ -143,7 +148,7 @@ class FieldBeams:
         rays = make_rays(backend, launch.reshape(-1, 3), heading.reshape(-1, 3))
         last = len(model.mirrors) - 1
         kept = {model.mirrors.index(name) for name in model.edges} | {last}
-        traced = trace(backend, assemble(bare, ["imaging"]), rays, keep=kept, world=True)
+        traced = trace(backend, assemble(bare, ["imaging"], states), rays, keep=kept, world=True)
         assert traced.world is not None
         position, direction, path, valid = traced.numpy(traced.world)
         shape = launch.shape[:2]

@@ -13,6 +13,8 @@ from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs import instrument as instruments
 from scenes.specs.baffle import SurfaceEdgeSpec
 from scenes.specs.detector import PixelPitch
+from scenes.specs.glass import LensGlass, Medium
+from scenes.specs.spectrum import Spectrum, SpectrumSpec
 from scenes.yaml.errors import Problem, unknown
 from scenes.yaml.quantity import (
     AsphereTerms,
@@ -26,9 +28,8 @@ from scenes.yaml.quantity import (
     Wavelength,
 )
 from scenes.yaml.spec import Name, Named, Number, Reference, Seed, Spec, Text, TitledSpec, Whole
-from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE, format_quantity
+from scenes.yaml.units import ANGLE, LENGTH, MASS, SCALE
 
-Spectrum = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
 Diffusion = Annotated[float, Quantity(LENGTH, smallest="0 um", largest="1 mm")]
 
 
@@ -58,7 +59,7 @@ class BandSpec(Spec):
         offset: along X' (flight direction) from the line's centre, metres.
         pixels: number of pixels along the line.
         pitch: of the pixels, which are square, metres.
-        spectrum: first and last wavelength, metres; the light is taken as evenly spread between them.
+        spectrum: the signal by wavelength; as two wavelengths, light that is evenly spread between them.
         detector: data sheet, by name or path.
         diffusion: rms spread of charge between pixels (crosstalk), metres.
         tdi: time delay and integration.
@@ -72,14 +73,6 @@ class BandSpec(Spec):
     diffusion: Diffusion = 0.0
     tdi: TdiSpec = TdiSpec()
 
-    @model_validator(mode="after")
-    def _spectrum_rises(self) -> BandSpec:
-        first, last = self.spectrum
-        if not first <= last:
-            found = f"[{format_quantity(first, LENGTH)}, {format_quantity(last, LENGTH)}]"
-            raise Problem("the spectrum's wavelengths are in the wrong order", found, "[shortest, longest]")
-        return self
-
     @property
     def exposure(self) -> float:
         """Exposure of all stages, over which dark current is collected, seconds; the data sheet gives it for all
@@ -92,6 +85,9 @@ class BandSpec(Spec):
         """Nyquist frequency of the pixels, cycles/m."""
         return 0.5 / self.pitch
 
+
+PANCHROMATIC = "P"
+"""Name of a camera's panchromatic band."""
 
 PhotonRange = tuple[instruments.Photons, instruments.Photons]
 
@@ -305,6 +301,8 @@ class MirrorSpec(Spec):
         light: what it does there, left out for a mirror; a plane that it passes is there to be the stop.
         index: refractive index behind a face of a lens, where light goes to, at the design wavelength; 1 where it
             leaves the lens.
+        glass: what lies behind a face where light enters a lens, in place of its index there, which then follows from
+            the dispersion at every wavelength.
         edges: what cuts light there beside the stop; several stop what any of them stops.
     """
 
@@ -317,6 +315,7 @@ class MirrorSpec(Spec):
     sag: Annotated[FrozenMap[str, SagTerm], SagTerms()] | None = None
     light: Light | None = None
     index: Annotated[Number, Field(ge=1.0, le=10.0)] | None = None
+    glass: LensGlass | None = None
     edges: Annotated[tuple[SurfaceEdgeSpec, ...], Field(min_length=1, max_length=100)] | None = None
 
     @model_validator(mode="after")
@@ -327,11 +326,20 @@ class MirrorSpec(Spec):
 
     @model_validator(mode="after")
     def _index_where_light_refracts(self) -> MirrorSpec:
-        if (self.light == "refracts") != (self.index is not None):
+        given = [key for key in ("index", "glass") if getattr(self, key) is not None]
+        if (self.light == "refracts") != bool(given):
             problem = "a face of a lens has an index behind it, and nothing else has"
-            found = "no index" if self.index is None else f"an index, light: {self.light or 'reflected'}"
-            raise Problem(problem, found, "light: refracts with an index", within=("light",))
+            found = f"{' and '.join(given)}, light: {self.light or 'reflected'}" if given else "no index"
+            raise Problem(problem, found, "light: refracts with an index or a glass", within=("light",))
+        if len(given) > 1:
+            problem = "the index of a glass follows from its dispersion"
+            raise Problem(problem, "index and glass", "one of both", within=("index",))
         return self
+
+    @property
+    def enters_glass(self) -> bool:
+        """Whether light goes into a lens here."""
+        return self.light == "refracts" and self.index != 1.0
 
 
 class FieldSpec(Spec):
@@ -376,6 +384,9 @@ class CameraSpec(TitledSpec):
         image: focal plane.
         line: line CCD.
         bands: line CCDs by spectral band, for images of targets; empty when none is described.
+        spectrum: light of which the camera is judged over all wavelengths; that of its band when left out.
+        medium: what its lenses stand in at 20 C, which the index of a glass is against: ``air``, as prescriptions on
+            the ground take it, or ``vacuum``, also when left out.
         edge_margin: by how much a mirror's clear aperture is wider than the beams that use it, metres.
     """
 
@@ -389,6 +400,8 @@ class CameraSpec(TitledSpec):
     image: ImageSpec
     line: LineSpec
     bands: Named[BandSpec] = Field(default_factory=FrozenMap)
+    spectrum: Spectrum | None = None
+    medium: Medium | None = None
     edge_margin: Annotated[float, Quantity(LENGTH, smallest="0 mm", largest="1 m")] = 0.005
 
     @model_validator(mode="after")
@@ -401,12 +414,14 @@ class CameraSpec(TitledSpec):
     def _lenses_stand_in_air(self) -> CameraSpec:
         inside = ""
         for name, mirror in self.mirrors.items():
-            if mirror.index is None:
+            if mirror.light != "refracts":
                 continue
-            if (mirror.index == 1.0) != bool(inside):
+            if mirror.enters_glass == bool(inside):
                 problem = "a lens has a face into glass and a face out of it, with nothing cemented to it"
                 allowed = "index: 1 where light leaves glass" if inside else "an index above 1 where light enters glass"
-                raise Problem(problem, f"{mirror.index:g}", allowed, within=("mirrors", name, "index"))
+                key = "index" if mirror.glass is None else "glass"
+                found = f"{mirror.index:g}" if mirror.glass is None else mirror.glass.name
+                raise Problem(problem, found, allowed, within=("mirrors", name, key))
             inside = "" if inside else name
         if inside:
             problem = "light enters glass and does not leave it"
@@ -414,12 +429,84 @@ class CameraSpec(TitledSpec):
         return self
 
     @model_validator(mode="after")
-    def _one_colour_through_glass(self) -> CameraSpec:
-        faces = [name for name, mirror in self.mirrors.items() if mirror.light == "refracts"]
-        if faces and self.bands:
-            problem = "a camera with lenses knows their index at its design wavelength alone, and has no bands"
-            raise Problem(problem, f"{faces[0]} refracts", "mirrors alone, or no bands", within=("bands",))
+    def _colours_through_named_glass(self) -> CameraSpec:
+        plain = [name for name, mirror in self.mirrors.items() if mirror.enters_glass and mirror.glass is None]
+        for key in ("bands", "spectrum"):
+            if plain and getattr(self, key):
+                problem = "an index alone says nothing of other wavelengths than the design's"
+                allowed = f"the glass of {plain[0]} by its name, or no {key}"
+                raise Problem(problem, f"index at {plain[0]}", allowed, within=(key,))
         return self
+
+    @model_validator(mode="after")
+    def _glasses_are_known(self) -> CameraSpec:
+        self._check_glasses()
+        return self
+
+    def _check_glasses(self) -> None:
+        """Refuse light at which a glass is not known. Raises Problem."""
+        lights: dict[tuple[str, ...], SpectrumSpec] = {
+            ("bands", name, "spectrum"): band.spectrum for name, band in self.bands.items()
+        }
+        if self.spectrum is not None:
+            lights["spectrum",] = self.spectrum
+        colours: dict[tuple[str, ...], tuple[float, ...]] = {("wavelength",): (self.wavelength,)}
+        # of a table that has not been read the wavelengths are not known yet
+        colours |= {key: light.ends for key, light in lights.items() if light.curve is not None or light.table is None}
+        for name, mirror in self.mirrors.items():
+            for key, wavelengths in colours.items() if mirror.glass is not None else ():
+                for wavelength in wavelengths:
+                    try:
+                        self.index_behind(name, wavelength)
+                    except ValueError as error:
+                        raise Problem(f"{name}: {error}", within=key) from None
+
+    def index_behind(self, name: str, wavelength: float | None = None) -> float:
+        """Refractive index behind a face of a lens, against what the lens stands in.
+
+        Args:
+            name: of the face.
+            wavelength: metres; the design wavelength by default.
+
+        Raises:
+            ValueError: its glass is not known there, or the face has an index alone and another wavelength is asked for
+                than that of the design.
+        """
+        mirror, colour = self.mirrors[name], self.wavelength if wavelength is None else wavelength
+        if mirror.glass is not None:
+            return mirror.glass.index(colour, self.medium or "vacuum")
+        if mirror.index is None:
+            raise ValueError(f"{name} is no face of a lens")
+        if mirror.enters_glass and colour != self.wavelength:
+            raise ValueError(f"{name}: its index is known at the design wavelength alone; name its glass")
+        return mirror.index
+
+    @property
+    def light(self) -> SpectrumSpec | None:
+        """Of which it is judged over all wavelengths: its own, or its panchromatic or first band's; None for none."""
+        if self.spectrum is not None or not self.bands:
+            return self.spectrum
+        return self.bands[PANCHROMATIC if PANCHROMATIC in self.bands else next(iter(self.bands))].spectrum
+
+    def with_curves(self) -> CameraSpec:
+        """Return the camera with the tables of its spectra read.
+
+        Raises:
+            InputError: a table is not there or not right, or has wavelengths at which a glass is not known.
+        """
+        bands = {
+            name: band.model_copy(update={"spectrum": band.spectrum.read(self, ("bands", name, "spectrum"))})
+            for name, band in self.bands.items()
+        }
+        own = None if self.spectrum is None else self.spectrum.read(self, ("spectrum",))
+        if own is self.spectrum and all(bands[name].spectrum is band.spectrum for name, band in self.bands.items()):
+            return self
+        read = self.model_copy(update={"bands": FrozenMap(bands), "spectrum": own})
+        try:
+            read._check_glasses()
+        except Problem as problem:
+            raise self.error(problem) from None
+        return read
 
     def require_mirrors(self, where: str, on_axis: bool = False) -> None:
         """Refuse a camera that is not made of mirrors alone.

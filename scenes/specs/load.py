@@ -177,7 +177,7 @@ def path_of_detector(instrument: InstrumentSpec) -> Path:
 
 def load_camera(name_or_path: str | Path) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    return load_named(CameraSpec, CAMERAS, name_or_path)
+    return load_named(CameraSpec, CAMERAS, name_or_path).with_curves()
 
 
 def load_detector(name_or_path: str | Path) -> DetectorSpec:

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs import load
-from scenes.specs.camera import CameraSpec
+from scenes.specs.camera import PANCHROMATIC, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
@@ -24,8 +24,6 @@ from scenes.yaml.yaml_file import YamlFile, dump_yaml, read_yaml
 
 TestType = TypeVar("TestType", bound=Spec)
 SetupType = TypeVar("SetupType", bound="ExperimentSetup")
-PANCHROMATIC = "P"
-"""Name of a camera's panchromatic band."""
 
 
 class ResolvedJob(Spec):

@@ -34,14 +34,47 @@ def batoid_camera(model: CameraModel, apertures: bool = False) -> Any:
     return batoid.CompoundOptic(items, name=model.spec.name)
 
 
-def batoid_rays(position: np.ndarray, direction: np.ndarray) -> Any:
+def batoid_lenses(model: CameraModel) -> Any:
+    """As ``batoid_camera``, with lenses whose glasses are Sellmeier's (formula 2, or of the catalogue) in air."""
+    import batoid
+
+    from optics.materials.glass import glass
+
+    air = batoid.ConstMedium(1.0)
+    items, inside = [], air
+    for name, surface in model.surfaces.items():
+        shape: Any = batoid.Plane()
+        if surface.curvature:
+            radius = 1.0 / surface.curvature
+            shape = batoid.Quadric(radius, surface.conic)
+            if surface.even:
+                shape = batoid.Asphere(radius, surface.conic, list(surface.even))
+        stand = batoid.CoordSys(origin=model.vertex(name))
+        face = model.spec.mirrors[name]
+        if face.light is None:
+            items.append(batoid.Mirror(shape, name=name, coordSys=stand))
+            continue
+        behind = air
+        if face.glass is not None:
+            b_and_c = face.glass.coefficients
+            own = None if b_and_c else glass(face.glass.name)
+            b, c = (b_and_c[0::2], b_and_c[1::2]) if own is None else (own.b, own.c)
+            behind = batoid.SellmeierMedium(*b, *c)
+        items.append(batoid.RefractiveInterface(shape, name=name, coordSys=stand, inMedium=inside, outMedium=behind))
+        inside = behind
+    stand = batoid.CoordSys(origin=[0.0, 0.0, model.spec.image.z])
+    items.append(batoid.Detector(batoid.Plane(), name=IMAGE, coordSys=stand))
+    return batoid.CompoundOptic(items, name=model.spec.name)
+
+
+def batoid_rays(position: np.ndarray, direction: np.ndarray, wavelength: float = 650e-9) -> Any:
     """A ``batoid.RayVector`` from arrays (N, 3); its time counts metres of optical path."""
     import batoid
 
     n = len(position)
     both = (position, np.broadcast_to(direction, position.shape))
     columns = [np.ascontiguousarray(a[:, i]) for a in both for i in range(3)]
-    return batoid.RayVector(*columns, np.zeros(n), np.full(n, 650e-9))
+    return batoid.RayVector(*columns, np.zeros(n), np.full(n, wavelength))
 
 
 def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:

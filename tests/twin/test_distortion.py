@@ -71,7 +71,7 @@ def test_images_are_those_of_the_general_renderer():
     light = (about_x @ b.middle)[None]
     (pupil,) = b.path.pupils(b.as_built, light, b.path.places(b.as_built, light))
     node, weight = np.polynomial.legendre.leggauss(9)
-    first, last = b.ccd.band.spectrum
+    first, last = b.ccd.band.spectrum.ends
     wavelengths = first + 0.5 * (last - first) * (node + 1.0)
     table = TransferTable.build(pupil, wavelengths, weight)
     target = pinhole(test.pinhole).mapped(b.path.local_map(b.as_built, light[0], test.pinhole))

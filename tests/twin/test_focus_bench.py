@@ -218,7 +218,7 @@ def test_diffraction_factor_against_an_unaberrated_circle(middle, budget) -> Non
         imager = site.imagers[line.edge]
         wavelength, weight = band_wavelengths(imager.ccd.band)
         cutoff = imager.optics.cutoff * wavelength.min() / wavelength
-        cutoff *= imager.ccd.band.spectrum[0] / wavelength.min()
+        cutoff *= imager.ccd.band.spectrum.ends[0] / wavelength.min()
         s = site.nyquist / cutoff
         circle = 2.0 / np.pi * (np.arccos(s) - s * np.sqrt(1.0 - s * s))
         expected = float(np.sum(weight * circle) / np.sum(weight))

@@ -25,6 +25,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.scenery import build_scenery
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.load import load_camera, load_instrument
+from scenes.specs.spectrum import SpectrumSpec
 from twin.monitor.image_quality import image_quality
 from twin.monitor.monitor_beams import CcdRays
 from twin.monitor.monitor_path import MonitorPath
@@ -226,7 +227,7 @@ def redder(instrument: Instrument, size: float) -> Instrument:
     cameras = {}
     for name, model in instrument.cameras.items():
         bands = {
-            key: band.model_copy(update={"spectrum": tuple(size * w for w in band.spectrum)})
+            key: band.model_copy(update={"spectrum": SpectrumSpec.evenly(*(size * w for w in band.spectrum.ends))})
             for key, band in model.spec.bands.items()
         }
         cameras[name] = replace(model, spec=model.spec.model_copy(update={"bands": bands}))

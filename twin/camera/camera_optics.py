@@ -33,7 +33,14 @@ from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import ROOT, CameraModel, camera_alone, derive_camera, field_direction
+from scenes.models.camera_model import (
+    ROOT,
+    CameraModel,
+    camera_alone,
+    derive_camera,
+    field_direction,
+    lenses,
+)
 from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
@@ -215,8 +222,10 @@ class Mtf:
         frequency: cycles/m, (M,).
         values: along the line and along the track, (2, M).
         limit: the same pupil without wavefront error, (2, M).
-        wavelengths: of the light, metres, (K,); equal weights if evenly spaced over a band.
+        wavelengths: of the light, metres, (K,).
         nyquist: of the pixels, cycles/m.
+        weights: signal at each wavelength, sum 1, (K,).
+        error: by how much the values change at most where more wavelengths are taken; 0 for lines.
     """
 
     field: Field
@@ -225,6 +234,8 @@ class Mtf:
     limit: np.ndarray
     wavelengths: np.ndarray
     nyquist: float
+    weights: np.ndarray
+    error: float = 0.0
 
     @property
     def at_nyquist(self) -> np.ndarray:
@@ -258,10 +269,12 @@ class CameraOptics:
     Attributes:
         path: its way from the scene to the line CCD.
         state: motions of bodies, with heat; empty as designed.
+        colour: wavelength of the light, metres; None for that of the design.
     """
 
     path: TargetPath
     state: State = field(default_factory=FrozenMap)
+    colour: float | None = None
 
     @classmethod
     def alone(cls, camera: CameraSpec | CameraModel, backend: Backend, state: State | None = None) -> Self:
@@ -298,6 +311,22 @@ class CameraOptics:
     def in_state(self, state: State) -> Self:
         """Return the camera in another state."""
         return replace(self, state=FrozenMap(state))
+
+    def at(self, wavelength: float) -> Self:
+        """Return the camera in light of another wavelength, metres.
+
+        Lenses have their index there; wavefront errors are in waves of it.
+
+        Raises:
+            ValueError: a lens whose glass is not named, or not known there.
+        """
+        self.path.coloured(self.state, wavelength)
+        return replace(self, colour=wavelength)
+
+    @property
+    def wavelength(self) -> float:
+        """Of the light, metres."""
+        return float(self.model.spec.wavelength if self.colour is None else self.colour)
 
     @property
     def model(self) -> CameraModel:
@@ -348,7 +377,7 @@ class CameraOptics:
         Raises:
             AimError, BeamMissedError: the state brings the light off the stop or off the line CCD's plane.
         """
-        return self.path.rays(self.state, self.directions(fields), points)
+        return self.path.rays(self.path.coloured(self.state, self.wavelength), self.directions(fields), points)
 
     @one_blas_thread()  # of small matrices: threads would only wait for each other
     def wavefronts(
@@ -363,7 +392,7 @@ class CameraOptics:
         within = np.stack([nodes.x, nodes.y], axis=-1)
         stop = np.concatenate([[[0.0, 0.0]], within, edge, INSIDE * np.stack([x[inside], y[inside]], axis=-1)])
         rays = self.rays(fields, stop)
-        wavelength = self.model.spec.wavelength
+        wavelength = self.wavelength
         error = -self._path(rays) / wavelength
         out = []
         own = slice(1, 1 + nodes.count)
@@ -435,7 +464,7 @@ class CameraOptics:
                     rms=float(np.sqrt(np.sum(spread))),
                     rms_along=np.sqrt(spread),
                     farthest=float(np.max(np.linalg.norm(hexapolar - centroid, axis=-1))),
-                    airy=0.61 * self.model.spec.wavelength / round_aperture(leaving[k, -len(rings[-1]) :, :2]),
+                    airy=0.61 * self.wavelength / round_aperture(leaving[k, -len(rings[-1]) :, :2]),
                     place=self._place(rays, k),
                 )
             )
@@ -475,7 +504,7 @@ class CameraOptics:
                 way = dz * np.sign(along) / along
                 place = rays.position + way[..., None] * rays.direction
                 path = path_to_sphere(place, rays.direction, rays.path + way, place[:, :1], radius)
-                error = (path[:, 1:] - path[:, :1]) / self.model.spec.wavelength
+                error = (path[:, 1:] - path[:, :1]) / self.wavelength
                 tilt = np.linalg.solve(weighted @ level, weighted @ error[..., None])
                 rows.append(np.sqrt(np.sum(share * (error - np.squeeze(level @ tilt, -1)) ** 2, axis=-1)))
             out.append(np.stack(rows, axis=-1))
@@ -484,13 +513,16 @@ class CameraOptics:
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Exit pupils as the images of fields (F, 2) see them, axes along the line and along the track.
 
+        They are about the places of the design wavelength's chief rays, whatever the light's: so the colours of an
+        image that stand apart do so in its pupils.
+
         Raises:
             AimError, BeamMissedError: as ``rays``.
             ValueError: a pupil that edges cut into too many pieces, or a wavefront too rough for its polynomials.
         """
         light = self.directions(fields)
         places = self.path.places(self.state, light)
-        pupils = self.path.pupils(self.state, light, places)
+        pupils = self.path.pupils(self.state, light, places, wavelength=self.wavelength)
         hold_within("the light that a pupil's shadow leaves", np.array([p.light for p in pupils]), 0.0, 1.0, ROUNDING)
         if self.model.edges:
             nodes = stop_nodes(self.model, RINGS, True)
@@ -520,27 +552,44 @@ class CameraOptics:
         Raises:
             AimError, BeamMissedError, ValueError: as ``pupils``.
         """
-        colours = np.array([self.model.spec.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
+        colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
-        pupils = self.pupils(fields)
+        pupils = self.colour_pupils(fields, colours)
         if frequency is None:
-            cutoff = max(float(np.max(pupil.cutoff(np.eye(2), float(np.min(colours))))) for pupil in pupils)
+            cutoff = max(
+                float(np.max(pupil.cutoff(np.eye(2), float(np.min(colours))))) for each in pupils for pupil in each
+            )
             frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), 65)
         both = np.concatenate([frequency[:, None] * axis for axis in np.eye(2)])
         out = []
-        for where, pupil in zip(np.asarray(fields, dtype=np.float64), pupils, strict=True):
-            perfect = replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms))
+        for where, own in zip(np.asarray(fields, dtype=np.float64), pupils, strict=True):
+            perfect = [replace(pupil, eikonal_terms=np.zeros_like(pupil.eikonal_terms)) for pupil in own]
             values, limit = (
-                np.abs(polychromatic_transfer(one, both, colours, shares, np.zeros(1))[0]).reshape(2, -1)
-                for one in (pupil, perfect)
+                np.abs(
+                    polychromatic_transfer(one if len(one) > 1 else one[0], both, colours, shares, np.zeros(1))[0]
+                ).reshape(2, -1)
+                for one in (own, perfect)
             )
-            own = (float(where[0]), float(where[1]))
-            out.append(Mtf(own, frequency, values, limit, colours, self.nyquist))
+            place = (float(where[0]), float(where[1]))
+            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)))
             _hold_mtf(out[-1])
         return tuple(out)
 
+    def colour_pupils(
+        self, fields: Sequence[Field] | np.ndarray, wavelengths: np.ndarray
+    ) -> list[tuple[PupilFunction, ...]]:
+        """Pupils of every field (F, 2): of each one for every wavelength (K,), metres, or one alone that serves all,
+        where the camera has no lenses.
+
+        Raises:
+            AimError, BeamMissedError, ValueError: as ``pupils``.
+        """
+        if not lenses(self.model.spec):
+            return [(pupil,) for pupil in self.at(float(np.min(wavelengths))).pupils(fields)]
+        return list(zip(*(self.at(float(colour)).pupils(fields) for colour in wavelengths), strict=True))
+
     def mtf(self, field: Field = (0.0, 0.0), frequency: np.ndarray | None = None) -> Mtf:
-        """MTF at one field and the design wavelength, as ``mtfs``."""
+        """MTF at one field and the wavelength of the light, as ``mtfs``."""
         return self.mtfs([field], frequency)[0]
 
     def _path(self, rays: LineRays) -> np.ndarray:

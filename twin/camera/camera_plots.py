@@ -143,6 +143,83 @@ def mtf_figure(run: CameraRun) -> Figure:
     return figure
 
 
+def lateral_figure(run: CameraRun) -> Figure:
+    """Place of every wavelength's chief ray from the reference's, along the line and along the track."""
+    colours = run.colours
+    assert colours is not None
+    assert colours.lateral is not None
+    figure = new_figure(3.3)
+    axes = figure.subplots(1, 2, sharey=True)
+    nm = 1e9 * colours.wavelengths
+    for direction, (one, name) in enumerate(zip(axes, ("along the line", "along the track"), strict=True)):
+        for f, colour in zip(range(len(colours.fields)), _FIELD_COLOURS, strict=True):
+            text = degrees_text(run, colours.fields[f])
+            one.plot(nm, 1e6 * colours.lateral[f, :, direction], color=colour, lw=1.3, label=text, marker=_mark(nm))
+        _over_light(one, run, f"place {name}")
+    axes[0].set_ylabel(f"from the reference wavelength, {MICRO}")
+    axes[0].legend(fontsize=7.0, title="field", title_fontsize=7.5)
+    return figure
+
+
+def axial_figure(run: CameraRun) -> Figure:
+    """Best focus by wavelength, field by field."""
+    colours = run.colours
+    assert colours is not None
+    assert colours.axial is not None
+    figure = new_figure(3.3)
+    axes = figure.subplots()
+    nm = 1e9 * colours.wavelengths
+    for f, colour in zip(range(len(colours.fields)), _FIELD_COLOURS, strict=True):
+        text = degrees_text(run, colours.fields[f])
+        axes.plot(nm, 1e6 * colours.axial[f], color=colour, lw=1.3, label=text, marker=_mark(nm))
+    _over_light(axes, run, "best focus")
+    axes.set_ylabel(f"from the focal plane, {MICRO}")
+    axes.legend(fontsize=7.0, title="field", title_fontsize=7.5)
+    return figure
+
+
+def _mark(wavelengths: np.ndarray) -> str:
+    """Dots where so few wavelengths stand that they are lines."""
+    return "o" if len(wavelengths) < 12 else ""
+
+
+def _over_light(axes: Axes, run: CameraRun, title: str) -> None:
+    assert run.colours is not None
+    axes.axhline(0.0, color=LIGHT, lw=0.8, zorder=0)
+    axes.axvline(1e9 * run.colours.reference, color=GREY, lw=0.8, ls=":")
+    axes.set_title(title)
+    axes.set_xlabel("wavelength, nm")
+    plain_axes(axes)
+
+
+def light_mtf_figure(run: CameraRun) -> Figure:
+    """MTF curves over the light, and images of points, of five fields."""
+    assert run.colours is not None
+    figure = new_figure(5.2)
+    rows = figure.subplots(2, len(run.colours.fields))
+    for k, (mtf, psf) in enumerate(zip(run.colours.mtfs, run.colours.psfs, strict=True)):
+        upper, lower = rows[:, k]
+        draw_mtf(upper, mtf, label=k == 0)
+        upper.set_title(degrees_text(run, mtf.field), fontsize=8.5)
+        um = 1e6 * psf.place
+        lower.pcolormesh(
+            um, um, np.sqrt(np.maximum(psf.values, 0.0)), cmap="YlGnBu", shading="nearest", rasterized=True
+        )
+        # as far as there is a thousandth of the peak
+        lit = np.abs(um)[np.max(psf.values, axis=0) + np.max(psf.values, axis=1) > 1e-3 * np.max(psf.values)]
+        lower.set_xlim(-np.max(lit), np.max(lit))
+        lower.set_ylim(-np.max(lit), np.max(lit))
+        lower.set_aspect("equal")
+        lower.set_title(f"Strehl {psf.strehl:.2f}", fontsize=8.0)
+        lower.set_xlabel(MICRO)
+        for one in (upper, lower):
+            one.tick_params(labelsize=7)
+    rows[0, 0].legend(fontsize=6.5)
+    rows[0, 0].set_ylabel("MTF of the optics")
+    rows[1, 0].set_ylabel(f"along the track, {MICRO}")
+    return figure
+
+
 def focus_figure(run: CameraRun) -> Figure:
     """Wavefront error and MTF at Nyquist through focus, field by field."""
     focus = run.focus

@@ -13,6 +13,7 @@ from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verdict
+from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER
 from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
@@ -33,6 +34,7 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
     moved, done = refocus_text(run), perturbed_text(run)
     told, more = answer(*verdict(run), "see the wavefronts and the layout")
     sections = [_layout(run), *([_refocus(run)] if moved else []), _wavefronts(run), _spots(run), _mtf(run)]
+    sections += [*_colours(run)]
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
@@ -221,6 +223,67 @@ def _mtf(run: CameraRun) -> Section:
     return Section(
         "MTF", (text,), (figure, Table("mtf-nyquist", "MTF at Nyquist", "", heads, rows, (None, 3, 3, 3, 3)))
     )
+
+
+def _colours(run: CameraRun) -> list[Section]:
+    """Lateral and axial colour of a camera with lenses, then what all wavelengths together make."""
+    colours = run.colours
+    if colours is None:
+        return []
+    ends = " to ".join(f"{1e9 * w:.6g}" for w in colours.spectrum.ends)
+    return [*_lenses(run, colours, ends), _light(run, colours, ends)]
+
+
+def _lenses(run: CameraRun, colours: Colours, ends: str) -> list[Section]:
+    lateral, second = colours.lateral_primary, colours.lateral_secondary
+    axial, other = colours.axial_primary, colours.axial_secondary
+    if colours.lateral is None or lateral is None or second is None or axial is None or other is None:
+        return []
+    rows: list[list[Cell]] = [
+        [plots.degrees_text(run, place), *(float(1e6 * v) for v in (*lateral[f], *second[f], axial[f], other[f]))]
+        for f, place in enumerate(colours.fields)
+    ]
+    heads = ("field", "lateral, line [µm]", "lateral, track [µm]", "secondary, line [µm]", "secondary, track [µm]",
+             "axial [µm]", "secondary [µm]")  # fmt: skip
+    widest = float(np.max(np.linalg.norm(np.ptp(colours.lateral, axis=1), axis=-1)))
+    text = (
+        f"Light of {ends} nm, reference {1e9 * colours.reference:.6g} nm. Chief rays of one field spread over "
+        f"{1e6 * widest:.3g} µm at most, {widest / run.camera.line.pitch:.2g} pixels. In the middle of the field the "
+        f"focus of the shortest wavelength lies {1e6 * axial[0]:+.4g} µm from that of the longest, that of the "
+        f"reference {1e6 * other[0]:+.4g} µm from the middle of both."
+    )
+    about = (
+        "Where the chief ray of a wavelength meets the focal plane, from that of the reference; dotted the reference."
+    )
+    along = "Least rms wavefront error of each wavelength by itself; positive is downstream, away from the optics."
+    caption = "Primary: shortest less longest wavelength. Secondary: reference less the middle of both."
+    figures = (
+        _figure("lateral-colour", "Lateral colour", about, plots.lateral_figure, run),
+        _figure("axial-colour", "Axial colour", along, plots.axial_figure, run),
+        Table("colour", "Colour by field", caption, heads, rows, (None, *[3] * 6)),
+    )
+    return [Section("Colour", (text,), figures)]
+
+
+def _light(run: CameraRun, colours: Colours, ends: str) -> Section:
+    title = "Over all wavelengths"
+    if not colours.mtfs:
+        return Section(title, (f"No MTF is told {colours.without_mtf or run.without_mtf}.",))
+    rows: list[list[Cell]] = []
+    for mtf, psf in zip(colours.mtfs, colours.psfs, strict=True):
+        limits = [float(np.interp(mtf.nyquist, mtf.frequency, row)) for row in mtf.limit]
+        rows.append([plots.degrees_text(run, mtf.field), *map(float, mtf.at(mtf.nyquist)), *limits, float(psf.strehl)])
+    heads = ("field", "along line", "along track", "limit along line", "limit along track", "Strehl ratio")
+    count = len(colours.mtfs[0].wavelengths)
+    exact = "lines, summed exactly" if colours.spectrum.lines else f"right to {colours.error:.1g}"
+    text = (
+        f"Light of {ends} nm, as the spectrum weighs it, at {count} wavelengths: {exact}. All wavelengths are about "
+        "one point of the image, so that colours which stand apart blur it."
+    )
+    caption = "MTF by field; below, the image of a point, its square root in colours, about the design's chief ray."
+    figure = _figure("light-mtf", "MTF and point images", caption, plots.light_mtf_figure, run)
+    table = Table("light-mtf-nyquist", "MTF at Nyquist over the light", "", heads, rows, (None, 3, 3, 3, 3, 3))
+    return Section(title, (text,), (figure, table))
 
 
 def _through_focus(run: CameraRun) -> Section:

@@ -28,6 +28,7 @@ from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
 from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
+from twin.camera.colour import COLOURS, Colours, colour_data, judge_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.monitor.image_quality import CameraQuality, image_quality
 from twin.monitor.truth import trace_truth
@@ -136,6 +137,7 @@ class CameraRun:
         refocus: what refocusing did, None where nobody asked.
         perturbed: what was done to it, None for a camera as designed.
         quality: of a camera in an instrument: what its bodies take of the beam.
+        colours: over the light of its spectrum or band; None where neither is described.
     """
 
     setup: CameraSetup
@@ -154,6 +156,7 @@ class CameraRun:
     refocus: Refocus | None = None
     perturbed: Perturbed | None = None
     quality: CameraQuality | None = None
+    colours: Colours | None = None
 
     @cached_property
     def worst(self) -> tuple[float, Field]:
@@ -243,6 +246,11 @@ def run_camera(
     focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
     curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
+    colours, light = None, camera.light
+    if light is not None and light.ends[0] < light.ends[1]:
+        advance("colours", 0, 1)
+        colours = judge_colours(optics, backend, light, MTF_FIELDS, bool(mtfs))
+        advance("colours", 1, 1)
     return CameraRun(
         setup=setup,
         camera=camera,
@@ -260,6 +268,7 @@ def run_camera(
         refocus=moved,
         perturbed=done,
         quality=quality,
+        colours=colours,
     )
 
 
@@ -444,6 +453,7 @@ CAMERA: Record[CameraRun] = Record(
     Quantity("first_order", lambda run: run.first_order, record=FIRST_ORDER),
     Quantity("fields", _field_numbers, "wavefront and spot, field by field"),
     Quantity("mtf_at_nyquist", lambda run: run.mtfs, record=_MTF),
+    Quantity("colours", lambda run: run.colours, "over all wavelengths", record=COLOURS, where_known=True),
     Quantity("distortion", lambda run: run.distortion, record=_DISTORTION),
     Quantity("refocus", lambda run: run.refocus, record=_REFOCUS),
     Quantity("perturbed", lambda run: run.perturbed, record=_PERTURBED),
@@ -504,5 +514,9 @@ def camera_data(run: CameraRun) -> xr.Dataset:
         data["mtf_limit"] = (mtf, np.stack([m.limit for m in run.mtfs]), named("the same without wavefront error"))
         about = named("spatial frequency in the image, cycles per length", {"units": "1/m"})
         coords["frequency"] = ("frequency", run.mtfs[0].frequency, about)
+    if run.colours is not None:
+        own_data, own_coords = colour_data(run.colours)
+        data |= own_data
+        coords |= own_coords
     told = {"title": "wavefronts, MTF and distortion of a camera over its field"}
     return xr.Dataset(data, coords, {**told, "reference_frames": frames_text("optics")})

@@ -102,7 +102,7 @@ def _bench_facts(run: SimulatedFocus) -> tuple[tuple[str, str], ...]:
     setup = run.bench.setup
     test, camera = setup.test, setup.camera
     bands = ", ".join(
-        f"{name} {1e9 * b.spectrum[0]:.0f}–{1e9 * b.spectrum[1]:.0f} nm, {UM_PER_M * b.pitch:g} µm"
+        f"{name} {1e9 * b.spectrum.ends[0]:.0f}–{1e9 * b.spectrum.ends[1]:.0f} nm, {UM_PER_M * b.pitch:g} µm"
         for name, b in camera.bands.items()
     )
     level = test.white

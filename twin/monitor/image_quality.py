@@ -13,7 +13,7 @@ bodies of the instrument take of the beam (``scenes.models.shadow``) is missing 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,14 +33,14 @@ from optics.numerics.threads import one_blas_thread
 from optics.raytrace.aim import AimError
 from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
-from optics.raytrace.system import assemble
+from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
-from scenes.models.camera_model import LAUNCH_DISTANCE, line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import (
     ImagingShadows,
@@ -53,6 +53,7 @@ from scenes.models.shadow import (
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
+from scenes.specs.spectrum import SpectrumSpec
 from twin.sensors.line_ccd import band_factors
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
@@ -231,7 +232,6 @@ def image_quality(
         reasons = [""] * len(states)
         for start in range(0, len(states), AT_ONCE):
             bench.fill(list(states), np.arange(start, min(start + AT_ONCE, len(states))), out, reasons)
-        light = (float(np.min(bench.spectrum)), float(np.max(bench.spectrum)))
         cameras[name] = CameraQuality(
             wfe=out[0],
             wfe_refocused=out[1],
@@ -240,7 +240,7 @@ def image_quality(
             mtf_along_track=out[4],
             light_lost=out[5],
             nyquist=bench.nyquist,
-            wavelengths=light,
+            wavelengths=bench.ends,
             reasons=tuple(reasons),
             bodies=FrozenMap(bench.bodies(len(states))),
             pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
@@ -257,6 +257,23 @@ def quality_dicts(
 
 _COLUMNS = 6
 """Arrays of ``CameraQuality``, in its order."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Traced:
+    """Beams of B images.
+
+    Attributes:
+        rays: at the design wavelength.
+        size: of the line CCD in each, (B,).
+        shadows: in them; None for free beams.
+        again: the same beams in light of another wavelength, metres.
+    """
+
+    rays: ImagingRays
+    size: np.ndarray
+    shadows: Shadows | None
+    again: Callable[[float], ImagingRays]
 
 
 class _CameraBench:
@@ -285,10 +302,9 @@ class _CameraBench:
         self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
         self.nyquist = 0.5 / line.pitch
         self.frequency = self.nyquist * np.eye(2)
-        self.spectrum = (spec.wavelength, spec.wavelength) if band is None else band.spectrum
-        first, last = self.spectrum
-        node, self.weights = quadrature.gauss(COLOURS if last > first else 1)
-        self.colours = 0.5 * (first + last) + 0.5 * (last - first) * node
+        light = SpectrumSpec.evenly(spec.wavelength, spec.wavelength) if band is None else band.spectrum
+        self.ends = light.ends
+        self.colours, self.weights = light.rule(COLOURS)
         x, y = self.frequency.T
         if band is None:
             self.detector = np.sinc(line.pitch * x) * np.sinc(line.pitch * y)
@@ -298,6 +314,7 @@ class _CameraBench:
         assert isinstance(stop, Circle)
         self.stop = stop
         # edges leave rays in the dark, where the wavefront may bend more
+        self.refracts = len(self.colours) > 1 and bool(lenses(spec))
         self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
         self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
         self.nodes = quadrature.disk(EDGED_RINGS if self.model.edges else RINGS)
@@ -307,7 +324,7 @@ class _CameraBench:
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
         """Work out some states; where the light of one is lost, both halves by themselves."""
         try:
-            rays, size, shadows = self._trace([states[s] for s in which])
+            traced = self._trace([states[s] for s in which])
         except (AimError, BeamMissedError, UnphysicalError) as error:
             if len(which) == 1:
                 reasons[which[0]] = str(error)
@@ -316,7 +333,7 @@ class _CameraBench:
             self.fill(states, which[:half], out, reasons)
             self.fill(states, which[half:], out, reasons)
             return
-        values, dark, rough = self._numbers(rays, size, shadows, which)
+        values, dark, rough = self._numbers(traced, which)
         count = len(self.points)
         out[:, which] = values.reshape(len(values), len(which), count)
         for k, s in enumerate(which):
@@ -341,8 +358,8 @@ class _CameraBench:
                 out.setdefault(body, known.copy())[which] = share.reshape(len(which), -1)
         return dict(sorted(out.items()))
 
-    def _trace(self, states: list[State]) -> tuple[ImagingRays, np.ndarray, Shadows | None]:
-        """Beams to the line CCD, state by state and field by field, for each the CCD's size, (B,), and the shadows.
+    def _trace(self, states: list[State]) -> _Traced:
+        """Beams to the line CCD, state by state and field by field.
 
         Raises:
             AimError, BeamMissedError: the light of some state is lost.
@@ -357,23 +374,29 @@ class _CameraBench:
         points = points_to_world(placed, self.body, self.points).real
         places, sight = chief_rays(self.backend, to_stop, to_object, points, guess, axis)
         every = np.repeat(np.arange(len(states)), len(self.points))
-        imaging, forward = (
-            assemble(assembly, [f"{name}/{way}"], states, placed=placed).take(every) for way in ("imaging", "to_stop")
-        )
         launch = (places + LAUNCH_DISTANCE * sight).reshape(-1, 3)
         heading = -sight.reshape(-1, 3)
-        rays = imaging_rays(self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis)
+
+        def sent(colour: float) -> tuple[SystemBatch, ImagingRays]:
+            own = [coloured(self.model.spec, f"{BASE}/{name}", state, colour) for state in states]
+            imaging, forward = (
+                assemble(assembly, [f"{name}/{way}"], own, placed=placed).take(every) for way in ("imaging", "to_stop")
+            )
+            return imaging, imaging_rays(
+                self.backend, imaging, forward, heading, launch, self.stop, self.nodes, first=axis
+            )
+
+        imaging, rays = sent(self.model.spec.wavelength)
         beams = TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
         if self.model.edges:
             free = no_shadows(len(every)) if shadows is None else shadows
             shadows = free.and_edges(edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
-        return rays, imaging.size, shadows
+        return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
-    def _numbers(
-        self, rays: ImagingRays, size: np.ndarray, shadows: Shadows | None, which: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (_COLUMNS, B), the share of each beam that is cut, and whether an MTF is not to be had."""
+        rays, size, shadows = traced.rays, traced.size, traced.shadows
         origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
         radius = float(self.model.first_order.exit_pupil_distance[0])
         error = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
@@ -389,27 +412,21 @@ class _CameraBench:
         pieces = None if shadows is None else shadows.pieces
         lit = np.flatnonzero(dark == 0.0)
         if len(lit):
-            # the image's first axis runs along the line, Y', the second along the track, X'
-            # per length of the nominal CCD, in which the pixels keep their pitch
-            v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
-            path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
             taken = None if pieces is None else pieces[lit]
             free = None
             if self.model.edges and taken is not None:
                 free = ~covered(taken, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
-            colour = float(np.min(self.colours))
-            for degree in self.degrees:
-                pupils = PupilStack.fit(
-                    u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides, free
-                )
-                if np.all(pupils.residual <= CUT_RESIDUAL * colour):
-                    break
-            smooth = pupils.residual <= WORST_RESIDUAL * colour
+            pupils, smooth = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
-                smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
-                otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                if self.refracts:
+                    otf, smooth = self._in_colours(traced, origin, lit, taken, free)
+                    good = good[smooth[good]]
+                    otf = otf[good]
+                else:
+                    smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
+                    otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
                 hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
@@ -418,6 +435,43 @@ class _CameraBench:
         values = np.stack([wfe, refocused, defocus, *mtf, lost])
         self._hold(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
+
+    def _pupils(
+        self,
+        rays: ImagingRays,
+        size: np.ndarray,
+        origin: np.ndarray,
+        lit: np.ndarray,
+        taken: np.ndarray | None,
+        free: np.ndarray | None,
+        colour: float,
+    ) -> tuple[PupilStack, np.ndarray]:
+        """Pupils of the beams ``lit``, and which of them are smooth for light of a wavelength, metres."""
+        # the image's first axis runs along the line, Y', the second along the track, X'
+        # per length of the nominal CCD, in which the pixels keep their pitch
+        v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
+        path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
+        for degree in self.degrees:
+            pupils = PupilStack.fit(
+                u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides, free
+            )
+            if np.all(pupils.residual <= CUT_RESIDUAL * colour):
+                break
+        return pupils, pupils.residual <= WORST_RESIDUAL * colour
+
+    def _in_colours(
+        self, traced: _Traced, origin: np.ndarray, lit: np.ndarray, taken: np.ndarray | None, free: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Transfer functions of beams through lenses, complex (B, M): each wavelength by its own rays, all about one
+        place, so that lateral colour blurs; and which are smooth at all wavelengths.
+        """
+        total, smooth = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
+        for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
+            rays = traced.again(float(colour))
+            pupils, good = self._pupils(rays, traced.size, origin, lit, taken, free, float(colour))
+            smooth &= good & (pupils.bend <= WORST_BEND)
+            total += weight * pupils.transfer(self.frequency, np.array([colour]), np.ones(1))
+        return total, smooth
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
         """Hold numbers (_COLUMNS, B) to what any camera has.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.spots.noise import NoiseModel
-from optics.numerics.quadrature import gauss
 from twin.sensors.area_detector import EmvaDetector, FixedPattern
 
 if TYPE_CHECKING:
@@ -23,10 +22,9 @@ _SIGMAS = 5.0
 
 
 def band_wavelengths(band: BandSpec) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre wavelengths (K,), metres, and their weights, for light that is evenly spread over the band."""
-    first, last = band.spectrum
-    node, weight = gauss(2 + int(np.ceil((last - first) / WIDEST_STEP)) if last > first else 1)
-    return 0.5 * (first + last) + 0.5 * (last - first) * node, 0.5 * weight
+    """Gauss' wavelengths (K,), metres, and their weights, which sum to 1, for means over the band's signal."""
+    first, last = band.spectrum.ends
+    return band.spectrum.rule(2 + int(np.ceil((last - first) / WIDEST_STEP)))
 
 
 def band_factors(band: BandSpec, fx: np.ndarray, fy: np.ndarray) -> dict[str, np.ndarray]:

@@ -83,7 +83,7 @@ class EdgeOptics:
     @classmethod
     def build(cls, pupil: PupilFunction, band: BandSpec, normal: np.ndarray, reach: float = TABLE_REACH) -> EdgeOptics:
         """Work the table out for defocus up to +-reach, metres."""
-        cutoff = float(pupil.cutoff(normal[None], band.spectrum[0])[0])
+        cutoff = float(pupil.cutoff(normal[None], band.spectrum.ends[0])[0])
         steps = max(int(np.ceil(reach / DEFOCUS_STEP)), 3)
         defocus = np.linspace(-reach, reach, 2 * steps + 1)
         samples = _samples(pupil, band, normal, cutoff, defocus)
@@ -248,7 +248,7 @@ class View:
         angle = np.linspace(0.0, np.pi, 64, endpoint=False)
         ways = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         # between the directions the cut-off of a smooth pupil is higher by less than 1e-3
-        return 1.001 * float(np.max(self.pupil.cutoff(ways, self.band.spectrum[0])))
+        return 1.001 * float(np.max(self.pupil.cutoff(ways, self.band.spectrum.ends[0])))
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupi
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
 from optics.waves.transfer import with_nodes_enough
-from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, line_body
+from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
 
 RINGS = 14
@@ -151,6 +151,15 @@ class TargetPath:
         )
         return np.asarray(-sight[0])
 
+    def coloured(self, state: State, wavelength: float) -> State:
+        """The state as light of another wavelength (metres) than the design's meets it, see
+        ``scenes.models.camera_model.coloured``.
+
+        Raises:
+            ValueError: a lens whose glass is not named, or not known there.
+        """
+        return coloured(self.model.spec, self.root, state, wavelength)
+
     def places(self, state: State, directions: np.ndarray) -> np.ndarray:
         """Where chief rays of directions (F, 3) meet the line CCD, (F, 2) (along, across).
 
@@ -219,7 +228,12 @@ class TargetPath:
         return placed, systems, rays
 
     def pupils(
-        self, state: State, directions: np.ndarray, places: np.ndarray, target_shift: float = 0.0
+        self,
+        state: State,
+        directions: np.ndarray,
+        places: np.ndarray,
+        target_shift: float = 0.0,
+        wavelength: float | None = None,
     ) -> tuple[PupilFunction, ...]:
         """Pupil of the image of each direction (F, 3), about its own place (F, 2) on the line CCD.
 
@@ -228,19 +242,23 @@ class TargetPath:
         Args:
             state: of the assembly.
             directions: of the light, world.
-            places: as ``places`` gives them for the same state.
+            places: as ``places`` gives them for the same state; what they are at the design wavelength is what all
+                colours of an image count from.
             target_shift: of the collimator's target, see ``Collimator.path``.
+            wavelength: of the light, metres; the design wavelength by default.
 
         Raises:
             BeamMissedError, AimError: the beam does not get through.
-            ValueError: it is vignetted.
+            ValueError: it is vignetted, or a glass is not known at that wavelength.
         """
+        colour = self.model.spec.wavelength if wavelength is None else wavelength
+        state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions)
         taken, _ = self._taken(placed, systems, rays, directions)
         origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
         collimator = self.collimator
         incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
-        field = pupil_field(rays, self.model.spec.wavelength, origin, incoming)
+        field = pupil_field(rays, colour, origin, incoming)
         turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
         turned = turned.in_lengths_of(systems.size)
         if not self.model.edges or taken is None:

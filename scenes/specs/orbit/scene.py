@@ -8,8 +8,9 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from optics.geometry.polygon import area, hull, intersect, sides
 from optics.numerics.frozen_map import FrozenMap
-from scenes.specs.camera import Diffusion, Spectrum, TdiSpec
+from scenes.specs.camera import Diffusion, TdiSpec
 from scenes.specs.orbit.angle import GroundSigma, TerrainHeight
+from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem
 from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector
@@ -87,7 +88,7 @@ class LineImageSpec(Spec):
     transmission: Annotated[Number, Field(gt=0.0, le=1.0)] = 0.8
     wavefront: Annotated[dict[EvenTerm, TermSize], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     obstruction: Annotated[tuple[Outline, ...], AfterValidator(_apart)] = ()
-    spectrum: Spectrum
+    spectrum: WavelengthRange
     detector: Reference
     diffusion: Diffusion = 0.0
     tdi: TdiSpec = TdiSpec()

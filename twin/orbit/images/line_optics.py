@@ -21,11 +21,13 @@ from scipy import constants, fft
 
 from optics.geometry.polygon import area
 from optics.geometry.zernike import cartesian_terms
+from optics.materials.black_body import black_body_photons
 from optics.waves.pupil_shadow import PupilShadow, separate
 from optics.waves.pupil_stack import PupilFunction, circular_pupil
 from optics.waves.transfer import TransferTable
 from scenes.specs.camera import BandSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
+from scenes.specs.spectrum import SpectrumSpec
 from twin.orbit.flight.sensor import Sensor
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 
@@ -131,7 +133,7 @@ class LineOptics:
             offset=0.0,
             pixels=pixels,
             pitch=pitch,
-            spectrum=image.spectrum,
+            spectrum=SpectrumSpec.evenly(*image.spectrum),
             detector=image.detector,
             diffusion=image.diffusion,
             tdi=image.tdi.model_copy(update={"line_time": line_time}),
@@ -146,9 +148,9 @@ class LineOptics:
         """Photons on a pixel over all stages from ground of apparent reflectance 1: the Sun as a black body at 1 au, a
         Lambertian ground, and pi/(4 F^2) of its radiance on the pixel, less what stands before the lens.
         """
-        first, last = self.ccd.band.spectrum
+        first, last = self.ccd.band.spectrum.ends
         wavelength, weight = band_wavelengths(self.ccd.band)
-        radiance = _black_body_photons(wavelength) * (SUN_RADIUS / constants.au) ** 2
+        radiance = black_body_photons(wavelength, SUN_TEMPERATURE) * (SUN_RADIUS / constants.au) ** 2
         band = float(weight @ radiance) * (last - first)
         tdi, pitch = self.ccd.band.tdi, self.ccd.band.pitch
         seconds = tdi.stages * tdi.open_share * tdi.line_time
@@ -213,7 +215,7 @@ class LineOptics:
     @cached_property
     def _table(self) -> TransferTable:
         wavelength, weight = band_wavelengths(self.ccd.band)
-        return TransferTable.build(self.pupil, wavelength, weight * _black_body_photons(wavelength))
+        return TransferTable.build(self.pupil, wavelength, weight * black_body_photons(wavelength, SUN_TEMPERATURE))
 
 
 def _shadow(outlines: tuple[tuple[tuple[float, float], ...], ...], harmonics: np.ndarray) -> PupilShadow:
@@ -236,14 +238,6 @@ def _eikonal(terms: dict[int, float]) -> np.ndarray | None:
     for k in range(degree + 1):
         to_chebyshev[: k + 1, k] = chebyshev.poly2cheb([0.0] * k + [1.0])
     return np.asarray(to_chebyshev @ power @ to_chebyshev.T)
-
-
-def _black_body_photons(wavelength: np.ndarray) -> np.ndarray:
-    """Radiance of the Sun's surface, photons/(s m^2 sr m); Lambertian ground in its light has this times the Sun's
-    radius over its distance, squared.
-    """
-    x = constants.h * constants.c / (wavelength * constants.k * SUN_TEMPERATURE)
-    return np.asarray(2.0 * constants.c / wavelength**4 / np.expm1(x))
 
 
 def _mean_of_steps(cycles: np.ndarray, count: int) -> np.ndarray:

@@ -1,0 +1,90 @@
+"""Dispersion formulas of glass catalogues (AGF files), by their numbers there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import sqrt
+
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import UnphysicalError
+
+
+def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
+    """Index n of n^2 = sum c_k w^e_k."""
+    return sqrt(sum(a * w**e for a, e in zip(c, exponents, strict=False)))
+
+
+def _sellmeier(c: Sequence[float], w: float, start: float = 1.0) -> float:
+    """Index n of n^2 = start + sum B w^2 / (w^2 - C) over pairs B, C."""
+    w2 = w * w
+    return sqrt(start + sum(b * w2 / (w2 - d) for b, d in zip(c[0::2], c[1::2], strict=False) if b))
+
+
+def _herzberger(c: Sequence[float], w: float) -> float:
+    ell = 1.0 / (w * w - 0.028)
+    return c[0] + c[1] * ell + c[2] * ell**2 + c[3] * w**2 + c[4] * w**4 + c[5] * w**6
+
+
+def _sellmeier_2(c: Sequence[float], w: float) -> float:
+    w2 = w * w
+    return sqrt(1.0 + c[0] + c[1] * w2 / (w2 - c[2] ** 2) + c[3] / (w2 - c[4] ** 2))
+
+
+FORMULAS: FrozenMap[int, tuple[str, Callable[[Sequence[float], float], float]]] = FrozenMap(
+    {
+        1: ("Schott", lambda c, w: _powers(c, w, (0, 2, -2, -4, -6, -8))),
+        2: ("Sellmeier 1", lambda c, w: _sellmeier(c[:6], w)),
+        3: ("Herzberger", _herzberger),
+        4: ("Sellmeier 2", _sellmeier_2),
+        5: ("Conrady", lambda c, w: c[0] + c[1] / w + c[2] / w**3.5),
+        6: ("Sellmeier 3", lambda c, w: _sellmeier(c[:8], w)),
+        7: ("Handbook 1", lambda c, w: sqrt(c[0] + c[1] / (w * w - c[2]) - c[3] * w * w)),
+        8: ("Handbook 2", lambda c, w: sqrt(c[0] + c[1] * w * w / (w * w - c[2]) - c[3] * w * w)),
+        9: ("Sellmeier 4", lambda c, w: _sellmeier(c[1:5], w, c[0])),
+        10: ("Extended 1", lambda c, w: _powers(c, w, (0, 2, -2, -4, -6, -8, -10, -12))),
+        11: ("Sellmeier 5", lambda c, w: _sellmeier(c[:10], w)),
+        12: ("Extended 2", lambda c, w: _powers(c, w, (0, 2, -2, -4, -6, -8, 4, 6))),
+        13: ("Extended 3", lambda c, w: _powers(c, w, (0, 2, 4, -2, -4, -6, -8, -10, -12))),
+    }
+)
+"""Number of a dispersion formula in AGF files -> its name, and the index by coefficients and wavelength in um."""
+
+
+@dataclass(frozen=True)
+class CatalogueGlass:
+    """A glass of a catalogue; called with a wavelength (metres) it gives its index.
+
+    Attributes:
+        name: as in the catalogue.
+        formula: number of its dispersion formula.
+        coefficients: of it, for micrometres.
+        shortest, longest: between which it holds, metres.
+    """
+
+    name: str
+    formula: int
+    coefficients: tuple[float, ...]
+    shortest: float
+    longest: float
+
+    def __call__(self, wavelength: float) -> float:
+        """Index against air.
+
+        Raises:
+            ValueError: the formula does not hold at that wavelength.
+        """
+        if not self.shortest <= wavelength <= self.longest:
+            raise UnphysicalError(
+                f"{self.name}: {wavelength * 1e9:.6g} nm is outside the range of its dispersion formula, "
+                f"{self.shortest * 1e9:.6g} to {self.longest * 1e9:.6g} nm"
+            )
+        try:
+            index = FORMULAS[self.formula][1](self.coefficients, wavelength * 1e6)
+        except (ValueError, ZeroDivisionError, OverflowError):
+            index = 0.0
+        if not 1.0 <= index <= 10.0:
+            raise UnphysicalError(
+                f"{self.name}: no index comes out of its dispersion formula at {wavelength * 1e9:.6g} nm"
+            )
+        return index

@@ -1,0 +1,215 @@
+"""The light that a camera sees: how much signal comes at which wavelength."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+
+from optics.materials.black_body import black_body_photons
+from optics.numerics.quadrature import gauss, gauss_of
+from scenes.yaml.csv_table import Column, read_table
+from scenes.yaml.errors import KeyPath, Problem
+from scenes.yaml.quantity import Quantity, Vector, Wavelength
+from scenes.yaml.spec import Number, Reference, Spec, one_given, short_for
+from scenes.yaml.units import LENGTH, TEMPERATURE, format_quantity
+
+WavelengthRange = Annotated[tuple[float, float], Vector(Quantity(LENGTH, smallest="100 nm", largest="100 um"), 2)]
+"""Shortest and longest, metres."""
+
+MOST_LINES = 100
+MOST_SAMPLES = 20_000
+
+_PIECES, _NODES, _LEAST_POINTS = 64, 8, 512
+"""Pieces of an even band in a black body's light; Gauss' nodes on each piece of a curve, at least, over which Planck's
+law is a polynomial to rounding; and points of all pieces together, at least: far more than any rule has."""
+
+
+class SpectrumSpec(Spec):
+    """How much signal comes at which wavelength, of a source that looks the same everywhere.
+
+    Signal counts photons: ``weights`` and a table's response are signal per photon (transmission times quantum
+    efficiency), and a black body gives photons. Only ratios count.
+
+    Attributes:
+        between: shortest and longest wavelength of light that is evenly spread between them, metres.
+        wavelengths: of lines, ascending, metres.
+        weights: signal of each line; all alike when left out.
+        table: CSV file with the columns `wavelength` (unit in its head) and `response`; relative to this file. Between
+            its rows the response is linear, beyond them nothing.
+        curve: what the table says, which is filled in when it is read; a table is not looked for where it is given.
+        black_body: temperature of a source whose photons the band or the table takes, kelvin; as many at all
+            wavelengths when left out.
+    """
+
+    between: WavelengthRange | None = None
+    wavelengths: Annotated[tuple[Wavelength, ...], Field(min_length=1, max_length=MOST_LINES)] | None = None
+    weights: tuple[Annotated[Number, Field(ge=0.0)], ...] | None = None
+    table: Reference | None = None
+    curve: Annotated[tuple[tuple[Wavelength, Number], ...], Field(min_length=2, max_length=MOST_SAMPLES)] | None = None
+    black_body: Annotated[float, Quantity(TEMPERATURE, above_zero=True, largest="100000 K")] | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> SpectrumSpec:
+        given = "table" if self.table is not None else "curve"
+        allowed = "between, wavelengths or table"
+        one_given(self, ("between", "wavelengths", given), "a spectrum is given in one way", allowed)
+        if self.weights is not None and len(self.weights) != len(self.wavelengths or ()):
+            problem, found = "one weight for each wavelength", f"{len(self.weights)} weights"
+            raise Problem(problem, found, f"{len(self.wavelengths or ())} of them", within=("weights",))
+        if self.weights is not None and not any(self.weights):
+            raise Problem("all weights are zero", None, "one above zero", within=("weights",))
+        if self.black_body is not None and self.wavelengths is not None:
+            raise Problem(
+                "the weights of lines are their signal", "black_body", "no black_body", within=("black_body",)
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _ascends(self) -> SpectrumSpec:
+        if self.between is not None and not self.between[0] <= self.between[1]:
+            found = f"[{', '.join(format_quantity(w, LENGTH) for w in self.between)}]"
+            raise Problem("the spectrum's wavelengths are in the wrong order", found, "[shortest, longest]")
+        for name, along in (("wavelengths", self.wavelengths), ("curve", tuple(w for w, _ in self.curve or ()))):
+            late = next((k for k, (a, b) in enumerate(pairwise(along or ()), 1) if not a < b), None)
+            if late is not None:
+                raise Problem("the wavelengths do not ascend", None, "ascending wavelengths", within=(name, late))
+        if self.curve is not None and not (all(r >= 0.0 for _, r in self.curve) and any(r for _, r in self.curve)):
+            raise Problem("a response below zero, or none at all", None, "a response", within=("curve",))
+        return self
+
+    @model_serializer(mode="wrap")
+    def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
+        """An even band is written as its ends."""
+        full = handler(self)
+        return full["between"] if self.between is not None and self.black_body is None else full
+
+    @classmethod
+    def evenly(cls, first: float, last: float) -> SpectrumSpec:
+        """Light that is evenly spread between two wavelengths, metres."""
+        return cls.model_construct(between=(first, last))
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Shortest and longest wavelength with signal, metres."""
+        if self.between is not None:
+            return self.between
+        if self.wavelengths is not None:
+            points, _ = _parts(self)
+        else:
+            points, _ = _corners(self)
+        return float(points[0]), float(points[-1])
+
+    @property
+    def lines(self) -> bool:
+        """Whether it consists of lines, whose sum is exact."""
+        return self.wavelengths is not None
+
+    @property
+    def mean(self) -> float:
+        """Mean wavelength of the signal, metres."""
+        points, weights = self.rule(2)
+        return float(points @ weights)
+
+    def rule(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Wavelengths and weights for means over the signal, by Gauss' rule for this very spectrum.
+
+        What depends on the wavelength like a polynomial of degree below 2 ``count`` has its exact mean, whatever the
+        response looks like. Lines are all given, in place of a rule.
+
+        Args:
+            count: of wavelengths.
+
+        Returns:
+            Wavelengths, metres, and weights that sum to 1, (K,) each.
+
+        Raises:
+            ValueError: the table has not been read.
+        """
+        if self.between is not None and self.black_body is None:
+            first, last = self.between
+            node, weight = gauss(count if last > first else 1)
+            return 0.5 * (first + last) + 0.5 * (last - first) * node, 0.5 * weight
+        points, weights = _parts(self)
+        if not self.lines:
+            points, weights = gauss_of(points, weights, count)
+        return points, weights / np.sum(weights)
+
+    def even(self, count: int) -> np.ndarray:
+        """Wavelengths evenly from the shortest to the longest, metres, (count,); of lines all of them."""
+        if self.wavelengths is not None:
+            return np.array(self.wavelengths)
+        first, last = self.ends
+        return np.linspace(first, last, count) if last > first else np.array([first])
+
+    def read(self, owner: Spec, key: KeyPath) -> SpectrumSpec:
+        """Return it with its table's curve filled in.
+
+        Args:
+            owner: the specification whose file names the table.
+            key: of this spectrum in there.
+
+        Raises:
+            InputError: no such table, or one that is not right.
+        """
+        if self.table is None or self.curve is not None:
+            return self
+        folder = Path(owner.source.file).parent
+        path = owner.file_at((*key, "table"), self.table, folder, "a CSV file")
+        columns = (
+            Column("wavelength", LENGTH, least=100e-9, most=100e-6),
+            Column("response", least=0.0),
+        )
+        read = read_table(path, columns, least_rows=2)
+        if len(read) > MOST_SAMPLES:
+            raise owner.error(
+                "a table of too many rows", (*key, "table"), found=len(read), allowed=f"at most {MOST_SAMPLES}"
+            )
+        along, response = read["wavelength"], read["response"]
+        late = np.flatnonzero(np.diff(along) <= 0.0)
+        if len(late):
+            raise read.error(int(late[0]) + 1, "wavelength", "the wavelengths do not ascend")
+        if not np.any(response > 0.0):
+            raise read.error(0, "response", "no response at any wavelength")
+        # a table's numbers have fewer digits than their rounding to metres
+        curve = tuple((float(f"{w:.12g}"), float(r)) for w, r in zip(along, response, strict=True))
+        return self.model_copy(update={"curve": curve})
+
+
+@lru_cache(maxsize=64)
+def _parts(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Wavelengths with signal and how much each has, as many as it takes to have all of it."""
+    if spectrum.wavelengths is not None:
+        weights = np.ones(len(spectrum.wavelengths)) if spectrum.weights is None else np.array(spectrum.weights)
+        return np.array(spectrum.wavelengths)[weights > 0.0], weights[weights > 0.0]
+    corners, response = _corners(spectrum)
+    if corners[0] == corners[-1]:
+        return corners[:1], np.ones(1)
+    node, weight = gauss(max(_NODES, -(-_LEAST_POINTS // (len(corners) - 1))))
+    step = np.diff(corners)[:, None]
+    points = (corners[:-1, None] + 0.5 * step * (node + 1.0)).ravel()
+    weights = (0.5 * step * weight).ravel() * np.interp(points, corners, response)
+    if spectrum.black_body is not None:
+        weights = weights * black_body_photons(points, spectrum.black_body)
+    return points[weights > 0.0], weights[weights > 0.0]
+
+
+def _corners(spectrum: SpectrumSpec) -> tuple[np.ndarray, np.ndarray]:
+    """Wavelengths between which the response is linear, and the response there."""
+    if spectrum.between is not None:
+        corners = np.linspace(*spectrum.between, _PIECES + 1)
+        return corners, np.ones_like(corners)
+    if spectrum.curve is None:
+        raise ValueError(f"the table {spectrum.table} has not been read")
+    corners, response = np.array(spectrum.curve).T
+    lit = np.flatnonzero(response > 0.0)
+    some = slice(max(int(lit[0]) - 1, 0), int(lit[-1]) + 2)
+    return corners[some], response[some]
+
+
+Spectrum = Annotated[SpectrumSpec, short_for("between", list, tuple)]
+"""With its keys, or the shortest and the longest wavelength alone."""

@@ -1,0 +1,179 @@
+"""A camera over all wavelengths of its light: colours, their MTF and point images, against other ways to them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optics.numerics.physical_error import UnphysicalError
+from optics.waves.transfer import polychromatic_transfer
+from scenes.specs.resolved import resolve_camera
+from scenes.specs.spectrum import SpectrumSpec
+from tests.scenes.lens.colour_cameras import colour_camera
+from twin.camera import colour
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_report import camera_report
+from twin.camera.camera_run import CAMERA, MTF_FIELDS, camera_data, run_camera
+from twin.camera.colour import axial_colour, judge_colours, lateral_colour, spectral_mtfs, spectral_psfs
+
+FIELDS = [(0.0, 0.0), (1.0, 1.0)]
+
+
+@pytest.fixture(scope="module")
+def achromat(backend) -> CameraOptics:
+    return CameraOptics.alone(colour_camera("achromat"), backend)
+
+
+def test_a_camera_of_one_colour_is_that_of_its_wavelength(achromat, backend) -> None:
+    """The same file with another design wavelength, but for its stop and pupil."""
+    blue = 486.1327e-9
+    other = CameraOptics.alone(
+        colour_camera("achromat").model_copy(update={"wavelength": blue, "spectrum": None}), backend
+    )
+    for ours, theirs in zip(achromat.at(blue).wavefronts(FIELDS), other.wavefronts(FIELDS), strict=True):
+        assert ours.wavelength == blue
+        # the reference sphere's radius is that of the design's exit pupil: second order in the error
+        assert ours.rms == pytest.approx(theirs.rms, rel=1e-5)
+        np.testing.assert_allclose(ours.place, theirs.place, atol=1e-12)
+    assert achromat.at(achromat.wavelength).wavefront().rms == achromat.wavefront().rms
+    with pytest.raises(ValueError, match="outside the range"):
+        achromat.at(5e-6)
+
+
+def test_colour_of_a_thin_achromat(achromat, backend) -> None:
+    """Secondary axial colour -f (P1 - P2) / (V1 - V2), with partial dispersions and Abbe numbers for F, d and C."""
+    spec = achromat.model.spec
+    lines = np.array([486.1327e-9, 587.5618e-9, 656.2725e-9])
+    n = np.array([[spec.index_behind(face, w) for w in lines] for face in ("L1", "L3")])
+    spread = n[:, 0] - n[:, 2]
+    abbe, partial = (n[:, 1] - 1.0) / spread, (n[:, 0] - n[:, 1]) / spread
+    found = judge_colours(achromat, backend, spec.spectrum, ((0.0, 0.0),), False)
+    focal = float(achromat.model.first_order.focal_length[0])
+    assert found.axial is not None
+    # what is not achromatic of it is a little of what one lens has, f / V; that is taken off the blue line's focus
+    blue = found.axial[0, 0] - found.axial_reference[0]
+    primary = found.axial_primary[0]
+    assert abs(primary) < 0.02 * focal / abbe[0]
+    wanted = -focal * (partial[0] - partial[1]) / (abbe[0] - abbe[1])
+    assert blue - primary * partial[0] == pytest.approx(wanted, rel=0.03)
+    np.testing.assert_allclose(
+        found.axial_secondary, found.axial_reference - 0.5 * (found.axial[:, 0] + found.axial[:, -1])
+    )
+
+
+def test_lateral_colour_is_in_the_pupils(achromat) -> None:
+    """The phase of a line's transfer function is that of where its light falls, seen from the design's chief ray."""
+    lines, field, frequency = np.array([486.1327e-9, 656.2725e-9]), (1.0, 0.0), np.array([0.0, 100.0, 40e3])
+    moved = lateral_colour(achromat, [field], lines, achromat.wavelength)[0, :, 0]
+    (both,) = achromat.colour_pupils([field], lines)
+    design, values = achromat.spot(field), []
+    for k, (line, pupil) in enumerate(zip(lines, both, strict=True)):
+        own = polychromatic_transfer(pupil, frequency[:, None] * [1.0, 0.0], np.array([line]), np.ones(1), np.zeros(1))
+        values.append(own[0])
+        spot = achromat.at(float(line)).spot(field)
+        assert spot.place[0] - design.place[0] == pytest.approx(moved[k], abs=1e-13)
+        middle = np.angle(own[0, 1]) / (-2.0 * np.pi * frequency[1])
+        assert middle == pytest.approx(moved[k] + spot.centroid[0], abs=2e-9)
+    assert abs(moved[0] - moved[1]) > 1e-7
+    mtf = achromat.mtfs([field], frequency, lines, np.array([1.0, 3.0]))[0]
+    assert mtf.values[0, 2] == pytest.approx(abs(values[0][2] + 3.0 * values[1][2]) / 4.0, rel=1e-12)
+    assert mtf.weights.tolist() == [0.25, 0.75]
+
+
+def test_images_that_stand_apart_blur_what_they_make_together(achromat) -> None:
+    """Two images of one kind at a distance s have the transfer function of one times cos(pi f s)."""
+    light, apart = achromat.directions([(0.0, 0.0)]), 5e-6
+    places = achromat.path.places({}, light)
+    pupils = [achromat.path.pupils({}, light, np.add(places, (k * apart, 0.0)))[0] for k in (0, 1)]
+    frequency = np.array([[20e3, 0.0], [70e3, 0.0], [70e3, 40e3]])
+    colours = np.full(2, achromat.wavelength)
+    both = polychromatic_transfer(pupils, frequency, colours, np.ones(2), np.zeros(1))[0]
+    alone = polychromatic_transfer(pupils[0], frequency, colours[:1], np.ones(1), np.zeros(1))[0]
+    wanted = np.abs(alone) * np.abs(np.cos(np.pi * frequency[:, 0] * apart))
+    np.testing.assert_allclose(np.abs(both), wanted, atol=1e-7)
+    with pytest.raises(ValueError, match="zip"):
+        polychromatic_transfer(pupils, frequency, colours[:1], np.ones(1), np.zeros(1))
+
+
+@pytest.mark.second
+def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) -> None:
+    light = SpectrumSpec.evenly(500e-9, 640e-9)
+    frequency = np.array([0.0, 30e3, 70e3])
+    (mtf,) = spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
+    (fine,) = achromat.mtfs([(0.0, 0.0)], frequency, *light.rule(24))
+    assert 0.0 < mtf.error <= colour.WORST_CHANGE
+    np.testing.assert_allclose(mtf.values, fine.values, atol=mtf.error)
+    # a trapezoidal rule comes to the same mean
+    wavelengths = np.linspace(500e-9, 640e-9, 36)
+    weights = np.ones(36)
+    weights[[0, -1]] = 0.5
+    (even,) = achromat.mtfs([(0.0, 0.0)], frequency, wavelengths, weights)
+    np.testing.assert_allclose(even.values, fine.values, atol=5e-4)
+    monkeypatch.setattr(colour, "LARGEST_RULE", 9)
+    monkeypatch.setattr(colour, "WORST_CHANGE", 1e-9)
+    with pytest.raises(UnphysicalError, match="still changes by"):
+        spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
+
+
+def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
+    """One pupil serves all wavelengths; a point's image has the MTF that the transfer function says."""
+    optics = CameraOptics.alone(gf7, backend)
+    light, field = gf7.spec.light, (1.0, 1.0)
+    assert light is not None
+    found = judge_colours(optics, backend, light, (field,), False)
+    assert found.lateral is None
+    assert found.axial_secondary is None
+    wavelengths, weights = light.rule(9)
+    (psf,) = spectral_psfs(optics, [field], wavelengths, weights)
+    frequency = np.array([0.0, 20e3, 50e3])
+    (mtf,) = optics.mtfs([field], frequency, wavelengths, weights)
+    step = psf.place[1] - psf.place[0]
+    for k in range(2):
+        line = np.sum(psf.values, axis=k) * step**2
+        turned = np.abs(np.exp(-2j * np.pi * frequency[:, None] * psf.place) @ line)
+        # 1 % of the light is beyond the window, spread so wide that it adds to no frequency but the lowest
+        np.testing.assert_allclose(turned[1:], mtf.values[k, 1:], atol=4e-3)
+        assert 0.985 < turned[0] < 1.0
+    assert 0.8 < psf.strehl < 1.0
+    # of one wavelength the Strehl ratio is what the wavefront says
+    (alone,) = spectral_psfs(optics, [field], np.array([650e-9]), np.ones(1))
+    assert alone.strehl == pytest.approx(optics.wavefront(field).strehl, abs=2e-3)
+
+
+def test_no_colours_without_named_glass(achromat, backend) -> None:
+    lenses = {**achromat.model.spec.mirrors}
+    lenses["L1"] = lenses["L1"].model_copy(update={"glass": None, "index": 1.5168})
+    old = replace(achromat, path=CameraOptics.alone(
+        achromat.model.spec.model_copy(update={"mirrors": lenses, "spectrum": None}), backend).path)  # fmt: skip
+    with pytest.raises(ValueError, match="name its glass"):
+        old.at(500e-9)
+    with pytest.raises(ValueError, match="name its glass"):
+        axial_colour(old, backend, [(0.0, 0.0)], np.array([500e-9]))
+
+
+@pytest.mark.second
+def test_report_and_files_have_the_colours(tmp_path: Path, backend) -> None:
+    (tmp_path / "c.yaml").write_text(colour_camera("achromat").file_text(""), "utf-8")
+    run = run_camera(resolve_camera(tmp_path / "c.yaml"), backend)
+    told = CAMERA(run)["colours"]
+    assert [told[key] for key in ("shortest_nm", "longest_nm", "wavelengths_of_mtf")] == pytest.approx(
+        [486.1327, 656.2725, 3]
+    )
+    assert told["mtf_error"] == 0.0
+    corner = told["fields"][MTF_FIELDS.index((1.0, 1.0))]
+    assert corner["lateral_primary_um"][0] == pytest.approx(corner["lateral_primary_um"][1], rel=1e-6)
+    data = camera_data(run)
+    assert data["lateral_colour"].shape == (5, 3, 2)
+    assert float(data["axial_colour"][0, 0]) == pytest.approx(
+        1e-6 * told["fields"][0]["axial_primary_um"] + float(data["axial_colour"][0, -1])
+    )
+    names = [a.name for section in camera_report(run).sections for a in section.artefacts]
+    assert {"lateral-colour", "axial-colour", "colour", "light-mtf", "light-mtf-nyquist"} <= set(names)
+    design = CAMERA(run)["mtf_at_nyquist"][0]["along_line"]
+    assert told["fields"][0]["mtf_at_nyquist"][0] < design  # other wavelengths are out of focus
+    # without lenses no wavelength stands apart, and there is no section of it
+    assert run.colours is not None
+    mirrors = replace(run, colours=replace(run.colours, lateral=None, axial=None, axial_reference=None))
+    assert "lateral-colour" not in {a.name for s in camera_report(mirrors).sections for a in s.artefacts}
+    assert "lateral_primary_um" not in CAMERA(mirrors)["colours"]["fields"][0]
