@@ -19,7 +19,7 @@ from optics.geometry.aperture import Aperture, Circle, Edge, EdgeShape, Polygon,
 from optics.geometry.pose import Pose, about_axis
 from optics.geometry.surface import Surface, ZernikeFigure
 from optics.geometry.zernike import MAX_NOLL
-from optics.materials.glass import GLASSES
+from optics.materials.dispersion import CatalogueGlass
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import OVER, LensSurface, Note, Prescription, even_asphere, turned_over
@@ -57,7 +57,7 @@ class _Reader:
         self.surfaces: list[LensSurface] = []
         self.notes: list[Note] = []
         self.ambient = 1.0
-        self.named: dict[float, str] = {}
+        self.named: dict[float, CatalogueGlass] = {}
 
     def error(self, key: KeyPath, problem: str, found: object = None, allowed: str | None = None) -> InputError:
         """What is wrong at a key."""
@@ -165,7 +165,15 @@ class _Reader:
             self.notes.append(Note(self.line(key), name, "a baffle that is no plane, or without an edge: not carried"))
             return
         surface = LensSurface(
-            name, pose, shape, how, index / self.ambient, clear, self.line(key), self.named.get(index, ""), rest
+            name,
+            pose,
+            shape,
+            how,
+            index / self.ambient,
+            clear,
+            self.line(key),
+            self.named[index].name if index in self.named else "",
+            rest,
         )
         # the world turns over, and each surface's own frame with it
         self.surfaces.append(turned_over(LensSurface(**{**vars(surface), "pose": OVER @ pose})))
@@ -285,9 +293,7 @@ class _Reader:
             case "SellmeierMedium":
                 b, c = ([self.number(medium, f"{n}{k}", key) for k in (1, 2, 3)] for n in "BC")
                 n = math.sqrt(1.0 + sum(p * um * um / (um * um - q) for p, q in zip(b, c, strict=True)))
-                for glass in GLASSES.values():
-                    if np.allclose([*b, *c], [*glass.b, *glass.c], rtol=1e-8, atol=0.0):
-                        self.named[n] = glass.name
+                self._keep_sellmeier(n, [*b, *c])
                 return n
             case "SumitaMedium":
                 a = [self.number(medium, f"A{k}", key) for k in range(6)]
@@ -302,6 +308,19 @@ class _Reader:
             case _:
                 known = "ConstMedium, TableMedium, SellmeierMedium, SumitaMedium, Air"
                 raise self.error((*key, "type"), "a medium that is not known here", kind, known)
+
+    def _keep_sellmeier(self, index: float, b_and_c: list[float]) -> None:
+        """Remember a Sellmeier glass by its index. The file says no range; it is taken well between the poles."""
+        b, c = b_and_c[:3], b_and_c[3:]
+        poles = [math.sqrt(pole) for pole in c if pole > 0.0]
+        below = [pole for pole in poles if pole < self.wavelength * 1e6]
+        above = [pole for pole in poles if pole > self.wavelength * 1e6]
+        first, last = max([0.2, *(1.5 * pole for pole in below)]), min([5.0, *(0.4 * pole for pole in above)])
+        if index in self.named or not first < self.wavelength * 1e6 < last:
+            return
+        pairs = tuple(value for pair in zip(b, c, strict=True) for value in pair)
+        name = f"Sellmeier_{len(self.named) + 1}"
+        self.named[index] = CatalogueGlass(name, 2, (*pairs, *[0.0] * 6), first * 1e-6, last * 1e-6)
 
     def edges(self, given: Mapping[str, Any], key: KeyPath, name: str, depth: int = 0) -> tuple[Edge, ...]:
         """What an obscuration cuts; clear apertures first. What has no place here is noted."""
@@ -374,8 +393,8 @@ def read_batoid(path: str | Path, wavelength: float) -> Prescription:
     if reader.ambient != 1.0:
         notes.append(Note(0, "inMedium", f"indices are relative to it, {reader.ambient:.9f}, and so are paths"))
     name, surfaces = str(system.get("name", "")) or Path(path).stem, tuple(reader.surfaces)
-    # against another medium than that of the file's start the catalogue's dispersion is another
-    known = {own: GLASSES[own].index for own in reader.named.values()} if reader.ambient == 1.0 else {}
+    # against another medium than that of the file's start the dispersion is another
+    known = {own.name: own for own in reader.named.values()} if reader.ambient == 1.0 else {}
     return Prescription(
         name,
         str(path),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from numpy.polynomial import chebyshev
 
 from optics.numerics.quadrature import disk
+from scenes.lens.batoid_reader import read_batoid
 from scenes.models.camera_model import CameraModel, field_direction
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from tests.oracles.peers import batoid_lenses, batoid_rays
@@ -87,6 +89,15 @@ def test_axial_colour_of_batoids_beams(case, backend) -> None:
             assert more == pytest.approx(less, rel=1e-4)
             assert less >= float(np.sqrt(nodes.share @ left**2)) * (1.0 - 1e-12)
     assert np.ptp(own[0]) > 1e-6
+
+
+def test_the_glass_of_batoids_lsst_comes_along() -> None:
+    batoid = pytest.importorskip("batoid")
+    lens = read_batoid(Path(batoid.__file__).parent / "data/LSST/LSST_r.yaml", 620e-9)
+    face = batoid.Optic.fromYaml("LSST_r.yaml")["L1_entrance"]
+    own = next(surface for surface in lens.surfaces if surface.name == "L1_entrance")
+    for wavelength in (450e-9, 620e-9, 900e-9):
+        assert lens.glasses[own.glass](wavelength) == pytest.approx(face.outMedium.getN(wavelength), rel=1e-15)
 
 
 @pytest.mark.second

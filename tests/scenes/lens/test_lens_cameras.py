@@ -20,7 +20,7 @@ from scenes.lens.batoid_writer import batoid_text
 from scenes.lens.camera_reader import Width, camera_of, camera_text
 from scenes.lens.camera_writer import perturbed_prescription, prescription_of
 from scenes.lens.codev_reader import read_codev
-from scenes.lens.glass_catalogue import own_glasses
+from scenes.lens.glass_catalogue import own_glasses, read_catalogues
 from scenes.lens.prescription import SEQUENCE, Prescription, joined
 from scenes.lens.zemax_reader import read_zemax
 from scenes.lens.zemax_writer import zemax_text
@@ -145,6 +145,26 @@ def test_two_lenses_of_two_glasses(tmp_path: Path, backend) -> None:
     _, again, _, valid = (a[0] for a in back.numpy(back.world))
     assert valid.all()
     np.testing.assert_allclose(again, -direction, rtol=0, atol=ROUNDING)
+
+
+def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> None:
+    """By name or by the catalogue's formula; a glass whose dispersion nobody knows keeps its index."""
+    path, agf = tmp_path / "singlet.zmx", tmp_path / "own.agf"
+    path.write_text(SINGLET, "utf-8")
+    front = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4)).camera
+    assert front.medium == "air"
+    assert front.plain()["mirrors"]["L1"]["glass"] == "N-BK7"
+    assert front.index_behind("L1", 500e-9) == N_BK7.index(500e-9)
+    assert "N-BK7" in SINGLET
+    path.write_text(SINGLET.replace("N-BK7", "F2"), "utf-8")
+    numbers = "1.34533359 0.00997743871 0.209073176 0.0470450767 0.937357162 111.886764"
+    agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\nLD 0.32 2.5\n", "utf-8")
+    made = camera_of(read_zemax(path, read_catalogues([agf])), "singlet", backend, Width(pupil=1e-4)).camera
+    again = validate(CameraSpec, parse_yaml(made.file_text("")))
+    assert again == made
+    # Schott's data sheet
+    for wavelength, index in ((486.1327e-9, 1.63208), (587.5618e-9, 1.62004), (656.2725e-9, 1.61503)):
+        assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)
 
 
 FACE = "{z: 1 mm, radius: 30 mm, light: refracts, index: %s}"
