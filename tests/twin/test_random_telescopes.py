@@ -1,6 +1,4 @@
-"""Telescopes drawn at random: every number within its bounds, and MTF as a dense raster of traced rays has it, or a refusal
-that says why.
-"""
+"""Telescopes drawn at random: numbers within their bounds and the MTF of a dense raster of traced rays, or a refusal."""
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ FEW, MANY = 10, 200
 MOST_REFUSED = 0.02
 CELLS = 400
 APART = 4e-3
-"""A raster of 400 cells counts the light of each to a whole one: vanes of a few cells are right to a tenth of a cell."""
+"""A raster has no parts of cells: vanes of a few of them are right to a tenth of one."""
 
 
 def edges(rng: np.random.Generator, radius: float) -> list[str]:
@@ -39,7 +37,7 @@ def edges(rng: np.random.Generator, radius: float) -> list[str]:
 
 
 def telescope(seed: int) -> str:
-    """A two-mirror telescope between a Cassegrain and an aplanat, some with a folding flat or a window of glass."""
+    """A two-mirror telescope between a Cassegrain and an aplanat, some behind a window of glass."""
     rng = np.random.default_rng(seed)
     diameter, ratio, m, k = rng.uniform(0.1, 1.5), rng.uniform(2.0, 4.0), rng.uniform(2.5, 5.0), rng.uniform(0.2, 0.35)
     f1 = ratio * diameter
