@@ -1,4 +1,4 @@
-"""Telescopes drawn at random: numbers within their bounds and the MTF of a dense raster of traced rays, or a refusal."""
+"""Telescopes drawn at random: numbers within bounds and the MTF of a dense raster of traced rays, or a refusal."""
 
 import numpy as np
 import pytest
