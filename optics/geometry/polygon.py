@@ -42,6 +42,7 @@ def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> 
     for k in range(polygons.shape[1]):
         corner = polygons[:, k]
         way = np.roll(corner, -1, axis=1) - corner
+        way[np.hypot(way[..., 0], way[..., 1]) <= _SAME] = 0.0  # the direction of such a side is rounding
         within = np.repeat(full[:, k, None], len(points), axis=1)
         for v in range(corner.shape[1]):
             x, y = (points[:, i] - corner[:, v, i, None] for i in (0, 1))

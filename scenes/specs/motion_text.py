@@ -85,12 +85,12 @@ def motion_of(text: str) -> tuple[str, str, str, str, str]:
     if kind in ("shift", "rotate", "gradient"):
         axis = rest.pop(0).lower() if rest else ""
         if axis not in AXES:
-            raise Problem(f"{kind} needs an axis", shown(axis or text), "x, y or z, as in " + FORMS)
+            raise Problem("not a motion of a node", shown(text), f"{kind} x, {kind} y or {kind} z: {FORMS}")
     elif kind == "figure":
         axis = rest.pop(0) if rest else ""
         noll(axis)
-    if pivot and kind not in ("rotate", "scale"):
-        raise Problem(f"a {kind} has no pivot", shown(f"{_ABOUT} {pivot}"), "about after rotate or scale alone")
+    if pivot and kind not in ("shift", "rotate", "scale"):
+        raise Problem(f"a {kind} has no pivot", shown(f"{_ABOUT} {pivot}"), "about after shift, rotate or scale alone")
     return node, kind, axis, " ".join(rest), pivot
 
 

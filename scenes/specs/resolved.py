@@ -494,9 +494,11 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
     data = yaml.data if isinstance(yaml.data, dict) else {}
     if "mirrors" in data:
         return _alone(load.load_camera(Path(text)), text, name)
+    if "camera" in data and {"mounted", "perturb"} & set(data) and "test" not in data:
+        return validate(CameraSetup, yaml)
     if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
         return _of_job(resolve(file), text, name)
-    if "cameras" in data and not {"job", "detector"} & set(data):
+    if "cameras" in data and not {"job", "detector", "camera"} & set(data):
         return _mounted(load.load_instrument(Path(text)), text, name)
     return _of_run(yaml, name)
 
@@ -543,8 +545,6 @@ def _mounted(instrument: InstrumentSpec, file: str, name: str | None) -> CameraS
 def _of_run(yaml: YamlFile, name: str | None) -> CameraSetup:
     """From a run's config.yaml; a study's has its own below ``base``."""
     data: Any = yaml.data
-    if isinstance(data, dict) and {"mounted", "instrument"} <= set(data):
-        return validate(CameraSetup, yaml)
     way: KeyPath = ("base",) if isinstance(data, dict) and "study" in data else ()
     below = data.get("base") if way else data
     one = below.get("camera") if isinstance(below, dict) else None

@@ -124,12 +124,12 @@ def test_observability_report():
     for motion in report.motions[:4]:  # the family is reported as what it is
         assert motion.reported - motion.true == pytest.approx(np.zeros(4), abs=1e-18)
     text = "\n".join(report.statements)
-    said = next(line for line in report.statements if line.startswith("tilt: cannot be told from the family"))
+    said = next(line for line in report.statements if line.startswith("tilt: is not separable from the family"))
     assert "reads as" in said
     for k, name in enumerate(NAMES):  # only what takes part in the imitation is named, with its amount
         part = f"{abs(tilt.imitation[k]):.3g} x {name}"
         assert (part in said) == (mix[k] != 0)
-    reported, true = said.split("true is")
+    reported, true = said.split("the true change is")
     assert "d_alpha" in reported
     assert f'd_alpha {truth[0] * 5e-6 * 180 * 3600 / np.pi:+.3g}"' in true
     assert "d_f" not in said  # rounding noise is not shown

@@ -183,3 +183,12 @@ def test_slivers_have_the_weight_of_their_area(height: float) -> None:
     _, weights = quadrature(slivers, 58)
     wide = np.ptp(x, axis=1) * np.ptp(y, axis=1)
     assert np.all(np.abs(weights).sum(axis=1) < 10.0 * wide + 1e-15)
+
+
+def test_corners_that_repeat_one_but_for_rounding_cover_what_the_polygon_does() -> None:
+    """Polygons of a batch have as many corners as the largest; those that only fill up may lie a rounding aside."""
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-2.5, 2.5, (300, 2))
+    doubled = np.repeat(SOME, 2, axis=1) * (1.0 + 2e-16 * rng.integers(-1, 2, (*SOME.shape[:1], 2 * SOME.shape[1], 1)))
+    np.testing.assert_array_equal(covered(doubled[:, None], points), covered(SOME[:, None], points))
+    assert covered(SOME[:, None], points).any()

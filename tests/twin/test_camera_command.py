@@ -332,7 +332,7 @@ def test_files_that_it_takes(tmp_path) -> None:
         (("gf7", "tilt"), "'tilt' has no meaning here; there is --refocus --tilt"),
         (("gf7", "--tilt"), "--tilt goes with --refocus"),
         (("gf7", "turn", "--refocus"), "'turn' has no meaning here; there is --refocus --tilt"),
-        (("scenes/examples/perturb.yaml",), "perturb.yaml:1: there is no camera's prescription in this file"),
+        (("scenes/examples/perturb.yaml",), "perturb.yaml: which of its cameras is meant is not said"),
         (("nowhere.yaml",), "nowhere.yaml: no such file"),
     ],
 )

@@ -106,7 +106,7 @@ def test_a_run_folder(tmp_path, monkeypatch) -> None:
     told = json.loads((out / "design.json").read_text("utf-8"))
     assert told["improved"]  # by 0.1 %
     assert "Improved: small has a wavefront error of 0.0237 waves" in page
-    assert "a local optimum: from one start it is not known whether there is a better one" in page
+    assert "A local optimum: from one start it is not known whether there is a better one" in page
     (start,) = told["starts"]
     assert (start["drawn"], start["steps"], start["problem"]) == (False, 1, "")
     assert told["local_optimum"]

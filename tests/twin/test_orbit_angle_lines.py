@@ -210,7 +210,7 @@ def test_contract_of_a_pair(done, gf7_pair, backend) -> None:
     sigma = data["along_track"]["alpha_arcsec_sigma"]
     assert abs(change["ground"]["alpha"] - change["trace"]["alpha"]) < 3.9 * sigma
     text = (folder / "report.html").read_text("utf-8")
-    assert "the trace of the instrument says" in text
+    assert "the trace of the instrument gives" in text
     assert re.search(r"wrong by 1 arcsec moves intersected heights by 4\.\d\d m for α", text)
     assert {"artefacts/change.csv", "artefacts/sensitivity-alpha-points.svg"} <= files(folder)
 

@@ -17,7 +17,6 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-import xarray as xr
 
 from analysis.short_repr import shows
 from optics.geometry import zernike
@@ -25,7 +24,7 @@ from optics.geometry.polygon import area, covered
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
-from optics.numerics.invariants import hold_below, hold_equal, hold_within
+from optics.numerics.invariants import hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
@@ -46,15 +45,9 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
+from twin.camera.camera_results import ROUNDING, TERMS, Field, Mtf, Spot, Wavefront, hold_mtf, hold_wavefront
 from twin.camera.cut_wavefront import RAYS_ACCURACY, WORST_LIGHT, counted_fit, exact_fit
-from twin.run.reference_frames import frames_text
 from twin.targets.target_path import LineRays, TargetPath
-
-Field = tuple[float, float]
-"""Shares of the half angles of view: along the line, along the track."""
-
-TERMS = 37
-"""Zernike terms (Noll's order) that are told of a wavefront: all to seventh order, and the spherical of eighth."""
 
 RINGS = 12
 """Rings of the quadrature over the stop, which is exact for squares of wavefronts up to order 23."""
@@ -65,198 +58,12 @@ MAP_POINTS = 65
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
 
-ROUNDING = 1e-6
-"""By which shares and Strehl ratios may leave 0 to 1: what quadratures over pieces of shadows are right to."""
-
-MTF_ROUNDING = 1e-3
-"""By which an MTF may leave 0 to 1 or exceed that of the perfect wavefront: what its quadrature is held to."""
-
-MOST_ERROR = 1e6
-"""Rms wavefront error beyond which a number is none of an image, waves: 0.6 m of path."""
 
 MOST_RAYS = 500_000
 """Traced at once, to bound memory."""
 
 INSIDE = 1.0 - 1e-9
 """Rays at the very edge of the stop are aimed this far out, so that rounding does not stop them."""
-
-
-@shows("field", "rms [waves]", "peak_to_valley [waves]", "strehl", "vignetted [percent]", "map [waves]")
-@dataclass(frozen=True, eq=False)
-class Wavefront:
-    """Wavefront error at one field.
-
-    Attributes:
-        field: where.
-        wavelength: metres; waves are of this.
-        x, y: coordinates of the map's columns and rows on the stop, in units of its radius, (n,); x runs along the
-            line, y along the track.
-        map: waves, (n, n); NaN where no light is.
-        coefficients: Zernike's circle terms in Noll's order, waves rms over the whole stop, (TERMS,), fitted to the
-            light that comes through; their names are ``optics.geometry.zernike``'s.
-        parts: of the rms that each term makes, waves, (TERMS,): the coefficients, where all of the stop is lit; else
-            those of the same terms made orthonormal over what is lit, each without what the earlier ones hold. Over a
-            ring these are the annular Zernike terms (Mahajan, J. Opt. Soc. Am. 71, 75, 1981). Their squares and that of
-            ``residual`` sum to that of ``rms``.
-        rms: waves, exact for smooth wavefronts; ``accuracy`` says how far.
-        peak_to_valley: waves, over the map and the edge.
-        residual: rms that the Zernike terms leave, waves.
-        strehl: Strehl ratio, from the mean phasor over the stop.
-        vignetted: share of the stop's area whose light other apertures and bodies stop.
-        place: of the chief ray on the line CCD, (along the line, along the track), metres.
-        hole: radius of the hole of a pupil that is a ring about the stop's middle, in units of the stop's; 0 for a
-            whole one, NaN for any other.
-        accuracy: of a beam that edges cut: change of rms, as a share of it, or of the Strehl ratio by a finer
-            quadrature, whichever is larger; 2e-3 where the shadows of edges are not known and 10 000 rays stand for the
-            light. 0 for a free beam.
-    """
-
-    field: Field
-    wavelength: float
-    x: np.ndarray
-    y: np.ndarray
-    map: np.ndarray
-    coefficients: np.ndarray
-    parts: np.ndarray
-    rms: float
-    peak_to_valley: float
-    residual: float
-    strehl: float
-    vignetted: float
-    place: tuple[float, float]
-    hole: float = 0.0
-    accuracy: float = 0.0
-
-    @property
-    def is_cut(self) -> bool:
-        """Whether edges or bodies take some of the light."""
-        return self.hole != 0.0
-
-    @property
-    def polynomials(self) -> str:
-        """What ``parts`` are numbers of."""
-        if self.hole == 0.0:
-            return "Zernike circle terms"
-        if np.isfinite(self.hole):
-            return f"annular Zernike terms, hole {self.hole:.4f} of the stop"
-        return "terms orthonormal over the light of this pupil"
-
-    @property
-    def orthonormal_terms(self) -> dict[str, float]:
-        """Name of each term -> waves rms of its part, of ``polynomials``."""
-        return {zernike.name(j): float(c) for j, c in enumerate(self.parts, start=1)}
-
-    @property
-    def terms(self) -> dict[str, float]:
-        """Name of each Zernike term -> waves rms."""
-        return {zernike.name(j): float(c) for j, c in enumerate(self.coefficients, start=1)}
-
-    def to_xarray(self) -> xr.Dataset:
-        """``wavefront`` over pupil coordinates and ``zernike`` over Noll's index, with units and names."""
-        index = np.arange(1, len(self.coefficients) + 1)
-        names = [zernike.name(int(j)) for j in index]
-        along = "{} on the stop over its radius"
-        return xr.Dataset(
-            {
-                "wavefront": (("y", "x"), self.map, {"units": "waves", "long_name": "wavefront error"}),
-                "zernike": ("noll", self.coefficients, {"units": "waves rms"}),
-            },
-            {
-                "x": ("x", self.x, {"long_name": along.format("along the line")}),
-                "y": ("y", self.y, {"long_name": along.format("along the track")}),
-                "noll": ("noll", index, {"long_name": "Noll's index"}),
-                "term": ("noll", names),
-            },
-            {
-                "reference_frames": frames_text("optics"),
-                "field": self.field,
-                "wavelength_m": self.wavelength,
-                "wfe_rms_waves": self.rms,
-                "strehl": self.strehl,
-                **({} if not self.is_cut else {"polynomials": self.polynomials, "parts_waves": self.parts}),
-            },
-        )
-
-
-@shows("field", "rms [um]", "farthest [um]", "airy [um]", "rays [um]")
-@dataclass(frozen=True, eq=False)
-class Spot:
-    """Where the rays of one field meet the line CCD.
-
-    Attributes:
-        field: where.
-        rays: from the chief ray, (along the line, along the track), metres, (N, 2); hexapolar on the stop, the chief
-            ray first; those that an aperture stops are left out.
-        centroid: of all light from the chief ray, metres, (2,).
-        rms: rms distance from the centroid, metres, exact for smooth wavefronts.
-        rms_along: the same along the line and along the track, metres, (2,).
-        farthest: of the rays from the centroid, metres.
-        airy: radius of the Airy disk of the same numerical aperture, metres.
-        place: of the chief ray on the line CCD, (along the line, along the track), metres.
-    """
-
-    field: Field
-    rays: np.ndarray
-    centroid: np.ndarray
-    rms: float
-    rms_along: np.ndarray
-    farthest: float
-    airy: float
-    place: tuple[float, float]
-
-    def to_xarray(self) -> xr.Dataset:
-        """The rays, metres from the chief ray."""
-        names = {"along_line": self.rays[:, 0], "along_track": self.rays[:, 1]}
-        data = {name: ("ray", values, {"units": "m"}) for name, values in names.items()}
-        told = {"reference_frames": frames_text("optics"), "field": self.field}
-        return xr.Dataset(data, attrs={**told, "rms_m": self.rms, "airy_m": self.airy})
-
-
-@shows("field", "at_nyquist", "nyquist [cycles/mm]", "frequency [cycles/mm]", "wavelengths [nm]")
-@dataclass(frozen=True, eq=False)
-class Mtf:
-    """Modulation transfer at one field, of the optics alone.
-
-    Attributes:
-        field: where.
-        frequency: cycles/m, (M,).
-        values: along the line and along the track, (2, M).
-        limit: the same pupil without wavefront error, (2, M).
-        wavelengths: of the light, metres, (K,).
-        nyquist: of the pixels, cycles/m.
-        weights: signal at each wavelength, sum 1, (K,).
-        error: by how much the values change at most where more wavelengths are taken; 0 for lines.
-    """
-
-    field: Field
-    frequency: np.ndarray
-    values: np.ndarray
-    limit: np.ndarray
-    wavelengths: np.ndarray
-    nyquist: float
-    weights: np.ndarray
-    error: float = 0.0
-
-    @property
-    def at_nyquist(self) -> np.ndarray:
-        """Along the line and along the track at the pixels' Nyquist frequency, (2,); NaN beyond the table."""
-        ends = {"left": np.nan, "right": np.nan}
-        return np.array([np.interp(self.nyquist, self.frequency, row, **ends) for row in self.values])
-
-    def at(self, frequency: float) -> np.ndarray:
-        """Along the line and along the track at a frequency among the table's, cycles/m, (2,)."""
-        return np.array([np.interp(frequency, self.frequency, row) for row in self.values])
-
-    def to_xarray(self) -> xr.Dataset:
-        """``mtf`` and ``limit`` over direction and frequency."""
-        return xr.Dataset(
-            {"mtf": (("direction", "frequency"), self.values), "limit": (("direction", "frequency"), self.limit)},
-            {
-                "direction": ["along line", "along track"],
-                "frequency": ("frequency", self.frequency, {"units": "1/m", "long_name": "spatial frequency"}),
-            },
-            {"reference_frames": frames_text("optics"), "field": self.field, "nyquist_per_m": self.nyquist},
-        )
 
 
 @shows("model.spec.name", "model.mirrors", "model.line_focal_length [m]", "model.spec.entrance_pupil [mm]", "state")
@@ -428,7 +235,7 @@ class CameraOptics:
                 hole=(np.nan if is_cut else 0.0) if known is None else known.hole,
                 accuracy=(RAYS_ACCURACY if is_cut else 0.0) if known is None else known.accuracy,
             )
-            _hold_wavefront(wave)
+            hold_wavefront(wave)
             out.append(wave)
         return tuple(out)
 
@@ -572,7 +379,7 @@ class CameraOptics:
             )
             place = (float(where[0]), float(where[1]))
             out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)))
-            _hold_mtf(out[-1])
+            hold_mtf(out[-1])
         return tuple(out)
 
     def colour_pupils(
@@ -601,38 +408,6 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
-
-
-def _hold_wavefront(wave: Wavefront) -> None:
-    """Hold a wavefront's numbers to what any has.
-
-    Raises:
-        UnphysicalError: one cannot be; with what it is.
-    """
-    hold_within("the share of a stop that is vignetted", wave.vignetted, 0.0, 1.0, ROUNDING)
-    hold_within("a Strehl ratio", wave.strehl, 0.0, 1.0, ROUNDING)
-    hold_within("an rms wavefront error in waves", wave.rms, 0.0, MOST_ERROR, 0.0)
-    square = float(np.sum(wave.parts**2)) + wave.residual**2
-    hold_equal(
-        "the squares of the parts of a wavefront error and of what they leave",
-        square,
-        wave.rms**2,
-        "the square of the whole",
-        1e-6 * wave.rms**2 + ROUNDING**2,
-    )
-
-
-def _hold_mtf(mtf: Mtf) -> None:
-    """Hold an MTF to what any has: by Schwarz' inequality no error raises one of the same light.
-
-    Raises:
-        UnphysicalError: it cannot be; with what it is.
-    """
-    hold_within("an MTF", mtf.values, 0.0, 1.0, MTF_ROUNDING)
-    hold_within("the MTF of a perfect wavefront", mtf.limit, 0.0, 1.0, MTF_ROUNDING)
-    hold_below("an MTF", mtf.values, mtf.limit, "that of the perfect wavefront", MTF_ROUNDING)
-    still = mtf.frequency == 0.0
-    hold_equal("the MTF at zero frequency", mtf.values[:, still], 1.0, "all of the light", MTF_ROUNDING)
 
 
 def rim(count: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from optics.geometry import zernike
 from scenes.models.camera_sharpness import BLURRED, FIELDS
-from twin.camera.camera_optics import Field
+from twin.camera.camera_results import Field
 from twin.camera.camera_run import GRID, SHARP, CameraRun
 from twin.camera.camera_view import LINE, TRACK, draw_mtf, draw_spot, draw_wavefront
 from twin.run.artefact import plain

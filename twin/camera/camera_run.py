@@ -27,7 +27,8 @@ from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
-from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.camera.colour import COLOURS, Colours, colour_data, judge_colours
 from twin.camera.first_order_data import FIRST_ORDER, FirstOrderData, first_order_data
 from twin.monitor.image_quality import CameraQuality, image_quality

@@ -21,7 +21,8 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from twin.camera.camera_optics import CameraOptics, Field, Mtf, Spot, Wavefront
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_results import Field, Mtf, Spot, Wavefront
 from twin.run.svg import BLUE, DIVERGING, GREY, INK, LIGHT, VERMILION, look, plain_axes, to_svg
 
 LINE, TRACK = BLUE, VERMILION

@@ -27,7 +27,8 @@ from optics.waves.transfer import LEAST_ACROSS
 from scenes.models.camera_model import lenses
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
 from scenes.specs.spectrum import SpectrumSpec
-from twin.camera.camera_optics import CameraOptics, Field, Mtf
+from twin.camera.camera_optics import CameraOptics
+from twin.camera.camera_results import Field, Mtf
 from twin.run.quantity import Quantity, Record
 
 WORST_CHANGE = 5e-4

@@ -11,7 +11,8 @@ from analysis.short_repr import shows
 from optics.numerics.backend import Backend
 from optics.waves.transfer import polychromatic_transfer
 from scenes.models.camera_sharpness import FieldBeams, FocalPlane
-from twin.camera.camera_optics import CameraOptics, Field, rim, solid_angle
+from twin.camera.camera_optics import CameraOptics, rim, solid_angle
+from twin.camera.camera_results import Field
 
 LINE_POINTS = 41
 """Places along the line at which distortion is told: as many as the truth of the main job has."""

@@ -4,12 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self
 
+from optics.geometry.tree import State
 from twin.camera.camera_view import CameraView
+from twin.monitor.monitor_experiment import MonitorExperiment
 
-if TYPE_CHECKING:
-    from twin.scripting.instrument_twin import InstrumentTwin
+
+class Twin(Protocol):
+    """The instrument that a camera belongs to, as `twin.load` gives it."""
+
+    @property
+    def experiment(self) -> MonitorExperiment:
+        """The modelled instrument."""
+
+    @property
+    def state(self) -> State:
+        """Body -> motion."""
+
+    def perturbed(self, *perturb: Mapping[str, Mapping[str, Any]] | str) -> Self:
+        """The instrument with these bodies perturbed. Raises InputError where that cannot be."""
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -22,12 +36,12 @@ class CameraTwin(CameraView):
         obstruction: whether what other bodies take of its beam is missing.
     """
 
-    twin: InstrumentTwin = field(repr=False)
+    twin: Twin = field(repr=False)
     name: str
     obstruction: bool = True
 
     @classmethod
-    def of(cls, twin: InstrumentTwin, name: str, obstruction: bool = True) -> CameraTwin:
+    def of(cls, twin: Twin, name: str, obstruction: bool = True) -> CameraTwin:
         """A camera of an instrument, in the instrument's state.
 
         Args:

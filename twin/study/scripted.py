@@ -200,6 +200,8 @@ def _by_node(vary: Mapping[str, Mapping[str, Any] | str]) -> dict[str, dict[str,
         try:
             node, kind, axis, quantity, pivot = motion_of(name)
         except Problem as problem:
+            if " " not in name.strip():
+                raise _wrong("not a perturbation", (name,), shown(what)) from None
             raise InputError(problem.at("", key=("vary", name))) from None
         if quantity or (match := _RANGE.search(what)) is None:
             raise _wrong("not a range", (name,), shown(quantity or what))

@@ -294,7 +294,7 @@ def run_uncertainty(
     if resolved.disturbances is None:
         raise InputError(
             Issue(
-                "nothing is stated to move, so that nothing can be said but the noise",
+                "there is no prior on disturbances, so that the noise alone limits the readings",
                 allowed="`disturbances: NAME` in the job or the instrument, or --disturbances NAME",
             )
         )

@@ -202,7 +202,7 @@ def test_an_instrument_takes_no_lenses(tmp_path: Path, backend) -> None:
     path = tmp_path / "singlet.zmx"
     path.write_text(SINGLET, "utf-8")
     made = camera_of(read_zemax(path, own_glasses()), "singlet", backend, Width(pupil=1e-4))
-    with pytest.raises(InputError, match="a camera of an instrument is made of mirrors alone"):
+    with pytest.raises(InputError, match="a camera with a monitor is made of mirrors alone"):
         build_instrument(load_instrument("gf7_pair"), {"gf7": made.camera}, backend)
 
 
