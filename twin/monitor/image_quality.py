@@ -68,6 +68,9 @@ WAVELENGTH = 650e-9
 RINGS = 7
 """Rings of the quadrature over the stop: exact for squares of wavefronts up to order 13."""
 
+MOST_BLUR = 10.0
+"""Wavefront error beyond which a pupil that edges cut gets no MTF, waves rms."""
+
 EDGED_RINGS = 14
 """Rings of the quadrature of a pupil that edges of surfaces cut, which takes polynomials of higher degrees."""
 
@@ -302,7 +305,8 @@ class _CameraBench:
         self.points = np.stack([across, along, np.zeros_like(along)], axis=-1)
         self.nyquist = 0.5 / line.pitch
         self.frequency = self.nyquist * np.eye(2)
-        light = SpectrumSpec.evenly(spec.wavelength, spec.wavelength) if band is None else band.spectrum
+        own = spec.spectrum or SpectrumSpec.evenly(spec.wavelength, spec.wavelength)
+        light = own if band is None else band.spectrum
         self.ends = light.ends
         self.colours, self.weights = light.rule(COLOURS)
         x, y = self.frequency.T
@@ -346,6 +350,10 @@ class _CameraBench:
                 reasons[s] = f"bodies in the beam take {np.max(values[5, own]):.1%} of it"
             elif np.any(rough[own]):
                 reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for its polynomials"
+                if self.model.edges and np.max(values[0, own]) > MOST_BLUR:
+                    reasons[s] = (
+                        f"no MTF: {np.max(values[0, own]):.3g} waves of wavefront error are more than {MOST_BLUR:g}"
+                    )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
         """Each body that was found in a beam -> share that it takes, (S, F); NaN where the light is lost."""
@@ -418,6 +426,9 @@ class _CameraBench:
                 free = ~covered(taken, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
             pupils, smooth = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
+            if self.model.edges:
+                # as many nodes as such a phase takes would be minutes, for a contrast that is next to nothing
+                smooth &= wfe[lit] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 if self.refracts:

@@ -1,0 +1,344 @@
+"""A camera by itself as an instrument: perturbed in the words of every command, traced, judged by its images."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import twin
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.job import JobSpec, NodeInfo, checked_nodes
+from scenes.specs.load import library_names, load_camera, load_instrument
+from scenes.specs.motion_text import motion_of, node_named, perturbation_in_words
+from scenes.specs.resolved import resolve_camera, resolve_job
+from scenes.yaml.errors import InputError, Problem
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import YamlFile
+from tests.scenes.lens.colour_cameras import colour_camera
+from tests.twin.commands import invoke
+from twin.camera.__main__ import app as camera_app
+from twin.camera.camera_optics import CameraOptics
+from twin.live.live_bench import LiveBench
+from twin.live.messages import AskedState
+from twin.main_job.render_job import render_job
+from twin.main_job.render_results import JobRun, RenderRun
+from twin.monitor.image_quality import image_quality
+from twin.render import app as render_app
+from twin.study.runs.base_job import Run
+from twin.study.runs.render_base import RenderBase
+
+RC = "ritchey_chretien"
+DESPACE = "M2 shift z 20 um"
+
+
+def job(**says) -> JobSpec:
+    return validate(JobSpec, YamlFile("", {"instrument": {"camera": RC}, **says}, {}))
+
+
+@pytest.fixture(scope="module")
+def run(backend) -> JobRun:
+    return render_job(resolve_job(job(perturb=[DESPACE])), backend)
+
+
+# --- the words -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("M2 shift z 20 um", ("M2", "shift", "z", "20 um", "")),
+        ("base/forward/M2 rotate X -3 arcsec about centre", ("base/forward/M2", "rotate", "x", "-3 arcsec", "centre")),
+        ("M1 figure Z5 10 nm", ("M1", "figure", "Z5", "10 nm", "")),
+        ("forward scale 20 ppm", ("forward", "scale", "", "20 ppm", "")),
+        ("base temperature +2 K", ("base", "temperature", "", "+2 K", "")),
+        ("M2 shift z", ("M2", "shift", "z", "", "")),
+    ],
+)  # fmt: skip
+def test_words_of_a_motion(text: str, parts: tuple[str, ...]) -> None:
+    assert motion_of(text) == parts
+
+
+def test_words_are_what_the_keys_are() -> None:
+    words = ["M2 shift z 20 um", "M2 shift x 1 um", "M2 rotate y 3 arcsec about centre", "M1 temperature 2 K",
+             "M1 gradient x 50 mK/m", "M1 figure Z5 10 nm", "rc scale 1 ppm"]  # fmt: skip
+    keys = {
+        "M2": {"shift": "1 0 20 um", "rotate": "0 3 0 arcsec", "pivot": "centre"},
+        "M1": {"temperature": {"change": "2 K", "gradient": "50 0 0 mK/m"}, "figure": {"Z5": "10 nm"}},
+        "rc": {"scale": "1 ppm"},
+    }
+    assert job(perturb=words).perturb == job(perturb=keys).perturb
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["M2"], "not a motion of a node"),
+        (["M2 shft z 20 um"], "no such kind of perturbation"),
+        (["M2 shift w 20 um"], "not a motion of a node"),
+        (["M2 shift z 20"], "no amount with a unit"),
+        (["M2 shift z"], "no amount with a unit"),
+        (["M2 figure Q5 2 nm"], "not a Zernike term"),
+        (["M2 temperature 2 K about centre"], "has no pivot"),
+        (["M2 shift z 2 um", "M2 shift z 3 um"], "said twice"),
+        (["M2 rotate x 2 arcsec about centre", "M2 rotate y 2 arcsec about origin"], "one pivot"),
+    ],
+)  # fmt: skip
+def test_words_that_say_nothing(words: list[str], problem: str) -> None:
+    with pytest.raises(Problem, match=problem):
+        perturbation_in_words(words)
+
+
+def test_a_wrong_unit_is_told_once() -> None:
+    with pytest.raises(InputError) as error:
+        job(perturb=["M2 shift z 3 arcsec"])
+    assert len(error.value.issues) == 1
+    assert "unit of an angle" in str(error.value)
+
+
+NODES = dict.fromkeys(("base", "base/a", "base/a/M1", "base/b", "base/b/M1", "base/b/M2"), NodeInfo())
+
+
+def test_short_names_mean_one_body() -> None:
+    assert node_named("M2", NODES) == "base/b/M2"
+    assert node_named("a/M1", NODES) == "base/a/M1"
+    with pytest.raises(Problem, match="several nodes are called so") as several:
+        node_named("M1", NODES)
+    assert several.value.allowed == "base/a/M1, base/b/M1"
+    with pytest.raises(Problem, match="no such node"):
+        node_named("M7", NODES)
+    named = checked_nodes(job(perturb={"M2": {"shift": "1 0 0 um"}, "a/M1": {"shift": "2 0 0 um"}}), NODES)
+    assert list(named.perturb) == ["base/b/M2", "base/a/M1"]
+    with pytest.raises(InputError, match="perturbed twice"):
+        checked_nodes(job(perturb={"M2": {"shift": "1 0 0 um"}, "b/M2": {"shift": "2 0 0 um"}}), NODES)
+    with pytest.raises(InputError) as both:  # one issue for each fault
+        checked_nodes(job(perturb={"M7": {"shift": "1 0 0 um"}, "M2": {"scale": "1 ppm"}}), NODES)
+    assert len(both.value.issues) == 2
+
+
+# --- the physics -----------------------------------------------------------------------------------------
+
+
+def test_despace_as_paraxial_rays_have_it(run: JobRun) -> None:
+    """A chief ray through the stop, which is the primary, unfolded: two mirrors and the image plane at rest."""
+    spec = load_camera(RC)
+    separation = -spec.mirrors["M2"].z
+    half = 0.5 * abs(spec.mirrors["M2"].radius)
+    to_image = separation + spec.image.z
+    height = separation + to_image * (1.0 + separation / half)
+    by_separation = 1.0 + (1.0 + separation / half) + to_image / half
+    camera = run.truth_dict()["cameras"][RC]
+    # M2's own z runs with the light that comes in: toward the primary
+    assert camera["d_f_um"] == pytest.approx(-20.0 * by_separation, rel=1e-3)
+    assert camera["principal_distance_mm"] == pytest.approx(1e3 * height, rel=1e-4)
+    assert [abs(camera[key]) < 1e-9 for key in ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec")] == [True] * 3
+
+
+def test_a_tilted_secondary_turns_the_line_of_sight(backend) -> None:
+    """By twice its angle times its distance from the image, over the focal length; about its vertex."""
+    spec = load_camera(RC)
+    found = render_job(resolve_job(job(perturb=["M2 rotate x 2 arcsec"])), backend).truth_dict()["cameras"][RC]
+    arm = -spec.mirrors["M2"].z + spec.image.z
+    assert abs(found["d_alpha_arcsec"]) == pytest.approx(2.0 * 2.0 * arm / 5.0, rel=1e-3)
+    assert abs(found["d_beta_arcsec"]) < 1e-6
+
+
+def test_quality_is_that_of_the_camera_looked_at(run: JobRun, backend) -> None:
+    """Two ways to the same numbers: image quality of an instrument, and a camera at fields, times the pixel."""
+    assert run.quality is not None
+    camera, middle = run.quality.cameras[RC], run.quality.fields.index(0.0)
+    for s, seen in enumerate((twin.load_camera(RC), twin.load_camera(RC).perturbed(DESPACE))):
+        along = seen.mtf((0.0, 0.0), np.array([0.0, seen.nyquist])).values[:, 1]
+        pixel = np.sinc(0.5)
+        told = [camera.mtf_along_line[s, middle], camera.mtf_along_track[s, middle]]
+        np.testing.assert_allclose(told, along * pixel, atol=2e-4)
+        assert camera.wfe[s, middle] == pytest.approx(seen.wavefront().rms, abs=2e-4)
+        assert camera.light_lost[s, middle] == pytest.approx(seen.wavefront().vignetted, abs=2e-3)
+    # a camera that is symmetric about its axis, moved along it, has the same numbers at both ends
+    for values in (camera.wfe, camera.mtf_along_line, camera.mtf_along_track, camera.light_lost):
+        np.testing.assert_allclose(values[:, 0], values[:, -1], atol=1e-6)
+
+
+def test_errors_are_those_of_wavefronts(backend) -> None:
+    """At the focal plane and beside it, for a free pupil and for one that edges cut."""
+    for name, within in (("gf7", 1e-9), (RC, 2e-3)):
+        optics = CameraOptics.alone(load_camera(name), backend)
+        fields = ((0.0, 0.0), (0.7, 0.0), (1.0, 1.0))
+        expected = [wave.rms for wave in optics.wavefronts(fields, points=3)]
+        np.testing.assert_allclose(optics.errors(fields)[:, 0], expected, rtol=within, atol=1e-6)
+
+
+def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
+    spec = load_instrument("gf7_pair")
+    sites = {
+        name: site.model_copy(update={"pupil_offset": None, "channels": None}) for name, site in spec.cameras.items()
+    }
+    bare = spec.model_copy(update={"monitor": None, "central_prism": None, "disturbances": None, "cameras": sites})
+    moved = ["forward/M2 shift z 3 um", "backward/focal_plane rotate z 9 arcsec", "forward temperature 1 K"]
+    given = resolve_job(validate(JobSpec, YamlFile("", {"instrument": "gf7_pair", "perturb": moved}, {})))
+    alone = given.model_copy(update={"instrument": bare, "detector": None, "disturbances": None})
+    with_monitor, without = (render_job(one, backend) for one in (given, alone))
+    assert isinstance(with_monitor, RenderRun)
+    assert not isinstance(without, RenderRun)
+    first, second = with_monitor.truth_dict(), without.truth_dict()
+    for name in ("forward", "backward"):
+        for key, value in first["cameras"][name].items():
+            assert second["cameras"][name][key] == pytest.approx(value, rel=1e-9, abs=1e-9), key
+    assert second["intersection_angle"] == pytest.approx(first["intersection_angle"], rel=1e-9)
+    assert second["ground"] == pytest.approx(first["ground"], rel=1e-7)
+
+
+def test_a_camera_with_lenses_is_moved_and_not_warmed(backend) -> None:
+    """In its colours: every wavelength by its own rays, about one place."""
+    camera = colour_camera("achromat")
+    spec = InstrumentSpec.of_camera("achromat", "achromat")
+    built = build_instrument(spec, {"achromat": camera}, backend)
+    warmed = {path for path, info in built.nodes.items() if "temperature" in info.allows}
+    root = "base/achromat"
+    assert not warmed & {"base", root, *(f"{root}/{name}" for name in camera.mirrors)}
+    assert all({"shift", "rotate"} <= built.nodes[f"{root}/{name}"].allows for name in camera.mirrors)
+    seen = CameraOptics.alone(camera, backend)
+    wavelengths, weights = camera.spectrum.rule(5)
+    frequency = np.array([0.0, seen.nyquist])
+    colours = seen.mtfs([(0.0, 0.0)], frequency, wavelengths, weights)[0].values[:, 1] * np.sinc(0.5)
+    alone = seen.mtf((0.0, 0.0), frequency).values[:, 1] * np.sinc(0.5)
+    found = image_quality(built, backend, [{}], (0.0,)).cameras["achromat"]
+    told = [found.mtf_along_line[0, 0], found.mtf_along_track[0, 0]]
+    np.testing.assert_allclose(told, colours, atol=2e-4)
+    assert np.all(np.abs(colours - alone) > 2e-3)  # of one colour it is another one
+
+
+@pytest.mark.parametrize("name", library_names("cameras"))
+def test_names_of_cameras_are_none_of_instruments(name: str) -> None:
+    assert name not in library_names("instruments")
+
+
+# --- what needs a monitor --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("says", "problem"),
+    [
+        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}}, "a course"),
+        ({"render": {"stray": True}}, "stray light"),
+        ({"disturbances": {"file": "launch"}}, "sigmas on disturbances"),
+    ],
+)  # fmt: skip
+def test_what_only_a_monitor_gives_is_refused(says: dict, problem: str, backend) -> None:
+    with pytest.raises(InputError, match=problem) as error:
+        render_job(resolve_job(job(**says)), backend)
+    assert f"{RC} has none" in str(error.value)
+
+
+def test_half_a_monitor_is_refused() -> None:
+    spec = load_instrument("gf7_pair").plain()
+    kind = type(load_instrument("gf7_pair"))
+    for gone, said in (("monitor", "no monitor"), ("central_prism", "no central_prism")):
+        with pytest.raises(InputError, match=said):
+            validate(kind, YamlFile("", {key: value for key, value in spec.items() if key != gone}, {}))
+    bare = {key: value for key, value in spec.items() if key not in ("monitor", "central_prism")}
+    with pytest.raises(InputError, match="has no channels"):
+        validate(kind, YamlFile("", bare, {}))
+    with pytest.raises(InputError, match="has no monitor, so that no spot tells"):
+        _ = load_instrument(RC).autocollimator
+
+
+# --- where users meet it ---------------------------------------------------------------------------------
+
+
+def test_a_script(backend) -> None:
+    camera = twin.load_camera(RC)
+    assert camera.perturbed(DESPACE).state == camera.perturbed({"M2": {"shift": "0 0 20 um"}}).state
+    for wrong, why in (
+        ("M7 shift z 1 um", "no such node"),
+        ("M2 shft z 1 um", "did you mean 'shift'"),
+        ("M2 shift z 1", "unit"),
+        ("M2 shift z 1 K", "unit of a temperature"),
+    ):
+        with pytest.raises(InputError, match=why):
+            camera.perturbed(wrong)
+    with pytest.raises(InputError, match="no such node"):
+        camera.perturbed({"M7": {"shift": "0 0 1 um"}})
+    shot = camera.twin.perturbed(DESPACE).render()
+    assert shot.quality.loc[RC, "after", 0.0].wfe_rms_waves > shot.quality.loc[RC, "before", 0.0].wfe_rms_waves
+    assert shot.truth.d_f_um.item() == pytest.approx(-121.0, abs=2.0)
+    assert shot.before.sizes["channel"] == 0
+
+
+def test_runs_of_a_study(backend, run: JobRun) -> None:
+    """States together are what each is by itself; a light that is lost costs its own run alone."""
+    base = RenderBase()
+    tree = json.loads(json.dumps(resolve_job(job(perturb={"M2": {"shift": "0 0 0 um"}})).plain()))
+    key = ("job", "perturb", "M2", "shift", 2)
+    runs = [Run(0, ((key, "20 um"),), None), Run(1, ((key, "-20 um"),), None), Run(2, ((key, "4.9 mm"),), None)]
+    base.check(tree, backend)
+    first, second, _ = base.evaluate(tree, runs, backend)
+    assert first["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(run.truth_dict()["cameras"][RC]["d_f_um"], rel=1e-9)
+    assert second["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(-first["truth"]["cameras"][RC]["d_f_um"], rel=1e-4)
+    assert first["quality"]["cameras"][RC]["wfe_worst_waves"] > 0.0
+    assert "recovered" not in first
+
+
+def test_the_live_page_has_what_the_job_has(run: JobRun) -> None:
+    bench = LiveBench(twin.load(RC))
+    hello = bench.greeting()
+    assert hello["channels"] == hello["estimators"] == []
+    told, images = bench.state(AskedState(n=1, knobs={f"base/{RC}/M2 shift z": 20.0}))
+    assert images is None
+    assert told["truth"]["cameras"][RC]["d_f_um"] == pytest.approx(run.truth_dict()["cameras"][RC]["d_f_um"], rel=1e-9)
+    assert run.quality is not None
+    expected = run.quality.to_dicts()[1]["cameras"][RC]["mtf_along_line"]["centre"]
+    assert told["quality"]["cameras"][RC]["mtf_along_line"]["centre"] == pytest.approx(expected, abs=1e-9)
+    assert hello["designed"]["cameras"][RC]["wfe_rms_waves"] > 0.0
+    assert bench.before(bench.at_rest).size == 0
+
+
+def test_the_config_of_a_job_is_the_job(tmp_path) -> None:
+    """What ``twin.camera`` looks at is in the state that the job says."""
+    file = tmp_path / "job.yaml"
+    file.write_text(f"instrument: {{camera: {RC}}}\nperturb: [{DESPACE}]\n", "utf-8")
+    setup = resolve_camera(file)
+    assert setup.mounted == RC
+    assert setup.perturb["M2"].shift == (0.0, 0.0, pytest.approx(2e-5))
+    again = tmp_path / "config.yaml"
+    again.write_text(setup.to_yaml(), "utf-8")
+    assert resolve_camera(again) == setup
+    alone = resolve_camera(RC).perturbed([DESPACE])
+    again.write_text(alone.to_yaml(), "utf-8")
+    assert resolve_camera(again) == alone
+    file.write_text(
+        f"instrument: {RC}\ncourse: {{times: [0 s, 1 s], motion: {{M2: {{shift: [0 0 0 um, 0 0 1 um]}}}}}}\n", "utf-8"
+    )
+    with pytest.raises(InputError, match="this job has a course"):
+        resolve_camera(file)
+
+
+@pytest.mark.second
+def test_the_commands(tmp_path) -> None:
+    """Perturbed from the command line, and by a job whose run folder is looked at, compared and exported."""
+    out = tmp_path / "seen"
+    done = invoke(camera_app, RC, "--perturb", DESPACE, "--temperature", "+0 K", "--out", out)
+    assert done.exit_code == 0, done.stderr
+    told = json.loads((out / "optics.json").read_text("utf-8"))
+    assert told["perturbed"]["d_f_um"] == pytest.approx(-121.0, abs=2.0)
+    assert told["wfe_worst_waves"] != pytest.approx(told["perturbed"]["worst_as_designed_waves"], rel=0.05)
+    assert "Perturbed: base/ritchey_chretien/M2 shift (0 um, 0 um, 20 um)" in re.sub(r"\s+", " ", done.stdout)
+    for words in (("M7 shift z 1 um",), ("M2 shift z 1 arcsec",), ("M2 shift",)):
+        wrong = invoke(camera_app, RC, "--perturb", *words, "--out", tmp_path / "none")
+        assert wrong.exit_code == 2
+        assert not (tmp_path / "none").exists()
+    both = invoke(camera_app, RC, "--perturb", DESPACE, "--refocus", "--out", tmp_path / "none")
+    assert both.exit_code == 2
+    file = tmp_path / "job.yaml"
+    file.write_text(f"instrument: {RC}\nperturb: [{DESPACE}]\n", "utf-8")
+    run = tmp_path / "run"
+    done = invoke(render_app, file, "--out", run)
+    assert done.exit_code == 0, done.stderr
+    assert {"truth.json", "quality.json", "report.html", "scene.glb", "config.yaml"} <= {p.name for p in run.iterdir()}
+    again = invoke(camera_app, run / "config.yaml", "--out", tmp_path / "again")
+    assert again.exit_code == 0, again.stderr
+    seen = json.loads((tmp_path / "again/optics.json").read_text("utf-8"))
+    assert seen["perturbed"]["d_f_um"] == pytest.approx(told["perturbed"]["d_f_um"], rel=1e-9)
