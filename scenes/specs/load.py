@@ -82,7 +82,8 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
         path = place_of(CAMERAS, name_or_path, Path())
     if path is not None and is_camera(path):
         camera = validate(CameraSpec, read_yaml(path))
-        return InstrumentSpec.of_camera(camera.name, path.name).with_source(Source(str(path)))
+        own = path.stem if path.parent == _folder(CAMERAS) else path.name
+        return InstrumentSpec.of_camera(camera.name, own).with_source(Source(str(path)))
     instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path)
     paths_of_cameras(instrument)
     if instrument.monitor is not None:

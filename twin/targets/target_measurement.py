@@ -16,6 +16,7 @@ from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.targets.target_shapes import TARGETS
+from scenes.models.camera_model import lenses
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import imaging_shadows
 from scenes.specs.instrument import BASE
@@ -301,7 +302,16 @@ def check_targets(resolved: ResolvedJob) -> None:
         )
     for key, mounted in resolved.instrument.cameras.items():
         name = _band(resolved, key)
-        pixels = resolved.cameras[mounted.camera].bands[name].pixels
+        camera = resolved.cameras[mounted.camera]
+        first, last = camera.bands[name].spectrum.ends
+        if lenses(camera) and first < last:
+            raise job.error(
+                f"images of targets are rendered with the rays of one wavelength, and {mounted.camera!r} has lenses",
+                ("render", "images"),
+                found=f"light of {1e9 * first:.6g} to {1e9 * last:.6g} nm in band {name}",
+                allowed="image quality, whose MTF is over all wavelengths, or a band of one wavelength",
+            )
+        pixels = camera.bands[name].pixels
         if usable_pixels(pixels, settings.region) <= 0.0:
             raise job.error(
                 f"the images of targets do not fit the line CCD {name} of camera {mounted.camera!r}",
