@@ -100,7 +100,10 @@ def _view(axes: Axes, model: CameraModel, backend: Backend, axis: int, first: fl
             drawn = pose.apply(np.stack([x, y, z], axis=-1))
         else:
             drawn = model.mirror_pose(name).apply(np.stack([x, y, model.surfaces[name].sag(x, y)], axis=-1))
-        axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
+        if name not in edges and name != IMAGE and model.spec.mirrors[name].light == "passes":  # nothing stands there
+            axes.plot(drawn[:, 2], drawn[:, axis], color=GREY, lw=0.8, ls=(0, (1, 2)), zorder=3)
+        else:
+            axes.plot(drawn[:, 2], drawn[:, axis], color=INK, lw=2.6, solid_capstyle="butt", zorder=3)
         _label(axes, model, name, drawn[:, [2, axis]], axis)
     axes.axhline(0.0, color=LIGHT, lw=0.7, ls=(0, (8, 3, 2, 3)), zorder=0)
 
