@@ -59,6 +59,9 @@ def test_the_librarys_cameras_are_sharp(backend, camera, name: str) -> None:
     assert found.worst < 1 / 14
     spec = camera(name).spec
     x, y = found.field[0] * spec.field.x, found.field[1] * spec.field.y
+    if any(mirror.edges for mirror in spec.mirrors.values()):  # that trace knows none; see test_camera_instrument
+        assert blur_warnings(with_camera(load_camera(name)), backend) == ()
+        return
     # three rings follow wavefronts to fifth order; there is a little more
     assert found.worst == pytest.approx(wavefront_error(camera(name), bundle(backend, camera(name), x, y)), rel=2e-3)
     assert blur_warnings(with_camera(load_camera(name)), backend) == ()

@@ -262,7 +262,7 @@ def pixel_rays(instrument, backend, state):
     """Dense rays to the middle of the line CCD, as ``image_quality`` has them."""
     bench = _CameraBench(instrument, CAMERA, backend, (0.0,), 650e-9, None)
     bench.nodes = spiral()
-    return bench._trace([state])[0], bench.points[:, None]
+    return bench._trace([state]).rays, bench.points[:, None]
 
 
 def with_plate(instrument, plate: Plate):
