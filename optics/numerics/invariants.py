@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from optics.numerics.physical_error import UnphysicalError
@@ -43,14 +45,10 @@ def hold_below(what: str, values: np.ndarray | float, bounds: np.ndarray | float
     Raises:
         UnphysicalError: one exceeds its bound.
     """
-    own, most = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(bounds, dtype=np.float64))
-    with np.errstate(invalid="ignore"):
-        off = np.where(np.isnan(own) | np.isnan(most), -np.inf, own - most)
-    if np.any(off > rounding):
-        k = int(np.argmax(off))
+    if (worst := _worst_beyond(values, bounds, rounding, lambda apart: apart)) is not None:
+        own, most = worst
         raise UnphysicalError(
-            f"{what} came out as {own.flat[k]:.6g}, which cannot be: it is at most {than}, {most.flat[k]:.6g}, to "
-            f"{rounding:g}"
+            f"{what} came out as {own:.6g}, which cannot be: it is at most {than}, {most:.6g}, to {rounding:g}"
         )
 
 
@@ -67,11 +65,23 @@ def hold_equal(what: str, values: np.ndarray | float, others: np.ndarray | float
     Raises:
         UnphysicalError: two differ by more.
     """
-    own, second = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64))
-    off = np.where(np.isnan(own) | np.isnan(second), 0.0, np.abs(own - second))
-    if np.any(off > apart):
-        k = int(np.argmax(off))
+    if (worst := _worst_beyond(values, others, apart, np.abs)) is not None:
+        own, second = worst
         raise UnphysicalError(
-            f"{what} came out as {own.flat[k]:.6g}, but {to} as {second.flat[k]:.6g}: they differ by more than "
-            f"{apart:g}"
+            f"{what} came out as {own:.6g}, but {to} as {second:.6g}: they differ by more than {apart:g}"
         )
+
+
+def _worst_beyond(
+    values: np.ndarray | float, others: np.ndarray | float, limit: float, measure: Callable[[np.ndarray], np.ndarray]
+) -> tuple[float, float] | None:
+    """The value and its other whose difference, as ``measure`` takes it, exceeds the limit most; None where none
+    does. Pairs with a NaN are not known and count as within it.
+    """
+    own, second = np.broadcast_arrays(np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64))
+    with np.errstate(invalid="ignore"):
+        off = np.where(np.isnan(own) | np.isnan(second), -np.inf, measure(own - second))
+    if not np.any(off > limit):
+        return None
+    k = int(np.argmax(off))
+    return float(own.flat[k]), float(second.flat[k])

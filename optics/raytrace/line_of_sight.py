@@ -99,6 +99,11 @@ class LineChange:
     d_f: np.ndarray
     nominal_distance: float
 
+    @property
+    def vector(self) -> np.ndarray:
+        """The changes d_alpha, d_beta, d_gamma (radians) and d_f (metres), (B, 4)."""
+        return np.stack([self.d_alpha, self.d_beta, self.d_gamma, self.d_f], axis=-1)
+
 
 def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
     """Compare perturbed states with the nominal one.

@@ -142,26 +142,29 @@ def _few_enough(pieces: np.ndarray) -> np.ndarray:
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
     """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
-    points, weights = nodes_in_shadows(pieces, 2)
-    return np.asarray(np.sum(weights, axis=-1) / np.pi) if points.size else np.zeros(len(pieces))
+    _, _, areas = nodes_in_shadows(pieces, 2)
+    return np.asarray(np.sum(areas, axis=-1) / np.pi)
 
 
-def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Quadrature over the part within the stop of pieces of shadows, with ``count`` nodes along each side of a box.
 
     Args:
-        pieces: convex polygons that do not overlap, counterclockwise, (B, K, V, 2).
+        pieces: convex polygons that do not overlap, counterclockwise, (B, K, V, 2); K may be 0.
         count: nodes.
 
     Returns:
-        Points, complex, (B, Q), and weights of the area.
+        Points, complex, (B, Q), weights of the area, (B, Q), and the areas of the pieces, (B, K).
     """
-    if not pieces.shape[1]:
-        return np.zeros((len(pieces), 0), complex), np.zeros((len(pieces), 0))
-    tiles, _ = tiled(pieces)
+    images, number = pieces.shape[:2]
+    if not number:
+        return np.zeros((images, 0), complex), np.zeros((images, 0)), np.zeros((images, 0))
+    tiles, tiled_from = tiled(pieces)
     flat = tiles.reshape(-1, *tiles.shape[2:])
     points, weights = quadrature_within(flat, np.ones((len(flat), 1), complex), count)
-    return points.reshape(len(pieces), -1), weights.reshape(len(pieces), -1)
+    of_tiles = np.sum(weights.reshape(*tiles.shape[:2], -1), axis=-1)
+    areas = of_tiles @ (tiled_from[:, None] == np.arange(number))
+    return points.reshape(images, -1), weights.reshape(images, -1), areas
 
 
 def outlines_on_stop(

@@ -41,7 +41,7 @@ class LitStop:
             count: nodes along each side of a shadow's box.
         """
         nodes = quadrature.disk(rings)
-        points, dark = nodes_in_shadows(pieces, count)
+        points, dark, _ = nodes_in_shadows(pieces, count)
         whole = (len(pieces), nodes.count)
         x, y = (
             np.concatenate([np.broadcast_to(own, whole), taken], axis=1)
@@ -62,7 +62,7 @@ def holes(pieces: np.ndarray) -> np.ndarray:
     Args:
         pieces: convex polygons that do not overlap, (F, K, V, 2).
     """
-    points, weight = nodes_in_shadows(pieces, 4)
+    points, weight, _ = nodes_in_shadows(pieces, 4)
     taken = np.sum(weight, axis=1)
     moment = np.sum(weight * np.abs(points) ** 2, axis=1)
     least = taken**2 / (2.0 * np.pi)

@@ -27,9 +27,9 @@ from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.system import SystemBatch
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.edge_shadow import StopOutlines, outlines_on_stop, settled_shadows
+from optics.waves.edge_shadow import StopOutlines, nodes_in_shadows, outlines_on_stop, settled_shadows
 from optics.waves.imaging import ImagingRays
-from optics.waves.pupil_shadow import SMALLEST, quadrature_within, separate, tiled
+from optics.waves.pupil_shadow import SMALLEST, separate
 from optics.waves.pupil_stack import products, to_terms
 from scenes.models.camera_model import CameraModel
 from scenes.models.clearance import convex_bodies
@@ -105,16 +105,7 @@ class Shadows:
     @classmethod
     def within(cls, pieces: np.ndarray, owners: tuple[str, ...]) -> Shadows:
         """Shadows of convex polygons (B, K, V, 2) that do not overlap, with the K names of what throws them."""
-        count = len(pieces)
-        tiles, tiled_from = tiled(pieces)
-        flat = tiles.reshape(-1, *tiles.shape[2:])
-        points, weights = (
-            a.reshape(*tiles.shape[:2], _NODES**2)
-            for a in quadrature_within(flat, np.ones((len(flat), 1), complex), _NODES)
-        )
-        areas = np.sum(weights, axis=-1) @ (tiled_from[:, None] == np.arange(pieces.shape[1]))
-        points, weights = (a.reshape(count, -1) if pieces.shape[1] else np.zeros((count, 0)) for a in (points, weights))
-        return cls(pieces, owners, points, weights, areas)
+        return cls(pieces, owners, *nodes_in_shadows(pieces, _NODES))
 
     def and_edges(self, outlines: Callable[[int], StopOutlines], name: str) -> Shadows:
         """These shadows together with those of edges of surfaces.

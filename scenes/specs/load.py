@@ -18,7 +18,7 @@ from scenes.specs.job import JobSpec, with_tables
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
-from scenes.yaml.yaml_file import read_yaml
+from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
 
@@ -57,9 +57,13 @@ def instrument_path(job: JobSpec) -> Path:
     Raises:
         InputError: there is none, said with the line of the job's file.
     """
-    if place_of(INSTRUMENTS, job.instrument, Path()) is None and job.instrument in library_names(CAMERAS):
-        return find_named(CAMERAS, job.instrument, job, ("instrument",))
-    return find_named(INSTRUMENTS, job.instrument, job, ("instrument",))
+    return find_named(_folder_of_instrument(job.instrument), job.instrument, job, ("instrument",))
+
+
+def _folder_of_instrument(reference: str | Path) -> str:
+    """Where the library has what a reference calls an instrument: a camera alone is one, too."""
+    alone = place_of(INSTRUMENTS, reference, Path()) is None and str(reference) in library_names(CAMERAS)
+    return CAMERAS if alone else INSTRUMENTS
 
 
 def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
@@ -77,24 +81,16 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
     Raises:
         InputError: as `load_job`.
     """
-    path = place_of(INSTRUMENTS, name_or_path, Path())
-    if path is None and str(name_or_path) in library_names(CAMERAS):
-        path = place_of(CAMERAS, name_or_path, Path())
-    if path is not None and is_camera(path):
-        camera = validate(CameraSpec, read_yaml(path))
+    path, text = _read_named(_folder_of_instrument(name_or_path), name_or_path)
+    if isinstance(text.data, dict) and "mirrors" in text.data:
+        camera = validate(CameraSpec, text)
         own = path.stem if path.parent == _folder(CAMERAS) else path.name
         return InstrumentSpec.of_camera(camera.name, own).with_source(Source(str(path)))
-    instrument = load_named(InstrumentSpec, INSTRUMENTS, name_or_path)
+    instrument = validate(InstrumentSpec, text)
     paths_of_cameras(instrument)
     if instrument.monitor is not None:
         path_of_detector(instrument)
     return instrument
-
-
-def is_camera(path: str | Path) -> bool:
-    """Whether a file is a camera's prescription and not an instrument. Raises InputError: it cannot be read."""
-    data = read_yaml(path).data
-    return isinstance(data, dict) and "mirrors" in data
 
 
 def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
@@ -218,10 +214,15 @@ def load_named(model: type[SpecType], folder: str, name_or_path: str | Path) -> 
     Raises:
         InputError: as `load_instrument`.
     """
+    return validate(model, _read_named(folder, name_or_path)[1])
+
+
+def _read_named(folder: str, name_or_path: str | Path) -> tuple[Path, YamlFile]:
+    """The file that a reference leads to, and what it says; arguments and errors as `load_named`."""
     path = place_of(folder, name_or_path, Path())
     if path is None:
         raise InputError(_no_such_name(folder, str(name_or_path)).at(""))
-    return validate(model, read_yaml(path))
+    return path, read_yaml(path)
 
 
 def _names_and_paths(folder: str) -> str:

@@ -18,6 +18,7 @@ from scenes.specs.resolved import resolve_camera
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import read_yaml
+from tests.scenes.test_stated_focal_length import CASSEGRAIN
 from tests.twin.commands import files, invoke
 from tests.twin.test_blurred_cameras import GF7, gf7_with
 from twin.camera.__main__ import app
@@ -103,22 +104,6 @@ def test_a_mirror_in_the_way_is_found(backend, tmp_path) -> None:
     taken = float(met @ nodes.share)
     assert 0.1 < taken < 0.9
     assert shares["M2"] == pytest.approx(taken, abs=0.05)  # 144 rays tell shares to some percent
-
-
-CASSEGRAIN = """
-name: cassegrain
-focal_length: 4 m
-entrance_pupil: 500 mm
-field_bias: 0 deg
-field: {x: 0.2 deg, y: 0.2 deg}
-wavelength: 650 nm
-stop: M1
-mirrors:
-  M1: {z: 0 m, radius: -2 m, conic: -1}
-  M2: {z: -0.7 m, radius: -0.8 m, conic: -2.77777777777778}
-image: {z: 0.5 m}
-line: {pixels: 2000, pitch: 7 um}
-"""
 
 
 def test_a_mirror_that_light_goes_through_has_a_hole_there(backend, tmp_path) -> None:

@@ -77,10 +77,6 @@ class Refocus:
     tilt: bool
 
 
-CHANGES = ("d_alpha", "d_beta", "d_gamma", "d_f")
-"""Of a camera's geometry, as ``LineChange`` calls them, in the order of `analysis.monitor.parameters.ESTIMATED`."""
-
-
 @dataclass(frozen=True, eq=False)
 class Perturbed:
     """What a perturbation does to a camera.
@@ -322,8 +318,7 @@ def perturbed_text(run: CameraRun) -> str:
     done = run.perturbed
     if done is None:
         return ""
-    values = [float(getattr(done.change, key)[0]) for key in CHANGES]
-    told = zip(parameters.ESTIMATED, values, strict=True)
+    told = zip(parameters.ESTIMATED, done.change.vector[0].tolist(), strict=True)
     moved = ", ".join(f"{one.symbol} {one.per_si * value + 0.0:+.{one.decimals}f} {one.unit}" for one, value in told)
     text = (
         f"Perturbed: {done.words}. The geometry changes by {moved}; the worst wavefront error goes from "
@@ -403,7 +398,7 @@ _PERTURBED: Record[Perturbed] = Record(
     *(
         Quantity(
             one.key,
-            lambda p, k=k: getattr(p.change, CHANGES[k])[0],  # type: ignore[misc]
+            lambda p, k=k: p.change.vector[0, k],  # type: ignore[misc]
             one.meaning,
         )
         for k, one in enumerate(parameters.ESTIMATED)

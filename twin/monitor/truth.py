@@ -66,8 +66,7 @@ class Truth:
         Args:
             camera: its name.
         """
-        change = self.cameras[camera]
-        return np.stack([change.d_alpha, change.d_beta, change.d_gamma, change.d_f], axis=-1)
+        return self.cameras[camera].vector
 
     def ground_error(self, geometry: GroundGeometry) -> np.ndarray:
         """Errors (S, 3) along the track, across it and up of points that are located by the nominal cameras, metres.

@@ -257,7 +257,7 @@ def _changes(truths: Sequence[Truth], reference: int) -> tuple[dict[str, np.ndar
     out, distance = {}, {}
     for name in truths[0].cameras:
         every = [one.cameras[name] for one in truths]
-        values = np.concatenate([np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f], axis=-1) for c in every])
+        values = np.concatenate([change.vector for change in every])
         out[name] = values - values[reference]
         distance[name] = float(np.concatenate([c.principal_distance for c in every])[reference])
     return out, distance
