@@ -22,7 +22,7 @@ from scenes.models.camera_model import LAUNCH_DISTANCE
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.resolved import resolve
 from tests.twin.commands import invoke
-from twin.monitor.image_quality import FIELDS, quality_dicts
+from twin.monitor.image_quality import FIELDS, QUALITY, quality_dicts
 from twin.monitor.image_quality import image_quality as quality_of
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.study.runs.base_job import Run
@@ -237,11 +237,11 @@ def test_a_state_is_the_same_alone_and_among_others_one_of_which_is_lost(gf7_pai
     assert "mirrors" in lost.reasons[0] or "no ray" in lost.reasons[0]
     assert "cuts" in lost.reasons[2]
     assert not any(kept.reasons)
-    written = several.to_dicts()[0]["cameras"][CAMERA]
+    written = QUALITY(several)["before"]["cameras"][CAMERA]
     assert written["wfe_rms_waves"] is None
     assert written["defocus_um"] == {"left": None, "centre": None, "right": None}
     assert written["reason"] == lost.reasons[0]
-    json.dumps(several.to_dicts(), allow_nan=False)
+    json.dumps(QUALITY(several), allow_nan=False)
 
 
 def test_a_line_that_moves_in_its_focal_plane(gf7_pair, backend) -> None:

@@ -272,12 +272,11 @@ FIRST_ORDER: Record[FirstOrderData] = Record(
     ),
     Quantity("pitch_um", lambda d: d.spec.line.pitch, "pitch of the line's pixels"),
     Quantity("pixel_arcsec", lambda d: d.spec.line.pitch / d.focal_length_line, "angle that a pixel sees"),
-    Quantity("nyquist_per_mm", lambda d: 1e-3 * 0.5 / d.spec.line.pitch, "of the line's pixels", converted=False),
+    Quantity("nyquist_per_mm", lambda d: 0.5 / d.spec.line.pitch, "of the line's pixels"),
     Quantity(
         "cutoff_per_mm",
-        lambda d: 1e-3 / (d.spec.wavelength * d.working_f_number_line),
+        lambda d: 1.0 / (d.spec.wavelength * d.working_f_number_line),
         "frequency from which diffraction leaves no contrast along the line",
-        converted=False,
     ),
     Quantity(
         "sampling_lambda_f_per_pixel",

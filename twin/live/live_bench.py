@@ -28,7 +28,7 @@ from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import MIN_LIGHT, require_one_state
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.crosstalk import crosstalk
-from twin.monitor.image_quality import image_quality
+from twin.monitor.image_quality import quality_dicts
 from twin.monitor.observation import StateReader
 from twin.pictures.scene_file import motions
 from twin.run.random_streams import stream
@@ -181,7 +181,7 @@ class LiveBench:
         """Contents of quality.json of a state."""
         job, experiment = self.twin.resolved.job, self.twin.experiment
         obstructed = job.render.obstructed
-        return image_quality(experiment.instrument, experiment.backend, [state], obstruction=obstructed).to_dicts()[0]
+        return quality_dicts(experiment.instrument, experiment.backend, [state], obstructed)[0]
 
     def perturbed(self, asked: AskedState) -> InstrumentTwin:
         """The instrument as the knobs stand.

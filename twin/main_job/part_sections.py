@@ -9,7 +9,7 @@ import numpy as np
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
-from twin.monitor.image_quality import PLACES, CameraQuality, ImageQuality
+from twin.monitor.image_quality import AT_FIELDS, PLACES, CameraQuality, ImageQuality
 from twin.path_tracing.families import family_name
 from twin.path_tracing.path_result import Family
 from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
@@ -70,22 +70,15 @@ def quality_section(run: JobRun, drawn: Mapping[str, str]) -> Section | None:
 
 
 def _quality_rows(name: str, camera: CameraQuality, quality: ImageQuality) -> list[list[Cell]]:
-    lines = (
-        ("wfe_rms_waves", "wavefront error, rms [waves]", camera.wfe, 1.0, 4),
-        ("wfe_rms_waves_focus_removed", "the same at best focus [waves]", camera.wfe_refocused, 1.0, 4),
-        ("defocus_um", "best focus − line CCD [µm]", camera.defocus, 1e6, 1),
-        ("mtf_along_line", "MTF at Nyquist along the line", camera.mtf_along_line, 1.0, 4),
-        ("mtf_along_track", "MTF at Nyquist along the track", camera.mtf_along_track, 1.0, 4),
-        ("light_lost", "light taken by bodies in the beam [%]", camera.light_lost, 1e2, 2),
-    )
     rows: list[list[Cell]] = []
-    for key, label, values, unit, decimals in lines:
-        row: list[Cell] = [label]
+    for one in AT_FIELDS:
+        values = one.shown_value(one.value(camera))
+        row: list[Cell] = [one.shown_head]
         for place, field in PLACES.items():
             for s, when in enumerate(_WHEN):
-                value = unit * float(values[s, quality.fields.index(field)])
-                text = fixed(value, decimals, sign=key == "defocus_um")
-                row.append(Marked(text, "", "number", f"quality.{name}.{key}.{place}.{when}"))
+                value = float(values[s, quality.fields.index(field)])
+                text = fixed(value, one.decimals or 0, sign=one.key == "defocus_um")
+                row.append(Marked(text, "", "number", f"quality.{name}.{one.key}.{place}.{when}"))
         rows.append(row)
     return rows
 
@@ -95,14 +88,12 @@ def _every_field(quality: ImageQuality) -> Table:
     places = {quality.fields.index(field): place for place, field in PLACES.items()}
     rows: list[list[Cell]] = []
     for name, camera in quality.cameras.items():
+        values = [one.shown_value(one.value(camera)) for one in AT_FIELDS]
         for s, when in enumerate(_WHEN):
             for k, field in enumerate(quality.fields):
-                numbers = (camera.wfe, camera.wfe_refocused, 1e6 * camera.defocus, camera.mtf_along_line)
-                values = [float(n[s, k]) for n in (*numbers, camera.mtf_along_track, 1e2 * camera.light_lost)]
-                rows.append([name, when, float(field), places.get(k, ""), *values])
-    heads = ["camera", "state", "field", "place", "wavefront error [waves]", "at best focus [waves]"]
-    heads += ["best focus - line CCD [µm]", "MTF at Nyquist along the line", "MTF at Nyquist along the track"]
-    return Table("quality", "Image quality", "", [*heads, "light taken [%]"], rows)
+                rows.append([name, when, float(field), places.get(k, ""), *(float(found[s, k]) for found in values)])
+    heads = ["camera", "state", "field", "place", *(one.shown_head for one in AT_FIELDS)]
+    return Table("quality", "Image quality", "", heads, rows)
 
 
 METHODS = {"edge": "ISO 12233 slanted edge", "bars": "fundamental of tilted bars"}

@@ -15,9 +15,9 @@ from twin.main_job.assumptions import assumed
 from twin.main_job.render_drawings import load_drawing
 from twin.main_job.render_folder import write_run
 from twin.main_job.render_job import render_job
-from twin.main_job.render_results import JobRun, RenderRun, quality_dict
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import judge, recovered_numbers
-from twin.monitor.image_quality import PLACES
+from twin.monitor.image_quality import AT_FIELDS, PLACES, QUALITY
 from twin.run.cli import print_verdict, print_whole, result_table
 from twin.run.command import Result, print_warnings
 from twin.run.procedure import Session
@@ -64,7 +64,7 @@ def _numbers(run: JobRun) -> dict[str, Any]:
         if run.series is not None:
             parts["course"] = run.series.to_dict()
     elif run.quality is not None:
-        parts["quality"] = quality_dict(run.quality)
+        parts["quality"] = QUALITY(run.quality)
     if run.targets is not None:
         parts["mtf"] = run.targets.to_dict()
     return {kind: described(kind, data) for kind, data in parts.items()}
@@ -146,14 +146,10 @@ def _changes(run: JobRun) -> Table:
         return table
     for name, camera in run.quality.cameras.items():
         table.add_row(f"[bold]{escape(name)}[/], left / centre / right", "before -> after")
-        for label, values in (
-            ("wavefront error [waves rms]", camera.wfe),
-            ("MTF at Nyquist along the line", camera.mtf_along_line),
-            ("MTF at Nyquist along the track", camera.mtf_along_track),
-        ):
+        for told in (AT_FIELDS[key] for key in ("wfe_rms_waves", "mtf_along_line", "mtf_along_track")):
+            before, after = told.value(camera)
             places = [run.quality.fields.index(field) for field in PLACES.values()]
-            pairs = (f"{values[0, k]:.4f} -> {values[1, k]:.4f}" for k in places)
-            table.add_row(escape(label), " / ".join(pairs))
+            table.add_row(escape(told.shown_head), " / ".join(f"{before[k]:.4f} -> {after[k]:.4f}" for k in places))
     return table
 
 

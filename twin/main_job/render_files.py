@@ -11,8 +11,9 @@ import numpy as np
 
 from scenes.specs.instrument import Channel
 from twin.main_job import job_tables
-from twin.main_job.render_results import JobRun, RenderRun, quality_dict
+from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import recovered_numbers
+from twin.monitor.image_quality import QUALITY
 from twin.monitor.time_series import TimeSeries
 from twin.run.data_files import FRAME_FORMATS, SPOT_STRETCH, FrameFacts, frame_files, netcdf
 from twin.run.reference_frames import described, frames_text
@@ -65,7 +66,7 @@ def write_results(run: JobRun, folder: RunFolder) -> None:
     if job_tables.heated_of(run):
         _write_numbers(folder, "temperature", job_tables.table_numbers(run, "temperature"))
     if run.quality is not None:
-        _write_numbers(folder, "quality", quality_dict(run.quality))
+        _write_numbers(folder, "quality", QUALITY(run.quality))
 
 
 def _write_monitor(run: RenderRun, folder: RunFolder) -> None:

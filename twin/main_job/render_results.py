@@ -216,22 +216,3 @@ class RenderRun(JobRun):
     def recovered_dict(self) -> dict[str, Any]:
         """Contents of recovered.json."""
         return self.reading.recovered_dict()
-
-
-def quality_dict(quality: ImageQuality) -> dict[str, Any]:
-    """Contents of quality.json: ``cameras`` of the perturbed state, and ``before`` those of the nominal one."""
-    before, after = quality.to_dicts()
-    light = {
-        name: {
-            "nyquist_per_mm": 1e-3 * camera.nyquist,
-            "spectrum_nm": [1e9 * wavelength for wavelength in camera.wavelengths],
-        }
-        for name, camera in quality.cameras.items()
-    }
-    about = {
-        "obstruction": "traced" if quality.obstruction else "ignore",
-        "wavelength_nm": 1e9 * quality.wavelength,
-        "fields": list(quality.fields),
-        "mtf": light,
-    }
-    return {**after, "before": before, **about}

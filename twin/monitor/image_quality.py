@@ -54,6 +54,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
 from scenes.specs.spectrum import SpectrumSpec
+from twin.run.quantity import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
 FIELDS = (1.0, 0.7, 0.0, -0.7, -1.0)
@@ -166,36 +167,69 @@ class ImageQuality:
             f"image quality of {name}: {reason}" for name, c in self.cameras.items() for reason in c.reasons if reason
         )
 
-    def to_dicts(self) -> list[dict[str, Any]]:
-        """Contents of quality.json of every state; what is not known is null.
-
-        Of each camera mean and worst wavefront error over the fields, the mean of those at best focus, and defocus and
-        MTF at those of PLACES that are among the fields.
-        """
+    def state(self, number: int) -> dict[str, CameraState]:
+        """Every camera in one state, for files."""
         where = {place: self.fields.index(field) for place, field in PLACES.items() if field in self.fields}
-        states = range(len(next(iter(self.cameras.values())).reasons))
-        return [{"cameras": {name: _camera_dict(c, s, where) for name, c in self.cameras.items()}} for s in states]
+        return {name: CameraState(camera, number, where) for name, camera in self.cameras.items()}
 
 
-def _camera_dict(camera: CameraQuality, s: int, where: Mapping[str, int]) -> dict[str, Any]:
-    def at(values: np.ndarray, unit: float = 1.0) -> dict[str, float | None]:
-        return {place: _known(unit * values[s, k]) for place, k in where.items()}
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """One camera in one state, and which fields are at the places that files name."""
 
-    out: dict[str, Any] = {
-        "wfe_rms_waves": _known(np.mean(camera.wfe[s])),
-        "wfe_rms_waves_focus_removed": _known(np.mean(camera.wfe_refocused[s])),
-        "wfe_worst_waves": _known(np.max(camera.wfe[s])),
-        "defocus_um": at(camera.defocus, 1e6),
-        "mtf_along_line": at(camera.mtf_along_line),
-        "mtf_along_track": at(camera.mtf_along_track),
-        "light_lost": at(camera.light_lost),
-        "obstructed_by": {name: at(share) for name, share in camera.bodies.items()},
-    }
-    return {**out, "reason": camera.reasons[s]} if camera.reasons[s] else out
+    camera: CameraQuality
+    number: int
+    places: Mapping[str, int]
+
+    def named(self, values: np.ndarray) -> dict[str, float | None]:
+        """Place -> value at it, of values (S, F)."""
+        return {place: _known(values[self.number, k]) for place, k in self.places.items()}
 
 
 def _known(value: float | np.floating[Any]) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+_REFOCUSED, _TAKEN = "wavefront error at each field's own best focus", "share of the light that bodies in the beam take"
+AT_FIELDS: Record[CameraQuality] = Record(
+    "Image quality of a camera in every state at every field, (S, F).",
+    Quantity("wfe_rms_waves", lambda c: c.wfe, "wavefront error without piston and tilt", "wavefront error, rms", 4),
+    Quantity("wfe_rms_waves_focus_removed", lambda c: c.wfe_refocused, _REFOCUSED, "the same at best focus [waves]", 4),
+    Quantity("defocus_um", lambda c: c.defocus, "best focus less line CCD, + downstream", "best focus − line CCD", 1),
+    Quantity("mtf_along_line", lambda c: c.mtf_along_line, "at Nyquist", "MTF at Nyquist along the line", 4),
+    Quantity("mtf_along_track", lambda c: c.mtf_along_track, "at Nyquist", "MTF at Nyquist along the track", 4),
+    Quantity("light_lost", lambda c: c.light_lost, _TAKEN, "light taken by bodies in the beam", 2, shown="percent"),
+)
+"""What is told of every field: the one list that files, reports and scripts follow."""
+
+
+def _at_places(one: Quantity[CameraQuality]) -> Quantity[CameraState]:
+    return Quantity(one.key, lambda of: of.named(one.of(of.camera)), f"{one.meaning}, at places of the line")
+
+
+_CAMERA: Record[CameraState] = Record(
+    "Image quality of a camera in one state; null where it is not known.",
+    Quantity("wfe_rms_waves", lambda of: _known(np.mean(of.camera.wfe[of.number])), "wavefront error, mean of RMS"),
+    Quantity("wfe_rms_waves_focus_removed", lambda of: _known(np.mean(of.camera.wfe_refocused[of.number])), _REFOCUSED),
+    Quantity("wfe_worst_waves", lambda of: _known(np.max(of.camera.wfe[of.number])), "the same of the worst field"),
+    *(_at_places(AT_FIELDS[key]) for key in ("defocus_um", "mtf_along_line", "mtf_along_track", "light_lost")),
+    Quantity("obstructed_by", lambda of: {k: of.named(v) for k, v in of.camera.bodies.items()}, "body -> share"),
+    Quantity("reason", lambda of: of.camera.reasons[of.number] or None, "why numbers are missing", where_known=True),
+)
+_LIGHT: Record[CameraQuality] = Record(
+    "What the MTF is of.",
+    Quantity("nyquist_per_mm", lambda camera: camera.nyquist, "Nyquist frequency of the line CCD"),
+    Quantity("spectrum_nm", lambda camera: camera.wavelengths, "first and last wavelength of the light"),
+)
+QUALITY: Record[ImageQuality] = Record(
+    "quality.json: image quality of the perturbed state, and before of the nominal one.",
+    Quantity("cameras", lambda quality: quality.state(1), "perturbed, by camera", record=_CAMERA),
+    Quantity("before", lambda quality: {"cameras": quality.state(0)}, "the same of the nominal state", record=_CAMERA),
+    Quantity("obstruction", lambda q: "traced" if q.obstruction else "ignore", "whether bodies in the beams count"),
+    Quantity("wavelength_nm", lambda quality: quality.wavelength, "unit of wavefront errors"),
+    Quantity("fields", lambda quality: quality.fields, "shares of half the line, +1 at its left end"),
+    Quantity("mtf", lambda quality: quality.cameras, "light and limit of the MTF by camera", record=_LIGHT),
+)
 
 
 @one_blas_thread()  # of small matrices: threads would only wait for each other
@@ -231,22 +265,17 @@ def image_quality(
     for name in instrument.cameras:
         shadows = imaging_shadows(instrument, name, backend) if obstruction else None
         bench = _CameraBench(instrument, name, backend, tuple(fields), wavelength, shadows)
-        out = np.full((_COLUMNS, len(states), len(fields)), np.nan)
+        out = np.full((len(_COLUMNS), len(states), len(fields)), np.nan)
         reasons = [""] * len(states)
         for start in range(0, len(states), AT_ONCE):
             bench.fill(list(states), np.arange(start, min(start + AT_ONCE, len(states))), out, reasons)
         cameras[name] = CameraQuality(
-            wfe=out[0],
-            wfe_refocused=out[1],
-            defocus=out[2],
-            mtf_along_line=out[3],
-            mtf_along_track=out[4],
-            light_lost=out[5],
             nyquist=bench.nyquist,
             wavelengths=bench.ends,
             reasons=tuple(reasons),
             bodies=FrozenMap(bench.bodies(len(states))),
             pupils=tuple(bench.pupils.get(s, ()) for s in range(len(states))),
+            **dict(zip(_COLUMNS, out, strict=True)),
         )
     return ImageQuality(tuple(fields), wavelength, FrozenMap(cameras), obstruction)
 
@@ -255,11 +284,12 @@ def quality_dicts(
     instrument: Instrument, backend: Backend, states: Sequence[State], obstruction: bool = True
 ) -> list[dict[str, Any]]:
     """Contents of quality.json for each of many states, traced together."""
-    return image_quality(instrument, backend, states, obstruction=obstruction).to_dicts() if states else []
+    found = image_quality(instrument, backend, states, obstruction=obstruction)
+    return [{"cameras": {k: _CAMERA(of) for k, of in found.state(s).items()}} for s in range(len(states))]
 
 
-_COLUMNS = 6
-"""Arrays of ``CameraQuality``, in its order."""
+_COLUMNS = ("wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track", "light_lost")
+"""Arrays of ``CameraQuality`` that are worked out together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,7 +433,7 @@ class _CameraBench:
         return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values (_COLUMNS, B), the share of each beam that is cut, and whether an MTF is not to be had."""
+        """Values (6, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
         rays, size, shadows = traced.rays, traced.size, traced.shadows
         origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
         radius = float(self.model.first_order.exit_pupil_distance[0])
@@ -485,7 +515,7 @@ class _CameraBench:
         return total, smooth
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
-        """Hold numbers (_COLUMNS, B) to what any camera has.
+        """Hold numbers (6, B) of _COLUMNS to what any camera has.
 
         Raises:
             UnphysicalError: one cannot be; with the camera and what it is.
@@ -496,13 +526,8 @@ class _CameraBench:
         of = f"of camera {self.name}"
         hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
         hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
-        hold_below(
-            f"a wavefront error {of} at best focus",
-            refocused,
-            wfe * (1.0 + _ROUNDING),
-            "that on the line CCD",
-            _ROUNDING,
-        )
+        most = wfe * (1.0 + _ROUNDING)
+        hold_below(f"a wavefront error {of} at best focus", refocused, most, "that on the line CCD", _ROUNDING)
         hold_within(f"an MTF {of}", np.array(mtf), 0.0, 1.0, _MTF_ROUNDING)
         if shadows is None or not shadows.owners:
             return

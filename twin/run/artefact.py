@@ -27,8 +27,8 @@ FAR = 3.0
 
 
 def shown_unit(unit: str) -> str:
-    """A unit as reports write it, of its name in files: ``µm`` of ``um``."""
-    return unit.replace("um", "µm")
+    """A unit as reports write it, of its name in files: ``µm`` of ``um``, ``%`` of ``percent``."""
+    return unit.replace("um", "µm").replace("percent", "%")
 
 
 def _typeset(text: str) -> str:

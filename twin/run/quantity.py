@@ -37,7 +37,7 @@ def in_unit(value: Any, unit: str) -> Any:
 
     Args:
         value: number, array, sequence or mapping of numbers, or None.
-        unit: as `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares.
+        unit: as `scenes.specs.study.unit_of` reads it off a key; "mm2" and the like are squares, "1/mm" is an inverse.
     """
     if value is None or not unit:
         return value
@@ -49,7 +49,8 @@ def in_unit(value: Any, unit: str) -> Any:
         return np.degrees(value)
     if unit in _SI:
         return value / _SI[unit]
-    factor = _PER_SI.get(unit.removesuffix("2"), 1.0) ** (2 if unit.endswith("2") else 1)
+    power = (2 if unit.endswith("2") else 1) * (-1 if unit.startswith("1/") else 1)
+    factor = _PER_SI.get(unit.removeprefix("1/").removesuffix("2"), 1.0) ** power
     return value if factor == 1.0 else factor * value
 
 
@@ -67,6 +68,7 @@ class Quantity(Generic[S]):
         record: of what stands below the key.
         where_known: files have the key only where the value is not None.
         converted: whether the source is in SI units; False where it already is in the unit of the key.
+        shown: unit in which reports have it, empty for that of the key: ``percent`` of a share.
     """
 
     key: str
@@ -77,6 +79,7 @@ class Quantity(Generic[S]):
     record: Record[Any] | None = None
     where_known: bool = False
     converted: bool = True
+    shown: str = ""
 
     @property
     def below(self) -> Record[Any] | None:
@@ -93,8 +96,12 @@ class Quantity(Generic[S]):
     @property
     def shown_head(self) -> str:
         """Head of a report's column, with its unit in brackets."""
-        words = self.head or self.key.removesuffix(f"_{self.unit}").replace("_", " ")
-        return f"{words} [{shown_unit(self.unit)}]" if self.unit else words
+        words, unit = self.head or self.key.removesuffix(f"_{self.unit}").replace("_", " "), self.shown or self.unit
+        return f"{words} [{shown_unit(unit)}]" if unit else words
+
+    def shown_value(self, value: Any) -> Any:
+        """A value as files have it, in the unit of reports."""
+        return in_unit(value, self.shown)
 
     def value(self, source: S) -> Any:
         """The value as files have it, before it is plain data."""
@@ -177,13 +184,17 @@ class Record(Generic[S]):
             keys: of the columns, in their order; all if none are given.
             label: head of the column of names.
         """
+
+        def told(row: Mapping[str, Any]) -> list[Cell]:
+            return [one.shown_value(row.get(one.key)) for one in shown]
+
         shown = self._chosen(keys)
         heads, decimals = [one.shown_head for one in shown], [one.decimals for one in shown]
         if isinstance(rows, Mapping):
             heads, decimals = [label, *heads], [None, *decimals]
-            cells: list[list[Cell]] = [[first, *(row.get(one.key) for one in shown)] for first, row in rows.items()]
+            cells: list[list[Cell]] = [[first, *told(row)] for first, row in rows.items()]
         else:
-            cells = [[row.get(one.key) for one in shown] for row in rows]
+            cells = [told(row) for row in rows]
         return Table(name, title, caption, heads, cells, decimals)
 
     def data_table(

@@ -24,6 +24,7 @@ from twin.main_job.monitor_reading import MonitorReading
 from twin.main_job.render_files import irradiance
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.verdict import judge
+from twin.monitor.image_quality import AT_FIELDS
 from twin.run.procedure import Session, silent
 from twin.run.reference_frames import frames_text
 from twin.run.run_folder import RunFolder
@@ -101,14 +102,7 @@ class Shot:
         """
         found = self.run.quality
         rows = {
-            (name, when, field): {
-                "wfe_rms_waves": camera.wfe[s, k],
-                "wfe_rms_waves_focus_removed": camera.wfe_refocused[s, k],
-                "defocus_um": 1e6 * camera.defocus[s, k],
-                "mtf_along_line": camera.mtf_along_line[s, k],
-                "mtf_along_track": camera.mtf_along_track[s, k],
-                "light_lost": camera.light_lost[s, k],
-            }
+            (name, when, field): {one.key: one.value(camera)[s, k] for one in AT_FIELDS}
             for name, camera in ({} if found is None else found.cameras).items()
             for s, when in enumerate(("before", "after"))
             for k, field in enumerate(() if found is None else found.fields)

@@ -28,8 +28,8 @@ from scenes.yaml.errors import InputError, Issue, KeyPath, Problem
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Spec, annotation_at, validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.main_job.render_results import JobRun, RenderRun, quality_dict
-from twin.monitor.image_quality import quality_dicts
+from twin.main_job.render_results import JobRun, RenderRun
+from twin.monitor.image_quality import QUALITY, quality_dicts
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe
 from twin.monitor.truth import Truth
@@ -295,7 +295,7 @@ def _alone(resolved: ResolvedJob, backend: Backend) -> Outcome:
     if run.targets is not None:
         out["mtf"] = run.targets.to_dict()
     if run.quality is not None:
-        out["quality"] = quality_dict(run.quality)
+        out["quality"] = QUALITY(run.quality)
     return out
 
 
