@@ -72,9 +72,9 @@ def test_families_scatter_as_their_sigma_says(backend, gf7_pair) -> None:
     found: dict[str, list[tuple[float, float]]] = {}
     for seed in range(16):
         run = tracer.run(source, 20_000, seed)
-        for family, share, sigma in StrayResult({}, {channel.key: run}, {}).relative(channel.key):
-            if family.kind == "ghost":
-                found.setdefault(f"{family.detector} {family.text}", []).append((share, sigma))
+        for one in StrayResult({}, {channel.key: run}, {}).relative(channel.key):
+            if one.family.kind == "ghost":
+                found.setdefault(f"{one.family.detector} {one.family.text}", []).append((one.share, one.sigma))
     total, degrees = 0.0, 0
     for every in found.values():
         if len(every) == 16:
@@ -161,7 +161,7 @@ def test_stray_light_in_photons(backend, gf7_pair) -> None:
     scale = stray.photons_per_power["forward/left"]
     assert scale * run.nominal(CCD).energy == pytest.approx(photons, rel=1e-12)
     assert scale * run.images[CCD][NOMINAL].sum() == pytest.approx(photons, rel=1e-9)
-    ghosts = sum(relative for family, relative, _ in stray.relative("forward/left") if family.detector == CCD)
+    ghosts = sum(one.share for one in stray.relative("forward/left") if one.family.detector == CCD)
     assert stray.photons[CCD].sum() == pytest.approx(ghosts * photons, rel=1e-9)
     assert set(stray.photons) == {f"{c.key}/area_ccd" for c in gf7_pair.channels}
     image = run.images[CCD]

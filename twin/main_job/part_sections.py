@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -10,8 +11,7 @@ from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE, figure
 from twin.main_job.verdict import sharpness_lost
 from twin.monitor.image_quality import AT_FIELDS, PLACES, CameraQuality, ImageQuality
-from twin.path_tracing.families import family_name
-from twin.path_tracing.path_result import Family
+from twin.path_tracing.stray_light import FAMILY
 from twin.run.artefact import FAR, Artefact, Cell, Marked, Table, fixed, plain, residual, residual_cell, significant
 from twin.run.report import Section
 from twin.targets.target_images import DIRECTION_NAMES, DIRECTIONS
@@ -229,23 +229,18 @@ def stray_section(run: RenderRun) -> Section | None:
     amounts: list[list[Cell]] = []
     families: list[list[Cell]] = []
     surfaces: list[list[Cell]] = []
-    full: list[list[Cell]] = []
+    full: list[dict[str, Any]] = []
     for i, channel in enumerate(run.experiment.path.channels):
-        name = f"{channel.key}/area_ccd"
-        found = [one for one in after.traced.relative(channel.key) if one[0].detector == name]
-        by_kind = [sum(share for family, share, _ in found if family.kind == kind) for kind in ("ghost", "stray")]
+        found = [one for one in after.traced.relative(channel.key) if one.family.detector == f"{channel.key}/area_ccd"]
+        by_kind = [sum(one.share for one in found if one.family.kind == kind) for kind in ("ghost", "stray")]
         amounts.append([channel.key, float(shares[i]), *by_kind, float(after.photons[i].max())])
-        nominal = after.traced.runs[channel.key].nominal(name).touches
-        for k, (family, share, sigma) in enumerate(sorted(found, key=lambda one: -one[1])):
-            what, (x, y) = family_name(family.touches, nominal), (1e6 * float(c) for c in family.centroid)
-            chain = " ".join(map(str, family.touches))
-            full.append([channel.key, family.kind, what, share, sigma, x, y, family.count, chain])
-            if k < _STRONGEST:
-                size = Marked(f"{significant(share)} ± {significant(sigma, 1)}", "", "number")
-                where = [Marked(fixed(c, 1), "", "number") for c in (x, y)]
-                families.append([channel.key, family.kind, what, size, *where])
-                surfaces.append([channel.key, what, _way(family) or "not looked up"])
-    heads = ["area CCD", "kind", "name", "share of the spot", "its σ", "x [µm]", "y [µm]", "paths", "surfaces in order"]
+        told = [FAMILY(one) for one in found]
+        full += [{**one, "surfaces": " ".join(one["surfaces"])} for one in told]
+        for one in told[:_STRONGEST]:
+            size = f"{significant(one['relative_to_nominal'])} ± {significant(one['relative_to_nominal_sigma'], 1)}"
+            numbers = (Marked(text, "", "number") for text in (size, fixed(one["x_um"], 1), fixed(one["y_um"], 1)))
+            families.append([channel.key, one["kind"], one["name"], *numbers])
+            surfaces.append([channel.key, one["name"], _way(one["surfaces"]) or "not looked up"])
     parts: list[Artefact] = [
         Table(
             "stray-families",
@@ -255,7 +250,7 @@ def stray_section(run: RenderRun) -> Section | None:
             ("Area CCD", "kind", "what happens", "share", "x [µm]", "y [µm]"),
             families,
             within=IN_PAGE,
-            full=Table("stray_families", "Families", "", heads, full),
+            full=FAMILY.table("stray_families", "Families", "", full),
         ),
         Table(
             "stray",
@@ -292,9 +287,8 @@ def stray_section(run: RenderRun) -> Section | None:
     return Section("Ghosts and stray light", (about,), tuple(parts), len(parts) - 2, "stray")
 
 
-def _way(family: Family) -> str:
+def _way(way: list[str]) -> str:
     """Surfaces in order, without ``base/<camera>/monitor/<side>/`` of the prisms' names, which every step repeats."""
-    way = [str(touch) for touch in family.touches]
     prisms = [step for step in way if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)

@@ -62,19 +62,33 @@ class StrayResult:
     runs: Mapping[str, PathResult]
     photons_per_power: Mapping[str, float]
 
-    def relative(self, channel: str) -> tuple[tuple[Family, float, float], ...]:
-        """Families of a channel's source at any detector, each with its energy relative to the nominal family's and the
-        standard deviation of that by the number of paths.
-        """
+    def relative(self, channel: str) -> list[ListedFamily]:
+        """Families of a channel's source at any detector, the strongest first."""
         run = self.runs[channel]
         nominal = run.nominal(f"{channel}/area_ccd")
         others = [(family, family.energy / nominal.energy) for family in run.families if family.kind != "nominal"]
+        others.sort(key=lambda one: -one[1])
         # a path of the one is none of the other: the covariance of their energies is -1 / paths of the product
         own = (nominal.error / nominal.energy) ** 2 + 2.0 / run.paths
-        return tuple(
-            (family, share, share * float(np.sqrt((family.error / family.energy) ** 2 + own)))
-            for family, share in others
-        )
+        sigmas = [share * float(np.sqrt((family.error / family.energy) ** 2 + own)) for family, share in others]
+        return [ListedFamily(*one, sigma, nominal.touches) for one, sigma in zip(others, sigmas, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class ListedFamily:
+    """A family beside the nominal one of its source.
+
+    Attributes:
+        family: which.
+        share: its light over that of the nominal family at the source's own area CCD.
+        sigma: of this share, by the number of paths.
+        nominal: events of the nominal family.
+    """
+
+    family: Family
+    share: float
+    sigma: float
+    nominal: tuple[Touch, ...]
 
 
 def pinhole(
@@ -220,31 +234,14 @@ class StrayLight:
         return {"paths_per_source": self.paths, "sources": {name: _source(self, name) for name in self.traced.runs}}
 
 
-@dataclass(frozen=True, eq=False)
-class _ListedFamily:
-    """A family beside the nominal one of its source, for files.
-
-    Attributes:
-        family: which.
-        share: its light over that of the nominal family at the source's own area CCD.
-        sigma: of this share, by the number of paths.
-        nominal: events of the nominal family.
-    """
-
-    family: Family
-    share: float
-    sigma: float
-    nominal: tuple[Touch, ...]
-
-
-_FAMILY: Record[_ListedFamily] = Record(
+FAMILY: Record[ListedFamily] = Record(
     "All paths that reach a detector by the same events in the same order.",
     Quantity("detector", lambda one: one.family.detector, "where the paths end"),
     Quantity("kind", lambda one: one.family.kind, "ghost, or stray where something scatters or diffuses on the way"),
     Quantity("name", lambda one: family_name(one.family.touches, one.nominal), "in what it differs from nominal light"),
-    Quantity("surfaces", lambda one: list(map(str, one.family.touches)), "surface by surface"),
-    Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's own spot"),
-    Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "standard deviation by the number of paths"),
+    Quantity("surfaces", lambda one: list(map(str, one.family.touches)), "in order"),
+    Quantity("relative_to_nominal", lambda one: one.share, "its light over that of the source's spot", "share"),
+    Quantity("relative_to_nominal_sigma", lambda one: one.sigma, "sigma by the number of paths", "its σ"),
     Quantity("paths", lambda one: one.family.count, "that were traced"),
     Quantity("x_um", lambda one: one.family.centroid[0], "centroid from the detector's middle"),
     Quantity("y_um", lambda one: one.family.centroid[1], "centroid from the detector's middle"),
@@ -264,11 +261,8 @@ _BALANCE: Record[Balance] = Record(
 
 def _source(light: StrayLight, channel: str) -> dict[str, Any]:
     """The strongest families of a source, and its balance."""
-    run = light.traced.runs[channel]
-    nominal = run.nominal(f"{channel}/area_ccd").touches
-    strongest = sorted(light.traced.relative(channel), key=lambda one: -one[1])[:FAMILIES]
-    families = [_FAMILY(_ListedFamily(*one, nominal)) for one in strongest]
-    return {"families": families, "balance": _BALANCE(run.balance)}
+    families = [FAMILY(one) for one in light.traced.relative(channel)[:FAMILIES]]
+    return {"families": families, "balance": _BALANCE(light.traced.runs[channel].balance)}
 
 
 def stray_light(
