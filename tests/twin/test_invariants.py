@@ -95,13 +95,13 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
         image_quality(gf7_pair, backend, [{}], (0.0,))
     monkeypatch.undo()
     bench = quality._CameraBench(gf7_pair, "forward", backend, (0.0,), 650e-9, None)
-    good = np.array([[0.05], [0.04], [1e-6], [0.3], [0.3], [0.1]])
+    good = np.array([[0.1], [0.05], [0.04], [1e-6], [0.3], [0.3]])
     bench._hold(good, np.zeros(1), None)
     for row, value, said in (
-        (0, 7.9e11, "a wavefront error of camera forward in waves came out as 7.9e"),
-        (1, 0.06, "at best focus came out as 0.06"),
-        (3, -0.5, "an MTF of camera forward came out as -0.5"),
-        (5, -0.1, "that bodies take came out as -0.1"),
+        (1, 7.9e11, "a wavefront error of camera forward in waves came out as 7.9e"),
+        (2, 0.06, "at best focus came out as 0.06"),
+        (4, -0.5, "an MTF of camera forward came out as -0.5"),
+        (0, -0.1, "that bodies take came out as -0.1"),
     ):
         wrong = good.copy()
         wrong[row] = value
@@ -109,5 +109,5 @@ def test_image_quality_that_cannot_be_is_none(backend, gf7_pair, monkeypatch) ->
             bench._hold(wrong, np.zeros(1), None)
     # of a beam that is all but dark nothing is told, and nothing held
     dark = good.copy()
-    dark[[0, 5]] = [[7.9e11], [0.999]]
+    dark[[1, 0]] = [[7.9e11], [0.999]]
     bench._hold(dark, np.zeros(1), None)

@@ -241,6 +241,7 @@ def stray_section(run: RenderRun) -> Section | None:
             numbers = (Marked(text, "", "number") for text in (size, fixed(one["x_um"], 1), fixed(one["y_um"], 1)))
             families.append([channel.key, one["kind"], one["name"], *numbers])
             surfaces.append([channel.key, one["name"], _way(one["surfaces"]) or "not looked up"])
+    keys = [*(one.key for one in FAMILY if one.key != "surfaces"), "surfaces"]
     parts: list[Artefact] = [
         Table(
             "stray-families",
@@ -250,7 +251,7 @@ def stray_section(run: RenderRun) -> Section | None:
             ("Area CCD", "kind", "what happens", "share", "x [µm]", "y [µm]"),
             families,
             within=IN_PAGE,
-            full=FAMILY.table("stray_families", "Families", "", full),
+            full=FAMILY.table("stray_families", "Families", "", full, keys),
         ),
         Table(
             "stray",

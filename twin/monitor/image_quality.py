@@ -212,7 +212,7 @@ _CAMERA: Record[CameraState] = Record(
     Quantity("wfe_rms_waves", lambda of: _known(np.mean(of.camera.wfe[of.number])), "wavefront error, mean of RMS"),
     Quantity("wfe_rms_waves_focus_removed", lambda of: _known(np.mean(of.camera.wfe_refocused[of.number])), _REFOCUSED),
     Quantity("wfe_worst_waves", lambda of: _known(np.max(of.camera.wfe[of.number])), "the same of the worst field"),
-    *(_at_places(AT_FIELDS[key]) for key in ("defocus_um", "mtf_along_line", "mtf_along_track", "light_lost")),
+    *map(_at_places, list(AT_FIELDS)[2:]),
     Quantity("obstructed_by", lambda of: {k: of.named(v) for k, v in of.camera.bodies.items()}, "body -> share"),
     Quantity("reason", lambda of: of.camera.reasons[of.number] or None, "why numbers are missing", where_known=True),
 )
@@ -288,8 +288,8 @@ def quality_dicts(
     return [{"cameras": {k: _CAMERA(of) for k, of in found.state(s).items()}} for s in range(len(states))]
 
 
-_COLUMNS = ("wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track", "light_lost")
-"""Arrays of ``CameraQuality`` that are worked out together."""
+_COLUMNS = ("light_lost", "wfe", "wfe_refocused", "defocus", "mtf_along_line", "mtf_along_track")
+"""Arrays of ``CameraQuality`` that are worked out together; a further one stands at the end."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,14 +375,14 @@ class _CameraBench:
             if np.any(dark[own]):
                 out[:, s] = np.nan
                 reasons[s] = f"an aperture beside the stop cuts {np.max(dark[own]):.1%} of the beam"
-            elif np.any(values[5, own] > _DARKEST):
-                out[:5, s] = np.nan
-                reasons[s] = f"bodies in the beam take {np.max(values[5, own]):.1%} of it"
+            elif np.any(values[0, own] > _DARKEST):
+                out[1:, s] = np.nan
+                reasons[s] = f"bodies in the beam take {np.max(values[0, own]):.1%} of it"
             elif np.any(rough[own]):
                 reasons[s] = "no MTF: the wavefront or the pupil's edge is too rough for its polynomials"
-                if self.model.edges and np.max(values[0, own]) > MOST_BLUR:
+                if self.model.edges and np.max(values[1, own]) > MOST_BLUR:
                     reasons[s] = (
-                        f"no MTF: {np.max(values[0, own]):.3g} waves of wavefront error are more than {MOST_BLUR:g}"
+                        f"no MTF: {np.max(values[1, own]):.3g} waves of wavefront error are more than {MOST_BLUR:g}"
                     )
 
     def bodies(self, count: int) -> dict[str, np.ndarray]:
@@ -433,7 +433,7 @@ class _CameraBench:
         return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Values (6, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
+        """Values (V, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
         rays, size, shadows = traced.rays, traced.size, traced.shadows
         origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
         radius = float(self.model.first_order.exit_pupil_distance[0])
@@ -473,7 +473,7 @@ class _CameraBench:
             self._note(pupils, lit, which)
         if shadows is not None:
             self._taken.append((which, shadows.shares()))
-        values = np.stack([wfe, refocused, defocus, *mtf, lost])
+        values = np.stack([lost, wfe, refocused, defocus, *mtf])
         self._hold(values, dark, shadows)
         return values, dark, np.isnan(mtf[0])
 
@@ -515,20 +515,20 @@ class _CameraBench:
         return total, smooth
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
-        """Hold numbers (6, B) of _COLUMNS to what any camera has.
+        """Hold numbers (V, B) of _COLUMNS to what any camera has.
 
         Raises:
             UnphysicalError: one cannot be; with the camera and what it is.
         """
         # a beam that something cuts or all but stops is told by its reason, and not by numbers
-        told = values[:, (dark == 0.0) & (values[5] <= _DARKEST)]
-        wfe, refocused, _, *mtf, lost = told
+        told = (dark == 0.0) & (values[0] <= _DARKEST)
+        lost, wfe, refocused, _, along, track, *_ = values[:, told]
         of = f"of camera {self.name}"
         hold_within(f"the share of the light {of} that bodies take", lost, 0.0, 1.0, _ROUNDING)
         hold_within(f"a wavefront error {of} in waves", wfe, 0.0, _MOST_WAVES, 0.0)
         most = wfe * (1.0 + _ROUNDING)
         hold_below(f"a wavefront error {of} at best focus", refocused, most, "that on the line CCD", _ROUNDING)
-        hold_within(f"an MTF {of}", np.array(mtf), 0.0, 1.0, _MTF_ROUNDING)
+        hold_within(f"an MTF {of}", np.array([along, track]), 0.0, 1.0, _MTF_ROUNDING)
         if shadows is None or not shadows.owners:
             return
         shares = np.array(list(shadows.shares().values()))
@@ -540,7 +540,7 @@ class _CameraBench:
         hold_equal(f"the share of the stop {of} that bodies take", together, counted, "that of points in it", _APART)
         hold_equal(
             f"the share of the stop {of} that bodies take",
-            together[(dark == 0.0) & (values[5] <= _DARKEST)],
+            together[told],
             lost,
             "that of the light",
             _APART,
