@@ -21,7 +21,7 @@ from docs.site.link_check import faults
 from docs.site.markdown import slug
 from docs.site.node_pages import ACTIONS, node_table
 from docs.site.policy import with_policy
-from docs.site.run_files import FILES, described, known
+from docs.site.run_files import FILES, described, known, meaning
 from docs.site.run_files import commands as golden_commands
 from docs.site.run_pages import run_pages
 from docs.site.spec_examples import accepted, examples, kinds_of, shipped
@@ -321,6 +321,14 @@ def test_a_style_sheet_that_loads_from_the_network_is_found(tmp_path: Path) -> N
     write_site(tmp_path, index="")
     (tmp_path / "a.css").write_text("@font-face { src: url(https://example.org/f.woff) }")
     assert len(faults(tmp_path)) == 1
+
+
+def test_names_of_mappings_lead_to_their_records() -> None:
+    """Runs of one camera name it as a key; what stands below is declared all the same."""
+    for name in ("one", "{backward|forward}"):
+        assert meaning("quality", ("cameras", name, "wfe_worst_waves")) == "the same of the worst field"
+        assert meaning("quality", ("mtf", name, "spectrum_nm[]")) == "first and last wavelength of the light"
+    assert meaning("quality", ("invented", "one", "wfe_worst_waves")) == ""
 
 
 def test_a_folder_with_other_things_is_not_replaced(tmp_path: Path) -> None:

@@ -273,8 +273,8 @@ def _of_record(record: Record[Any], path: tuple[str, ...]) -> tuple[str, str]:
         found = None if here is None else next((one for one in here if one.key in names), None)
         if found is not None:
             said, here = found.meaning, found.below
-        elif not part.startswith("{"):
-            # a name of a mapping leads to what the mapping holds; anything else is not declared
+        elif not part.startswith("{") and (here is None or here is record):
+            # a name of a mapping leads to the record that the mapping holds; anything else is not declared
             return "", ""
     return said, "" if here is None else here.meaning
 

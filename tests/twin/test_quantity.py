@@ -56,9 +56,17 @@ def test_tables_and_columns_follow() -> None:
     assert (column.unit, column.description, column.plain) == ("um", "along the line", [1.0, -2.5])
 
 
+def test_reports_may_have_another_unit() -> None:
+    lost: Record[float] = Record("", Quantity("light_lost", lambda share: share, "share", "light", 1, shown="percent"))
+    table = lost.table("light", "Light", "", [lost(0.0625)])
+    assert lost(0.0625) == {"light_lost": 0.0625}
+    assert (list(table.heads), table.rows) == (["light [%]"], [[6.25]])
+
+
 def test_units() -> None:
     assert in_unit(None, "mm") is None
     assert in_unit({"a": [1.0, 2.0]}, "mm") == {"a": [1e3, 2e3]}
     assert in_unit(1e-9, "nm") == 1.0
+    assert in_unit(71e3, "1/mm") == pytest.approx(71.0, rel=1e-15)
     with pytest.raises(ValueError, match="place"):
         Record("", Quantity("place", lambda _: 1), Quantity("place", lambda _: 2))
