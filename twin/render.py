@@ -18,19 +18,7 @@ from scenes.kinds.file_kinds import read_for
 from scenes.specs.job import ACTIONS
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
-from twin.run.cli import (
-    AsJson,
-    BackendName,
-    Force,
-    Options,
-    Out,
-    Quiet,
-    Seed,
-    check_backend,
-    explained,
-    print_whole,
-    result_table,
-)
+from twin.run import cli
 from twin.run.command import Result, run_command
 from twin.run.procedure import Session
 
@@ -43,12 +31,12 @@ def main(
     job: Annotated[
         Path, typer.Argument(readable=False, help="YAML file of the job, e.g. scenes/examples/perturb.yaml.")
     ],
-    out: Out = None,
-    seed: Seed = None,
+    out: cli.Out = None,
+    seed: cli.Seed = None,
     frames: Annotated[
         int | None, typer.Option(min=1, max=10_000, help="Frames per state; overrides the file's.")
     ] = None,
-    backend: BackendName = "llvm",
+    backend: cli.BackendName = "llvm",
     picture: Annotated[
         bool,
         typer.Option("--picture", help="Also render pictures of the instrument itself: picture.png and two close-ups."),
@@ -60,9 +48,9 @@ def main(
             help="Print the nodes of the job's instrument, their pivots and what each allows; run nothing.",
         ),
     ] = False,
-    force: Force = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    force: cli.Force = False,
+    as_json: cli.AsJson = False,
+    quiet: cli.Quiet = False,
 ) -> None:
     """Perturb an instrument, render the spot images of its autocollimation monitor and recover the perturbation from
     them.
@@ -120,7 +108,7 @@ def main(
 
     run_command(
         job.stem,
-        Options(out, seed, backend, force, as_json, quiet),
+        cli.Options(out, seed, backend, force, as_json, quiet),
         lambda: read_for("twin.render", job, resolve),
         work,
     )
@@ -133,8 +121,8 @@ def print_nodes(job: Path, backend: str, as_json: bool) -> None:
         typer.Exit: with the exit code of a failure, which has been told.
     """
     errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(backend)
+    with cli.explained(errors):
+        cli.check_backend(backend)
         resolved = read_for("twin.render", job, resolve)
         from scenes.models.instrument_builder import build_instrument
 
@@ -147,13 +135,13 @@ def print_nodes(job: Path, backend: str, as_json: bool) -> None:
             }
             print_json({"instrument": resolved.instrument.name, "nodes": allowed})
             return
-        table = result_table(f"nodes of {resolved.instrument.name}")
+        table = cli.result_table(f"nodes of {resolved.instrument.name}")
         for head in ("node", "pivots", "may be given"):
             table.add_column(head, no_wrap=True)
         for path, info in nodes.items():
             actions = ", ".join(action for action in ACTIONS if action in info.allows)
             table.add_row(path, ", ".join(info.pivots), actions)
-        print_whole(Terminal(), table)
+        cli.print_whole(Terminal(), table)
 
 
 if __name__ == "__main__":

@@ -20,19 +20,7 @@ from rich.text import Text
 
 from optics.numerics.backend import load_backend
 from scenes.yaml.standard_output import FAILURE, Terminal, print_json, to_stdout
-from twin.run.cli import (
-    LARGEST_SEED,
-    BackendName,
-    Force,
-    InputErrorText,
-    check_backend,
-    explained,
-    heartbeat,
-    print_verdict,
-    print_whole,
-    result_table,
-    time_text,
-)
+from twin.run import cli
 from twin.run.durable import exit_on_terminate
 from twin.run.provenance import program_digest
 from twin.run.run_folder import RunFolder
@@ -90,9 +78,9 @@ def main(
     out: Annotated[
         Path | None, typer.Option(readable=False, help="Run folder to make. Default: nothing is written.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Seed of all noise.")] = 1,
-    backend: BackendName = "llvm",
-    force: Force = False,
+    seed: Annotated[int, typer.Option(min=0, max=cli.LARGEST_SEED, help="Seed of all noise.")] = 1,
+    backend: cli.BackendName = "llvm",
+    force: cli.Force = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print validation.json (or the list) on stdout, and nothing else.")
     ] = False,
@@ -133,15 +121,15 @@ def main(
     be used; 2 bad input; 130 interrupted, 143 terminated. After 2, 130 and 143 nothing is left behind.
     """
     errors = Console(stderr=True)
-    with explained(errors):
-        check_backend(backend)
+    with cli.explained(errors):
+        cli.check_backend(backend)
         from twin.validation import registry
         from twin.validation.registry import UnknownCheck, select
 
         try:
             selections = select(registry.GROUPS, only)
         except UnknownCheck as error:
-            raise InputErrorText(str(error)) from error
+            raise cli.InputErrorText(str(error)) from error
         if list_checks:
             with to_stdout(errors):
                 _print_list(selections, fast, as_json)
@@ -195,10 +183,10 @@ def _run(
         def show(done: float, text: str) -> None:
             nonlocal at
             left = (time.monotonic() - begun) * (total - done) / done if done > 0.05 * total else total - done
-            at = f"{text}, about {time_text(left)} left"
+            at = f"{text}, about {cli.time_text(left)} left"
             bar.update(task, completed=done, description=text)
 
-        beat = heartbeat(errors, lambda: at, silent=False)
+        beat = cli.heartbeat(errors, lambda: at, silent=False)
 
         if folder is None:
             with beat:
@@ -255,7 +243,7 @@ def _print_result(validation: Validation, target: Path | None) -> None:
     """Every check in a line, and where to read more."""
     from twin.validation.validation_report import claim_text, comparison_text, measured_text, sigma_text, verdict
 
-    table = result_table()
+    table = cli.result_table()
     table.add_column("check", no_wrap=True)
     table.add_column("claim", justify="right", no_wrap=True)
     table.add_column("sides", no_wrap=True)
@@ -268,8 +256,8 @@ def _print_result(validation: Validation, target: Path | None) -> None:
         cells = (r.id, claim_text(r), comparison_text(r), measured_text(r), sigma_text(r), unit)
         table.add_row(*(Text(cell) for cell in cells), Text(r.verdict, style=STYLES[r.verdict]))
     console = Terminal()
-    print_verdict(console, verdict(validation))
-    print_whole(console, table)
+    cli.print_verdict(console, verdict(validation))
+    cli.print_whole(console, table)
     if target is None:
         console.print("How each was done: --out DIR writes a report, --json prints it.", style="dim", soft_wrap=True)
     else:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from analysis.orbit import null_space
 from analysis.orbit.calibration_parameters import (
     CalibrationError,
     CalibrationField,
@@ -26,17 +27,6 @@ from analysis.orbit.calibration_parameters import (
     index,
 )
 from analysis.orbit.normal_equations import Equations, State, Weights, assemble
-from analysis.orbit.null_space import (
-    WORST,
-    Combination,
-    Freedom,
-    Gauge,
-    RankError,
-    combinations,
-    free_basis,
-    solved,
-    weak_vectors,
-)
 from analysis.orbit.plausibility import FarPointsError, NoiseError, check_places, single_ray
 from analysis.orbit.residual_tests import (
     HUBER,
@@ -84,9 +74,9 @@ class Adjustment:
     names: tuple[str, ...]
     values: Array
     covariance: Array
-    gauge: Gauge
-    open: tuple[Combination, ...]
-    weak: tuple[Combination, ...]
+    gauge: null_space.Gauge
+    open: tuple[null_space.Combination, ...]
+    weak: tuple[null_space.Combination, ...]
     from_start: Array
     follow: Array
     cameras: Mapping[str, LineModel]
@@ -175,7 +165,7 @@ def adjust(
     unknowns: Unknowns | None = None,
     start: Mapping[str, float] | None = None,
     priors: Sequence[Prior] = (),
-    gauge: Gauge | None = None,
+    gauge: null_space.Gauge | None = None,
     robust: Robust | None = None,
     variance_components: bool | Collection[str] = False,
     iterations: int = 20,
@@ -209,7 +199,7 @@ def adjust(
     if robust not in (None, "huber", "igg"):
         raise CalibrationError(f"calibration: robust must be huber or igg, found {robust!r}")
     parameters = Parameters.of(fields, cameras, unknowns or Unknowns(), start)
-    gauge = gauge or Gauge()
+    gauge = gauge or null_space.Gauge()
     shared = SharedNoise.of(fields, noise)
     none = np.zeros(sum(len(f.ground) for f in fields), bool)
     estimated = None if isinstance(variance_components, bool) else frozenset(variance_components)
@@ -225,7 +215,7 @@ def adjust(
     state = _Iteration(start_state, Weights(np.ones(count), dict.fromkeys(groups, 1.0)), 0)
     try:
         return _adjusted(problem, state, robust, bool(variance_components))
-    except RankError as error:
+    except null_space.RankError as error:
         raise problem.cause(error) from error
 
 
@@ -332,7 +322,7 @@ class _Problem:
     noise: Noise
     shared: SharedNoise
     priors: tuple[Prior, ...]
-    gauge: Gauge
+    gauge: null_space.Gauge
     iterations: int
     lost: NDArray[np.bool_]
     estimated: frozenset[str] | None = None
@@ -385,7 +375,7 @@ class _Problem:
         equations = self.equations(state)
         try:
             freedom = self.freedom(state, equations)
-        except RankError as error:
+        except null_space.RankError as error:
             lost = int(np.sum(state.weights.image <= _SETTLED))
             if not lost:
                 raise
@@ -400,7 +390,7 @@ class _Problem:
             total = equations.reduced + pull
             right = equations.right + pull @ (state.state.values - self.parameters.start)
             step = np.zeros(len(right))
-            step[kept] = solved(total[np.ix_(kept, kept)], -right[kept])
+            step[kept] = null_space.solved(total[np.ix_(kept, kept)], -right[kept])
             size = float(np.sqrt(max(float(step @ total @ step), 0.0)))
             state = _Iteration(state.state.moved(equations, step), state.weights, state.steps + 1)
             equations = self.equations(state)
@@ -413,10 +403,10 @@ class _Problem:
             )
         total = (equations.reduced + pull)[np.ix_(kept, kept)]
         spread = np.zeros(pull.shape)
-        spread[np.ix_(kept, kept)] = solved(total, np.eye(len(kept)))
+        spread[np.ix_(kept, kept)] = null_space.solved(total, np.eye(len(kept)))
         return state, equations, 0.5 * (spread + spread.T)
 
-    def freedom(self, state: _Iteration, equations: Equations) -> Freedom:
+    def freedom(self, state: _Iteration, equations: Equations) -> null_space.Freedom:
         """What may be solved for: by the robust weights, but the sigmas as they were given.
 
         Misfit of the measurements would else open what they determine, and then cannot shrink any more.
@@ -429,18 +419,18 @@ class _Problem:
         stated = isinstance(self.gauge.start, Mapping)
         ray = float(np.linalg.norm(list(self.ray.values()))) if stated else np.inf
         told = {next(iter(p.weights)): p.sigma for p in self.priors if len(p.weights) == 1}
-        return free_basis(equations.reduced, equations.length, scale, names, self.gauge, ray, told)
+        return null_space.free_basis(equations.reduced, equations.length, scale, names, self.gauge, ray, told)
 
-    def cause(self, error: RankError) -> CalibrationError:
+    def cause(self, error: null_space.RankError) -> CalibrationError:
         """The error of open combinations, or that of the noise where this leaves them open."""
         ray = float(np.linalg.norm(list(self.ray.values())))
-        if ray < WORST:
+        if ray < null_space.WORST:
             return error
         largest = max(self.ray, key=lambda group: self.ray[group])
         parts = ", ".join(f"{group} {1e6 * v:.3g}" for group, v in self.ray.items() if v)
         return NoiseError(
             f"calibration: noise too large: a single image point is uncertain by {1e6 * ray:.3g} um in the image"
-            f" (one sigma; {parts}), more than what is to be found, {1e6 * WORST:g} um",
+            f" (one sigma; {parts}), more than what is to be found, {1e6 * null_space.WORST:g} um",
             largest,
         )
 
@@ -452,7 +442,7 @@ class _Problem:
         names, scale = self.parameters.names, self.parameters.scale
         freedom = self.freedom(state, equations)
         rows = freedom.rows
-        vectors = weak_vectors(
+        vectors = null_space.weak_vectors(
             equations.reduced + rows.T @ rows, equations.length, scale, np.eye(len(names))[:, freedom.kept]
         )
         cofactors = equations.image_cofactors(covariance)
@@ -498,7 +488,7 @@ class _Problem:
             covariance=covariance,
             gauge=self.gauge,
             open=freedom.opened,
-            weak=combinations(names, scale, vectors, equations.reduced, equations.length),
+            weak=null_space.combinations(names, scale, vectors, equations.reduced, equations.length),
             from_start=from_start,
             follow=follow,
             cameras={

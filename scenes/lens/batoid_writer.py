@@ -14,33 +14,23 @@ from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectan
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, Surface, ZernikeFigure
 from optics.raytrace.assembly import Interaction
+from scenes.lens import prescription
 from scenes.lens.camera_writer import rounded
-from scenes.lens.prescription import (
-    LARGEST_ORDER,
-    OVER,
-    LensSurface,
-    Note,
-    Prescription,
-    about_vertex,
-    polynomial_of,
-    turned_over,
-    zernike_of,
-)
 from scenes.yaml.yaml_file import dump_yaml
 
 
-def batoid_text(lens: Prescription) -> tuple[str, tuple[Note, ...]]:
+def batoid_text(lens: prescription.Prescription) -> tuple[str, tuple[prescription.Note, ...]]:
     """The file's text, and what of the prescription is not in it.
 
     Raises:
         InputError: a surface that batoid does not know.
     """
-    notes: list[Note] = []
+    notes: list[prescription.Note] = []
     items: list[dict[str, Any]] = []
     index = 1.0
     for k, surface in enumerate(lens.surfaces):
-        over = turned_over(surface)
-        pose = rounded(OVER @ over.pose)
+        over = prescription.turned_over(surface)
+        pose = rounded(prescription.OVER @ over.pose)
         last = k == len(lens.surfaces) - 1
         kind = {Interaction.REFLECT: "Mirror", Interaction.REFRACT: "RefractiveInterface"}.get(surface.interaction)
         item: dict[str, Any] = {"type": "Detector" if last else kind or "Interface", "name": surface.name}
@@ -59,7 +49,7 @@ def batoid_text(lens: Prescription) -> tuple[str, tuple[Note, ...]]:
         if parts and item["type"] != "Interface":
             item["obscuration"] = parts[0] if len(parts) == 1 else {"type": "ObscUnion", "items": parts}
         if len(parts) < len(cuts) or (cuts and item["type"] == "Interface"):
-            notes.append(Note(0, surface.name, "its aperture is not carried"))
+            notes.append(prescription.Note(0, surface.name, "its aperture is not carried"))
         if item["type"] == "Interface":
             item.pop("inMedium"), item.pop("outMedium")
         items.append(item)
@@ -86,14 +76,14 @@ def _place(pose: Pose) -> dict[str, float]:
     return out
 
 
-def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
+def _surface(lens: prescription.Prescription, given: prescription.LensSurface) -> dict[str, Any]:
     shape = given.surface
     if isinstance(shape.figure, GridFigure):
         raise lens.error("batoid's file cannot carry a figure on a grid", given.line, given.name, "Zernike terms")
     freeform: dict[tuple[int, int], float] = {}
     if shape.terms:
         try:
-            freeform = polynomial_of(Surface(terms=shape.terms))
+            freeform = prescription.polynomial_of(Surface(terms=shape.terms))
         except TypeError as error:
             raise lens.error(f"batoid's file cannot carry this: {error}", given.line, given.name) from None
     radius = 0.0
@@ -102,7 +92,7 @@ def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
         radius = figure.radius
         if any(figure.centre) or freeform:
             radius += math.hypot(*figure.centre)
-            for pair, value in about_vertex(figure).items():
+            for pair, value in prescription.about_vertex(figure).items():
                 freeform[pair] = freeform.get(pair, 0.0) + value
     base: dict[str, Any] = {"type": "Plane"}
     if shape.curvature:
@@ -113,14 +103,14 @@ def _surface(lens: Prescription, given: LensSurface) -> dict[str, Any]:
             # where a ray runs along the axis of a Quadric with this conic, batoid divides by zero
             base = {"type": "Paraboloid", "R": 1.0 / shape.curvature}
     elif any(shape.even):
-        for pair, value in polynomial_of(Surface(even=shape.even)).items():
+        for pair, value in prescription.polynomial_of(Surface(even=shape.even)).items():
             freeform[pair] = freeform.get(pair, 0.0) + value
     terms: dict[int, float] = {}
     if freeform:
         radius = radius or (0.5 * float(np.ptp(given.aperture.bounds[:2])) if given.aperture else 0.1)
-        if max(a + b for a, b in freeform) > LARGEST_ORDER:
+        if max(a + b for a, b in freeform) > prescription.LARGEST_ORDER:
             raise lens.error("batoid's file cannot carry a polynomial of so high an order", given.line, given.name)
-        terms = zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in freeform.items()})
+        terms = prescription.zernike_of({(a, b): c * radius ** (a + b) for (a, b), c in freeform.items()})
     elif isinstance(figure, ZernikeFigure):
         terms = {j: a for j, a in figure.terms.items() if a}
     if not terms:

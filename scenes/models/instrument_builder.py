@@ -20,6 +20,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
+from scenes.models import monitor_chain
 from scenes.models.camera_model import (
     CameraModel,
     camera_bodies,
@@ -32,14 +33,6 @@ from scenes.models.camera_model import (
 from scenes.models.camera_sharpness import no_cameras
 from scenes.models.clearance import check_clearance, check_solids
 from scenes.models.instrument_model import Instrument, MisplacedError
-from scenes.models.monitor_chain import (
-    MonitorChain,
-    check_prisms,
-    facet_places,
-    leaving_beams,
-    monitor_chain,
-    square_facets,
-)
 from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
@@ -93,7 +86,7 @@ def _build(
     spec: InstrumentSpec, camera_specs: Mapping[str, object], backend: Backend, free_beams: bool, free_bodies: bool
 ) -> Instrument:
     if spec.monitor is not None:
-        check_prisms(spec)
+        monitor_chain.check_prisms(spec)
     derived: dict[str, CameraModel] = {}
     for site in spec.cameras.values():
         if site.camera not in derived:
@@ -107,7 +100,7 @@ def _build(
     elements: dict[str, Element] = {}
     sequences: dict[str, tuple[str, ...]] = {}
     channels: list[Channel] = []
-    chains: dict[str, MonitorChain] = {}
+    chains: dict[str, monitor_chain.MonitorChain] = {}
     for name, site in spec.cameras.items():
         model = derived[site.camera]
         root = f"{BASE}/{name}"
@@ -122,10 +115,12 @@ def _build(
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in own)]
         given = spec.channels_of(name)
         distances = {channel: given[channel.name].prism_180.distance for channel in own}
-        beams = leaving_beams(model, distances, to_base, backend)
-        facets = facet_places(spec, beams)
+        beams = monitor_chain.leaving_beams(model, distances, to_base, backend)
+        facets = monitor_chain.facet_places(spec, beams)
         for channel in own:
-            chain = monitor_chain(spec, channel, given[channel.name], beams[channel], facets[channel], to_base)
+            chain = monitor_chain.monitor_chain(
+                spec, channel, given[channel.name], beams[channel], facets[channel], to_base
+            )
             bodies += chain.bodies
             elements.update({e.name: e for e in chain.elements})
             way = tuple(e.name for e in chain.elements)
@@ -148,7 +143,7 @@ def _build(
     assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
     _check_alike(spec, assembly)
     if channels:
-        assembly = square_facets(assembly, channels, cameras, backend)
+        assembly = monitor_chain.square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
     instrument = Instrument(

@@ -18,17 +18,9 @@ from optics.geometry.pose import Pose
 from optics.geometry.tree import AT_REST, PlacedBodies, State
 from optics.materials.finish import CoatingTable, Finish
 from optics.raytrace.assembly import Element, Interaction
+from scenes.models import scenery_parts
 from scenes.models.camera_model import line_body
 from scenes.models.instrument_model import Instrument
-from scenes.models.scenery_parts import (
-    Detector,
-    Finishes,
-    SceneSurface,
-    detector_surface,
-    mirror_surface,
-    plate_surfaces,
-    solid_surfaces,
-)
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE
 from scenes.specs.job_tables import FinishSpec
@@ -49,7 +41,7 @@ class MeasuredFinishes:
         coatings: kind of surface -> its coating.
     """
 
-    finishes: Finishes
+    finishes: scenery_parts.Finishes
     scatter: Mapping[str, MeasuredScatter]
     coatings: Mapping[str, CoatingTable]
 
@@ -97,7 +89,7 @@ def measured_finishes(resolved: ResolvedJob) -> MeasuredFinishes | None:
     stray = resolved.job.render.stray
     if stray is None or stray.finishes is None:
         return None
-    built_in = Finishes()
+    built_in = scenery_parts.Finishes()
     changed: dict[str, Finish] = {}
     scatter: dict[str, MeasuredScatter] = {}
     coatings: dict[str, CoatingTable] = {}
@@ -156,8 +148,8 @@ FACING_THE_LIGHT = Pose(np.diag([-1.0, 1.0, -1.0]))
 class Scenery:
     """All surfaces of a scene and its detectors; the position in ``surfaces`` is a surface's number."""
 
-    surfaces: tuple[SceneSurface, ...]
-    detectors: tuple[Detector, ...] = ()
+    surfaces: tuple[scenery_parts.SceneSurface, ...]
+    detectors: tuple[scenery_parts.Detector, ...] = ()
     _by_element: Mapping[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -186,7 +178,7 @@ class Scenery:
 def build_scenery(
     instrument: Instrument,
     state: State,
-    finishes: Finishes | None = None,
+    finishes: scenery_parts.Finishes | None = None,
     baffles: Iterable[Plate] = (),
     whole_focal_planes: bool = False,
 ) -> Scenery:
@@ -200,25 +192,29 @@ def build_scenery(
         whole_focal_planes: make each focal plane one large detector, named ``CAMERA/focal_plane``, in the place
             of its CCDs and its board: for light from the scene.
     """
-    finishes = finishes or Finishes()
+    finishes = finishes or scenery_parts.Finishes()
     assembly = instrument.assembly
     placed = assembly.place([state])
     glass = [
-        surface for solid in instrument.solids for surface in solid_surfaces(solid, assembly, placed, state, finishes)
+        surface
+        for solid in instrument.solids
+        for surface in scenery_parts.solid_surfaces(solid, assembly, placed, state, finishes)
     ]
     on_glass = {name for surface in glass for name in surface.elements}
     surfaces = [
-        mirror_surface(element, placed, finishes, _lit_side(instrument, element), state.get(element.body, AT_REST))
+        scenery_parts.mirror_surface(
+            element, placed, finishes, _lit_side(instrument, element), state.get(element.body, AT_REST)
+        )
         for element in assembly.elements.values()
         if element.interaction is Interaction.REFLECT and element.name not in on_glass
     ]
     surfaces += glass
-    detectors: list[Detector] = []
+    detectors: list[scenery_parts.Detector] = []
     for camera in instrument.cameras:
         more, grids = _focal_plane(instrument, camera, placed, finishes, whole_focal_planes)
         surfaces += more
         detectors += grids
-    surfaces += plate_surfaces((*instrument.baffles, *baffles), placed, finishes.baffle)
+    surfaces += scenery_parts.plate_surfaces((*instrument.baffles, *baffles), placed, finishes.baffle)
     return Scenery(tuple(surfaces), tuple(detectors))
 
 
@@ -250,8 +246,8 @@ def _reach(instrument: Instrument, camera: str) -> tuple[float, float]:
 
 
 def _focal_plane(
-    instrument: Instrument, camera: str, placed: PlacedBodies, finishes: Finishes, whole: bool
-) -> tuple[list[SceneSurface], list[Detector]]:
+    instrument: Instrument, camera: str, placed: PlacedBodies, finishes: scenery_parts.Finishes, whole: bool
+) -> tuple[list[scenery_parts.SceneSurface], list[scenery_parts.Detector]]:
     """Detectors of one focal plane and the board behind them."""
     model = instrument.cameras[camera]
     body = f"{BASE}/{camera}/focal_plane"
@@ -262,19 +258,19 @@ def _focal_plane(
     if whole:
         pitch = 1e-3
         name = f"{camera}/focal_plane"
-        grid = Detector(name, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
-        return [detector_surface(grid, facing, finishes, (element,))], [grid]
+        grid = scenery_parts.Detector(name, round(2.0 * reach_x / pitch), round(2.0 * reach_y / pitch), (pitch, pitch))
+        return [scenery_parts.detector_surface(grid, facing, finishes, (element,))], [grid]
     chip = line_body(f"{BASE}/{camera}")
     pitch = line.pitch * float(placed.size(chip)[0])
-    grids = [Detector(element, 1, line.pixels, (pitch, pitch))]
-    surfaces = [detector_surface(grids[0], placed.pose(chip) @ FACING_THE_LIGHT, finishes, (element,))]
+    grids = [scenery_parts.Detector(element, 1, line.pixels, (pitch, pitch))]
+    surfaces = [scenery_parts.detector_surface(grids[0], placed.pose(chip) @ FACING_THE_LIGHT, finishes, (element,))]
     ccd = instrument.spec.autocollimator.area_ccd
     for channel in channels:
         name = f"{channel.key}/area_ccd"
         pitch = ccd.pitch * float(placed.size(channel.ccd_body)[0])
-        grid = Detector(name, ccd.columns, ccd.rows, (pitch, pitch))
+        grid = scenery_parts.Detector(name, ccd.columns, ccd.rows, (pitch, pitch))
         grids.append(grid)
-        surfaces.append(detector_surface(grid, placed.pose(channel.ccd_body), finishes, (name,)))
+        surfaces.append(scenery_parts.detector_surface(grid, placed.pose(channel.ccd_body), finishes, (name,)))
     board = Pose(np.eye(3), np.array([0.0, 0.0, BOARD]))
     plate = Plate(f"{camera}/board", body, board, Rectangle(reach_x, reach_y), finishes.board)
-    return surfaces + plate_surfaces([plate], placed), grids
+    return surfaces + scenery_parts.plate_surfaces([plate], placed), grids

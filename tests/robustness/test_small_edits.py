@@ -195,9 +195,9 @@ def test_a_monitor_that_misses_says_by_how_much(tmp_path, backend, monkeypatch) 
     """Facets that are not turned to their beams: which spot, how far off in pixels and mm, in which file.
     The job is not to blame, it perturbs nothing.
     """
-    import scenes.models.instrument_builder
+    import scenes.models.monitor_chain
 
-    monkeypatch.setattr(scenes.models.instrument_builder, "square_facets", lambda assembly, *_: assembly)
+    monkeypatch.setattr(scenes.models.monitor_chain, "square_facets", lambda assembly, *_: assembly)
     camera, instrument = trees("gf7_pair")
     instrument["monitor"]["prism_180"]["angle_errors"] = {"roof_a": ["30 arcsec", "0 arcsec"]}
     with pytest.raises(InputError) as caught:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from optics.numerics.frozen_map import FrozenMap
-from twin.run.plain_data import plain_data
+from twin.run.quantity import plain_data
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from twin.run import cli, reference_frames
 from twin.run.artefact import SvgFigure, Table
 from twin.run.cli import heartbeat
 from twin.run.command import add_test
-from twin.run.plain_data import plain_data
 from twin.run.procedure import Advance, BenchError
+from twin.run.quantity import plain_data
 from twin.run.report import Report, Section, answer
 from twin.study.runs.base_job import Failure, ProcedureBase, Run
 

@@ -40,16 +40,9 @@ from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
 from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
+from scenes.models import shadow
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
-from scenes.models.shadow import (
-    ImagingShadows,
-    Shadows,
-    TracedBeams,
-    edge_outlines,
-    imaging_shadows,
-    no_shadows,
-)
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
@@ -263,7 +256,7 @@ def image_quality(
         raise ValueError(f"fields from -1 to 1 expected, got {list(fields)}")
     cameras = {}
     for name in instrument.cameras:
-        shadows = imaging_shadows(instrument, name, backend) if obstruction else None
+        shadows = shadow.imaging_shadows(instrument, name, backend) if obstruction else None
         bench = _CameraBench(instrument, name, backend, tuple(fields), wavelength, shadows)
         out = np.full((len(_COLUMNS), len(states), len(fields)), np.nan)
         reasons = [""] * len(states)
@@ -305,7 +298,7 @@ class _Traced:
 
     rays: ImagingRays
     size: np.ndarray
-    shadows: Shadows | None
+    shadows: shadow.Shadows | None
     again: Callable[[float], ImagingRays]
 
 
@@ -319,7 +312,7 @@ class _CameraBench:
         backend: Backend,
         fields: tuple[float, ...],
         wavelength: float,
-        shadows: ImagingShadows | None,
+        shadows: shadow.ImagingShadows | None,
     ) -> None:
         self.shadows = shadows
         self.pupils: dict[int, tuple[PupilOutline, ...]] = {}
@@ -425,11 +418,11 @@ class _CameraBench:
             )
 
         imaging, rays = sent(self.model.spec.wavelength)
-        beams = TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
+        beams = shadow.TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
         if self.model.edges:
-            free = no_shadows(len(every)) if shadows is None else shadows
-            shadows = free.and_edges(edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
+            free = shadow.no_shadows(len(every)) if shadows is None else shadows
+            shadows = free.and_edges(shadow.edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
         return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -514,7 +507,7 @@ class _CameraBench:
             total += weight * pupils.transfer(self.frequency, np.array([colour]), np.ones(1))
         return total, smooth
 
-    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: Shadows | None) -> None:
+    def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
         """Hold numbers (V, B) of _COLUMNS to what any camera has.
 
         Raises:
@@ -565,7 +558,7 @@ class _Mean:
     Values are continued into the shadows by their polynomials, and what they hold there is taken off.
     """
 
-    def __init__(self, bench: _CameraBench, shadows: Shadows | None) -> None:
+    def __init__(self, bench: _CameraBench, shadows: shadow.Shadows | None) -> None:
         self._share, self._tilts = bench.nodes.share[None], bench.tilts[None]
         self._added: np.ndarray | None = None
         if shadows is None:

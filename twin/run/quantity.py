@@ -9,7 +9,7 @@ times the metres that its source has.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -19,7 +19,6 @@ from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.study import unit_of
 from twin.run.artefact import Cell, Table, shown_unit
 from twin.run.data_files import DataColumn, DataTable
-from twin.run.plain_data import plain_data
 
 S = TypeVar("S")
 T = TypeVar("T")
@@ -206,3 +205,35 @@ class Record(Generic[S]):
             for one in self._chosen(keys)
         )
         return DataTable(name, title, tuple(columns))
+
+
+def plain_data(value: Any) -> Any:
+    """What JSON can hold of a value.
+
+    Args:
+        value: None, a string, a truth value, a number, an array, a sequence, a mapping with strings as keys, or a
+            dataclass, whose fields are written in their order; all of them may be nested. Nothing is converted here.
+
+    Returns:
+        dict, list, str, int, float, bool or None.
+
+    Raises:
+        TypeError: anything else, a mapping with other keys, a complex number.
+    """
+    if value is None or isinstance(value, str | bool | np.bool_):
+        return bool(value) if isinstance(value, np.bool_) else value
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain_data(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        if other := [key for key in value if not isinstance(key, str)]:
+            raise TypeError(f"a key that is no text: {other[0]!r}")
+        return {str(key): plain_data(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain_data(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain_data(item) for item in value]
+    raise TypeError(f"no plain data: {type(value).__name__}")
