@@ -439,7 +439,7 @@ responses:
 def test_a_reading(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The change of the principal distance as a part of it: one entry, seen in every view of the table of readings."""
     toy, key, symbol = "a part of the principal distance", "d_f_relative_ppm", "Δf/f"
-    relative: Callable[[CameraCalibration], Any] = lambda c: (0.0, 0.0, 0.0, 1.0 / c.geometry.focal_length_m)  # noqa: E731
+    relative: Callable[[CameraCalibration], Any] = lambda c: (0.0, 0.0, 0.0, 1.0 / c.geometry.principal_distance_m)  # noqa: E731
     add(monkeypatch, READINGS, None, Parameter(key, symbol, toy, 3, relative))
     (tmp_path / "job.yaml").write_text(READ_JOB, "utf-8")
     folder = tmp_path / "run"

@@ -79,7 +79,7 @@ def quantities(cameras: Mapping[str, CameraCalibration], ground: GroundGeometry 
         sign = parameters.ANGLE.per_si if first > second else -parameters.ANGLE.per_si
         out.append(Quantity(ANGLE_GROUP, parameters.ANGLE, sign * (unit[0] - unit[count])))
     if ground is not None:
-        one_f, two_f = (camera.geometry.focal_length_m for camera in cameras.values())
+        one_f, two_f = (camera.geometry.principal_distance_m for camera in cameras.values())
         rows = ground.rows((one_f, two_f))
         middle = rows[len(rows) // 2]
         out += [Quantity(GROUND_GROUP, axis, row) for axis, row in zip(parameters.GROUND, middle, strict=True)]
@@ -260,7 +260,7 @@ def field_covariance(
         half_field: tangent of half the field along the line, of each camera.
     """
     sigma = [
-        direction_rad * np.array([1.0, 1.0, 1.0 / t, camera.geometry.focal_length_m / t])
+        direction_rad * np.array([1.0, 1.0, 1.0 / t, camera.geometry.principal_distance_m / t])
         for camera, t in zip(cameras.values(), half_field, strict=True)
     ]
     return np.asarray(np.diag(np.concatenate(sigma) ** 2))

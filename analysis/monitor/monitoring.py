@@ -55,26 +55,26 @@ PER_SI = np.array([1 / ARCSEC, 1 / ARCSEC, 1 / ARCSEC, UM_PER_M])
 """How many of these units make one SI unit (rad, m)."""
 
 
-@shows("focal_length_m [m]", "separation_m [mm]", "pixel_m [um]", "field_alpha_rad [deg]", "field_beta_rad [deg]")
+@shows("principal_distance_m [m]", "separation_m [mm]", "pitch_m [um]", "field_alpha_rad [deg]", "field_beta_rad [deg]")
 @dataclass(frozen=True)
 class MonitorGeometry:
     """What the formulas need to know of one camera's monitor. Raises ValueError, naming the field.
 
-    focal_length_m: f, m. separation_m: L, distance of the two area CCDs, m. pixel_m: delta, m.
+    principal_distance_m: f, m. separation_m: L, distance of the two area CCDs, m. pitch_m: delta, m.
     field_alpha_rad, field_beta_rad: alpha and beta in the cos^2 of (2), (3) and Table 1, rad.
-    focal_length_x_m: plate scale across the line, m, where calibration finds it different from f (anamorphism);
-        default focal_length_m. Only `derived` uses it.
+    principal_distance_across_m: plate scale across the line, m, where calibration finds it different from f
+        (anamorphism); default principal_distance_m. Only `derived` uses it.
     d_f_per_alpha_m: change of the principal distance per rad of d_alpha, m, from the calibrated distortion: turning
         the line of sight brings the line to a field where the plate scale differs. Only `derived` uses it.
     d_gamma_per_beta: likewise the turn of the imaged line per rad of d_beta. Only `derived` uses it.
     """
 
-    focal_length_m: float
+    principal_distance_m: float
     separation_m: float
-    pixel_m: float
+    pitch_m: float
     field_alpha_rad: float = 0.0
     field_beta_rad: float = 0.0
-    focal_length_x_m: float | None = None
+    principal_distance_across_m: float | None = None
     d_f_per_alpha_m: float = 0.0
     d_gamma_per_beta: float = 0.0
 
@@ -170,9 +170,9 @@ def coefficients(name: str, geometry: MonitorGeometry) -> Array:
     """
     if name not in FORMULAS:
         raise ValueError(f"monitoring: no estimator {name!r}; there are {', '.join(FORMULAS)}")
-    delta, f, length = geometry.pixel_m, geometry.focal_length_m, geometry.separation_m
+    delta, f, length = geometry.pitch_m, geometry.principal_distance_m, geometry.separation_m
     paper = name != "derived"
-    f_x = f if paper or geometry.focal_length_x_m is None else geometry.focal_length_x_m
+    f_x = f if paper or geometry.principal_distance_across_m is None else geometry.principal_distance_across_m
     beta = delta * (math.cos(geometry.field_beta_rad) ** 2 if paper else 1.0) / (2 * f) / 2
     alpha = delta * (math.cos(geometry.field_alpha_rad) ** 2 if paper else 1.0) / (2 * f_x) / 2
     gamma = delta / length if paper else delta / (2 * length) * f / f_x
@@ -197,7 +197,7 @@ def paper_single(
     """Eq. (2), (3), (5), (7) of paper 001 as printed, with the arctangent.
 
     Args:
-        before: (..., 2 sides, 2) spot positions (row, column) of the nominal state, px.
+        before: (..., 2 channels, 2) spot positions (row, column) of the nominal state, px.
         after: of the changed state, likewise.
         covariance: (..., 4, 4) of after - before, px^2, in order [left row, left column, right row, right column];
             zeros where there is no noise.
@@ -217,7 +217,7 @@ def paper_joint(
     """Table 1 of paper 001, last column, as printed; arguments as `paper_single`, sign of Y_L: see the module.
 
     Args:
-        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
         after: of the changed state, likewise.
         covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
             zeros where there is no noise.
@@ -230,7 +230,7 @@ def derived(before: ArrayLike, after: ArrayLike, covariance: ArrayLike, geometry
     """The corrected factors (see the module's text); arguments as `paper_single`.
 
     Args:
-        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
         after: of the changed state, likewise.
         covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
             zeros where there is no noise.
@@ -245,7 +245,7 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
 
     Args:
         matrix: as of `coefficients`, (4, 4).
-        before: spot positions of the nominal state, (..., 2 sides, 2), row and column, px.
+        before: spot positions of the nominal state, (..., 2 channels, 2), row and column, px.
         after: of the changed state, likewise.
         covariance: of after - before, (..., 4, 4), px^2, in the order left row, left column, right row, right column;
             zeros where there is no noise.
@@ -254,7 +254,7 @@ def linear(matrix: Array, before: ArrayLike, after: ArrayLike, covariance: Array
     spread = np.asarray(covariance, dtype=np.float64)
     if start.shape[-2:] != (2, 2) or end.shape[-2:] != (2, 2) or spread.shape[-2:] != (4, 4):
         raise ValueError(
-            "monitoring: before and after must be (..., 2 sides, 2 (row, column)) and covariance (..., 4, 4),"
+            "monitoring: before and after must be (..., 2 channels, 2 (row, column)) and covariance (..., 4, 4),"
             f" found {start.shape}, {end.shape}, {spread.shape}"
         )
     shift = end - start

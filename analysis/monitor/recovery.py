@@ -300,7 +300,7 @@ def estimates_of(
             both = parameters[one][title], parameters[two][title]
             angle[title] = intersection_angle.exact(*both, *looks, *across)
             if ground is not None:
-                distances = [camera.geometry.focal_length_m for camera in cameras.values()]
+                distances = [camera.geometry.principal_distance_m for camera in cameras.values()]
                 f = (distances[0], distances[1])
                 errors[title] = ground.error(values, noise, noise if total is None else total, f)
     return Estimates(parameters, angle, errors)

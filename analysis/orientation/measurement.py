@@ -110,7 +110,7 @@ class PointMeans:
 
 
 def reduce_sets(
-    angle: Array, spots: Spots, focal_length: float, single: float, present: NDArray[np.bool_] | None = None
+    angle: Array, spots: Spots, principal_distance: float, single: float, present: NDArray[np.bool_] | None = None
 ) -> PointMeans:
     """Find gross errors among the sets and the noise of the means.
 
@@ -120,12 +120,12 @@ def reduce_sets(
     Args:
         angle: W, (N, S), radians, by the readings.
         spots: as located.
-        focal_length: about, metres.
+        principal_distance: about, metres.
         single: sigma of one exposure, metres, for a test of one set.
         present: which exposures there are, (N, S), where sets lack points; the others hold any finite numbers. None
             for all.
     """
-    rest = spots.position - focal_length * np.tan(angle)
+    rest = spots.position - principal_distance * np.tan(angle)
     # what does not average out while the spot stays on its pixels
     fixed = np.sqrt(np.mean(spots.fixed**2, axis=1, where=True if present is None else present))
     count, sets = rest.shape

@@ -295,18 +295,18 @@ def check_prisms(spec: InstrumentSpec) -> None:
     wavelength = spec.autocollimator.wavelength
     kinds: dict[str, Reflector] = {}
     for camera in spec.cameras:
-        for side, given in spec.channels_of(camera).items():
+        for channel, given in spec.channels_of(camera).items():
             for name, prism in given.prisms.items():
                 if kinds.setdefault(name, prism.reflector) is not prism.reflector:
                     raise spec.error(
-                        f"{camera}/{side} has another kind of reflector than the channels before it",
-                        spec.key_of(camera, side, ("monitor", name, "kind")),
+                        f"{camera}/{channel} has another kind of reflector than the channels before it",
+                        spec.key_of(camera, channel, ("monitor", name, "kind")),
                         found=prism.kind,
                         allowed="the same kind in all channels of an instrument, whose light is traced together",
                     )
             face = given.return_face.aperture
             for name, prism in given.prisms.items():
-                key = spec.key_of(camera, side, ("monitor", name))
+                key = spec.key_of(camera, channel, ("monitor", name))
                 known = glass(prism.material) if prism.reflector.transparent else None
                 if known is not None and not known.shortest <= wavelength <= known.longest:
                     raise spec.error(

@@ -26,7 +26,7 @@ FUNCTIONS = {"paper_single": paper_single, "paper_joint": paper_joint, "derived"
 
 def printed(y01, y11, y02, y22, x01, x11, x02, x22, g):
     """Equations (2), (3), (5), (7) typed from the page."""
-    delta, f, length = g.pixel_m, g.focal_length_m, g.separation_m
+    delta, f, length = g.pitch_m, g.principal_distance_m, g.separation_m
     d_beta = math.atan((((y01 - y11) + (y02 - y22)) / 2 * delta) * math.cos(g.field_beta_rad) ** 2 / (2 * f))
     d_alpha = math.atan((((x01 - x11) + (x02 - x22)) / 2 * delta) * math.cos(g.field_alpha_rad) ** 2 / (2 * f))
     d_gamma = math.atan(((x01 - x11) + (x22 - x02)) / length * delta)
@@ -55,10 +55,10 @@ def test_joint_is_table_1(spots):
     x_l, x_r = (before - after)[:, 0, 1], (before - after)[:, 1, 1]
     y_l, y_r = (before - after)[:, 0, 0], (before - after)[:, 1, 0]
     g = GEOMETRY
-    alpha = (x_l + x_r) / 2 * g.pixel_m * math.cos(0.3) ** 2 / (2 * g.focal_length_m)
-    beta = (y_l + y_r) / 2 * g.pixel_m * math.cos(0.2) ** 2 / (2 * g.focal_length_m)
-    gamma = (x_l - x_r) / g.separation_m * g.pixel_m
-    d_f = (-y_l + y_r) / 2 * g.pixel_m * g.focal_length_m / (2 * g.separation_m)
+    alpha = (x_l + x_r) / 2 * g.pitch_m * math.cos(0.3) ** 2 / (2 * g.principal_distance_m)
+    beta = (y_l + y_r) / 2 * g.pitch_m * math.cos(0.2) ** 2 / (2 * g.principal_distance_m)
+    gamma = (x_l - x_r) / g.separation_m * g.pitch_m
+    d_f = (-y_l + y_r) / 2 * g.pitch_m * g.principal_distance_m / (2 * g.separation_m)
     assert np.allclose(result.vector, np.stack([alpha, beta, gamma, d_f], axis=1), rtol=1e-12, atol=1e-22)
 
 
@@ -84,10 +84,10 @@ def test_derived_inverts_a_plane_mirror_return():
     x, y, turn, d_f = 30e-6, -20e-6, 12 * ARCSEC, 40e-6
     half = g.separation_m / 2
     shift_m = np.array([[y, x + turn * half], [y, x - turn * half]])
-    image_m = -2 * shift_m + 2 * (d_f / g.focal_length_m) * np.array([[half, 0], [-half, 0]])
+    image_m = -2 * shift_m + 2 * (d_f / g.principal_distance_m) * np.array([[half, 0], [-half, 0]])
     before = np.full((2, 2), 48.0)
-    found = derived(before, before + image_m / g.pixel_m, ZERO, g)
-    assert found.vector == pytest.approx([x / g.focal_length_m, y / g.focal_length_m, turn, d_f], rel=1e-9)
+    found = derived(before, before + image_m / g.pitch_m, ZERO, g)
+    assert found.vector == pytest.approx([x / g.principal_distance_m, y / g.principal_distance_m, turn, d_f], rel=1e-9)
 
 
 @pytest.mark.parametrize("name", list(FUNCTIONS))
@@ -147,7 +147,7 @@ def test_to_dict_units_and_shapes():
 
 
 def test_geometry_options_and_errors():
-    other = MonitorGeometry(7.68, 0.73, 7e-6, focal_length_x_m=7.0)
+    other = MonitorGeometry(7.68, 0.73, 7e-6, principal_distance_across_m=7.0)
     assert coefficients("derived", other)[0, 1] == pytest.approx(-7e-6 / 28)
     assert coefficients("derived", other)[1, 0] == pytest.approx(-7e-6 / (4 * 7.68))
     with pytest.raises(ValueError, match="separation_m"):
@@ -156,7 +156,7 @@ def test_geometry_options_and_errors():
         MonitorGeometry(7.68, 0.7, 7e-6, 0.0, 2.0)
     with pytest.raises(ValueError, match="paper_single"):
         coefficients("paper", other)
-    with pytest.raises(ValueError, match="2 sides"):
+    with pytest.raises(ValueError, match="2 channels"):
         derived(np.zeros(4), np.zeros(4), ZERO, other)
     with pytest.raises(ValueError, match="finite"):
         derived(np.full((2, 2), np.nan), np.zeros((2, 2)), ZERO, other)

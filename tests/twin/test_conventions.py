@@ -54,7 +54,7 @@ def truth(gf7_pair, backend, motions):
 
 @pytest.fixture(scope="module")
 def spots(path, motions):
-    """Motion -> (2 sides, 2 (row, column)) px per radian, metre or unit of scale, for the camera's own spots."""
+    """Motion -> (2 channels, 2 (row, column)) px per radian, metre or unit of scale, for the camera's own spots."""
     jacobian = spot_jacobian(path, list(motions.values()))[:2]
     return {name: jacobian[..., k] for k, name in enumerate(motions)}
 
@@ -296,9 +296,9 @@ def test_spot_signs(spots, path, gf7_pair):
 @pytest.fixture(scope="module")
 def geometry(gf7_pair, backend, path):
     return MonitorGeometry(
-        focal_length_m=trace_truth(gf7_pair, backend, [{}]).principal_distance[CAMERA],
+        principal_distance_m=trace_truth(gf7_pair, backend, [{}]).principal_distance[CAMERA],
         separation_m=gf7_pair.separation[CAMERA],
-        pixel_m=path.pitch,
+        pitch_m=path.pitch,
     )
 
 

@@ -62,7 +62,7 @@ def test_factors_of_the_printed_formulas(table):
         assert factors["paper_joint", "d_f_um"].by_model == pytest.approx(0.5, abs=2e-3)
         # against the truth the anamorphism of a field-biased camera comes on top
         geometry = setup.geometry(name)
-        stretch = geometry.focal_length_x_m / geometry.focal_length_m
+        stretch = geometry.principal_distance_across_m / geometry.principal_distance_m
         assert stretch > 1.02
         assert factors["paper_single", "d_gamma_arcsec"].by_truth == pytest.approx(2.0 * stretch, rel=5e-3)
 
@@ -81,7 +81,7 @@ def test_three_kinds_of_focal_length_change(table):
         # defocus times the off-centre aperture, a/f^2 per metre of piston, reads as a rotation
         aperture = abs(setup.instrument.spec.cameras[name].pupil_offset[0])
         geometry = setup.geometry(name)
-        looks_like = 1e-6 * aperture / geometry.focal_length_m**2 / ARCSEC
+        looks_like = 1e-6 * aperture / geometry.principal_distance_m**2 / ARCSEC
         false = found.readings["model"][0, k] - found.true[0, k]
         assert abs(false) == pytest.approx(looks_like, rel=0.2)
         statements = found.principal_distance_statements()

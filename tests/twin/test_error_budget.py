@@ -105,7 +105,7 @@ def test_equation_12_and_table_5_from_the_printed_lines(budget):
     assert table_5["d_gamma"] / ARCSEC == pytest.approx(2.15, rel=0.01)  # the reference camera's f / L is 10.54
     assert table_5["d_f"] / 1e-3 == pytest.approx(0.04, abs=0.005)
     # by hand, without the factors of analysis/: two spots, each doubled by the reflection, (5) without the doubling
-    spot, f, length = 0.145 * ARCSEC, geometry.focal_length_m, geometry.separation_m
+    spot, f, length = 0.145 * ARCSEC, geometry.principal_distance_m, geometry.separation_m
     assert table_5["d_alpha"] == pytest.approx(spot / 2 / np.sqrt(2), rel=1e-9)
     assert table_5["d_gamma"] == pytest.approx(np.sqrt(2) * spot * f / length, rel=1e-9)
     assert table_5["d_f"] == pytest.approx(spot * f / np.sqrt(2) * f / length, rel=1e-9)

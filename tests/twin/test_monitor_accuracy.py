@@ -85,7 +85,7 @@ def test_printed_formulas_miss_by_their_factors(measured):
         assert single[rows, 2] / (turn[rows] * TURN) == pytest.approx(2.0, abs=2e-3)
         assert joint[rows, 2] / (turn[rows] * TURN) == pytest.approx(2.0, abs=2e-3)
         rows = np.flatnonzero(scale)
-        f = geometry.focal_length_m
+        f = geometry.principal_distance_m
         # both ends read 3e-3 too much at the largest field: the calibrated line is not quite the chord of the monitors
         assert single[rows, 3] / (scale[rows] * SCALE * f) == pytest.approx(1.0, abs=4e-3)
         assert joint[rows, 3] / (scale[rows] * SCALE * f) == pytest.approx(0.5, abs=2e-3)

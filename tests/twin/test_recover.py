@@ -125,7 +125,7 @@ def test_without_an_instrument_its_geometry_and_a_learnt_shape_will_do(run, imag
         g = camera.geometry
         look = np.degrees(camera.look_rad)
         text += (
-            f"  {name}: {{principal_distance: {g.focal_length_m:.9f} m, separation: {g.separation_m:.9f} m, "
+            f"  {name}: {{principal_distance: {g.principal_distance_m:.9f} m, separation: {g.separation_m:.9f} m, "
             f"pitch: 12 um, look: {look:.6f} deg, field: {np.degrees(g.field_beta_rad):.6f} deg}}\n"
         )
     found = measured(images.parent, text, backend, run, "geometry.yaml")

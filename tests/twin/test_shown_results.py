@@ -130,7 +130,7 @@ def test_a_shot_and_a_test() -> None:
 def test_monitor_results() -> None:
     geometry = MonitorGeometry(5.512, 0.2347, 12e-6, 0.0, np.deg2rad(1.22))
     assert repr(geometry) == (
-        "<MonitorGeometry: focal length 5.512 m; separation 234.7 mm; pixel 12 um; field alpha 0 deg; "
+        "<MonitorGeometry: principal distance 5.512 m; separation 234.7 mm; pitch 12 um; field alpha 0 deg; "
         "field beta 1.22 deg>"
     )
     changes = CameraParameters.from_vector(np.zeros((50, 4)), np.tile(np.eye(4), (50, 1, 1)))

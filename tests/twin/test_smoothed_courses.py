@@ -89,7 +89,7 @@ class Courses:
         """(8,) height at the middle of the line by changes."""
         geometry = self.experiment.ground
         assert geometry is not None
-        first, second = (camera.geometry.focal_length_m for camera in self.experiment.cameras.values())
+        first, second = (camera.geometry.principal_distance_m for camera in self.experiment.cameras.values())
         rows = geometry.rows((first, second))
         return np.asarray(rows[len(rows) // 2, 2])
 

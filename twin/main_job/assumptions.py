@@ -73,7 +73,7 @@ def doubted(run: RenderRun) -> tuple[str, ...]:
     """
     if run.series is None:
         return (*run.reading.doubts, *run.reading.notes)
-    return run.series.doubts([f"{camera}/{side}" for camera, side in run.reading.channels])
+    return run.series.doubts(["/".join(channel) for channel in run.reading.channels])
 
 
 def contradicted(

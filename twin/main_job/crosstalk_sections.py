@@ -199,15 +199,15 @@ def formula_section(run: RenderRun) -> Section:
 def _factor_text(run: RenderRun, name: str) -> str:
     """The numbers behind a camera's factors."""
     geometry, factors = run.experiment.geometry(name), run.crosstalk[name].factors
-    assert geometry.focal_length_x_m is not None
-    by_model = {(f.estimator, f.parameter): float(f.by_model) for f in factors}
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
+    by_model = {(one.estimator, one.parameter): float(one.by_model) for one in factors}
     beta, alpha = geometry.field_beta_rad, geometry.field_alpha_rad
     return (
         f"the printed Δγ, eq. (5), reads {fixed(by_model['paper_single', 'd_gamma_arcsec'], 3)} times the turn of the "
         f"line; the joint Δf of Table 1 reads {fixed(by_model['paper_joint', 'd_f_um'], 3)} times the change. The "
-        f"anamorphism is fₓ/f = {fixed(geometry.focal_length_x_m / geometry.focal_length_m, 4)} (plate scale across "
-        f"the line {fixed(geometry.focal_length_x_m, 4)} m, principal distance along it "
-        f"{fixed(geometry.focal_length_m, 4)} m). Eqs. (2), (3) and Table 1 carry a cos² of angles that the paper "
-        f"leaves undefined; taken as the field angles of the area CCDs, cos² β = {fixed(math.cos(beta) ** 2, 5)} at "
-        f"{plain(math.degrees(beta))}° and cos² α = {fixed(math.cos(alpha) ** 2, 5)} at {plain(math.degrees(alpha))}°."
+        f"anamorphism is fₓ/f = {fixed(f_x / f, 4)} (plate scale across the line {fixed(f_x, 4)} m, "
+        f"principal distance along it {fixed(f, 4)} m). Eqs. (2), (3) and Table 1 carry a cos² of angles that the "
+        "paper leaves undefined; taken as the field angles of the area CCDs, "
+        f"cos² β = {fixed(math.cos(beta) ** 2, 5)} at {plain(math.degrees(beta))}° and "
+        f"cos² α = {fixed(math.cos(alpha) ** 2, 5)} at {plain(math.degrees(alpha))}°."
     )

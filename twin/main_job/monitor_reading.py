@@ -42,7 +42,7 @@ class MonitorReading:
     """One state's reading.
 
     Attributes:
-        channels: camera and side of every spot, in the order of the spots.
+        channels: camera and name of the channel of every spot, in the order of the spots.
         cameras: what is calibrated of each.
         ground: how a pair of known altitude sees the ground, else None.
         disturbances: what is stated to move, None for nothing.
@@ -93,7 +93,7 @@ class MonitorReading:
         """
         out = list(self.found_wrong)
         evidence = self.recovery.evidence
-        told = None if evidence is None else evidence.doubt(0, [f"{camera}/{side}" for camera, side in self.channels])
+        told = None if evidence is None else evidence.doubt(0, ["/".join(channel) for channel in self.channels])
         if told is not None and not out:
             out.append(told.text)
         for name, found in self.recovery.curvature.items():
@@ -220,9 +220,9 @@ class MonitorReading:
         spots: dict[str, Any] = {}
         r = self.recovery
         fits = None if r.evidence is None else (r.evidence.before, r.evidence.after)
-        for i, (camera, side) in enumerate(self.channels):
+        for i, (camera, channel) in enumerate(self.channels):
             first, last = (None, None) if fits is None else (_fit(own, i) for own in fits)
-            spots.setdefault(camera, {})[side] = {
+            spots.setdefault(camera, {})[channel] = {
                 "before": {**_spot(r.before[0, i], r.sigma_before[0, i]), **(first or {})},
                 "after": {**_spot(r.after[0, i], r.sigma_after[0, i]), **(last or {})},
             }

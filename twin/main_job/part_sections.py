@@ -289,7 +289,7 @@ def stray_section(run: RenderRun) -> Section | None:
 
 
 def _way(way: list[str]) -> str:
-    """Surfaces in order, without ``base/<camera>/monitor/<side>/`` of the prisms' names, which every step repeats."""
+    """Surfaces in order, without ``base/<camera>/monitor/<channel>/`` of prisms, which every step repeats."""
     prisms = [step for step in way if "/monitor/" in step]
     common = "/".join(prisms[0].split("/")[:4]) + "/" if prisms else ""
     return " \N{RIGHTWARDS ARROW} ".join(step.removeprefix(common) for step in way)

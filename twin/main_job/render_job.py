@@ -402,13 +402,13 @@ def _blurred(experiment: MonitorExperiment, focus: SpotFocus) -> tuple[str, ...]
         own = [i for i, channel in enumerate(experiment.path.channels) if channel.camera == name]
         worst = max(own, key=lambda i: focus.error[i])
         if focus.error[worst] > SHARP:
-            side = experiment.path.channels[worst].name
+            channel = experiment.path.channels[worst].name
             model = experiment.instrument.cameras[name]
             # image.z counts along the parent axis, +-Z of the focal plane
             shift = model.focal_plane.rotation[2, 2] * focus.defocus[worst]
             out.append(
                 f"{name}: the spots of camera {model.spec.name} are out of focus as designed, "
-                f"{focus.error[worst]:.2g} waves rms in channel {side}; they would be sharpest with image.z "
+                f"{focus.error[worst]:.2g} waves rms in channel {channel}; they would be sharpest with image.z "
                 f"{1e3 * shift:+.3g} mm from where it is"
             )
     return tuple(out)

@@ -97,8 +97,8 @@ def _draw(run: RenderRun, camera: str) -> Figure:
         row[2].yaxis.set_major_locator(MaxNLocator(5, integer=True))
         row[2].set(xlim=(x - half, x + half), ylim=(y + half, y - half))
         map_of = svg.signed_map(row[3], difference[i], largest, interpolation="none")
-        side = run.experiment.path.channels[i].name
-        row[0].set_ylabel(f"{side} channel\nrow [px]")
+        channel = run.experiment.path.channels[i].name
+        row[0].set_ylabel(f"{channel} channel\nrow [px]")
         title = f"moved {moved[0]:+.3f} px in row, {moved[1]:+.3f} px in column".replace("-", "\N{MINUS SIGN}")
         row[2].set_title(title, fontsize=8.5)
         if line == 0:

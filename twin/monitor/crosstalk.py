@@ -167,7 +167,7 @@ def crosstalk(experiment: MonitorExperiment, covariance: np.ndarray) -> dict[str
         rows, unit = slice(4 * k, 4 * k + 4), parameters.rows_of(experiment.cameras[name])
         readings = {e: (unit @ (gain[rows] @ moved)) * size for e, gain in gains.items()}
         true = unit @ truth * size
-        f = geometry.focal_length_m
+        f = geometry.principal_distance_m
         ideal = PER_SI * np.array([-1.0 / f, 1.0 / f, 1.0, f]) * size[:4]
         factors = tuple(
             FormulaFactor(

@@ -303,12 +303,12 @@ class MonitorExperiment:
         given = self.instrument.spec.channels_of(camera)
         one = given[SIDES[0]] if SIDES[0] in given else next(iter(given.values()))
         return MonitorGeometry(
-            focal_length_m=self.nominal_truth.principal_distance[camera],
+            principal_distance_m=self.nominal_truth.principal_distance[camera],
             separation_m=self.instrument.separation[camera],
-            pixel_m=self.path.pitch,
+            pitch_m=self.path.pitch,
             field_alpha_rad=0.0,
             field_beta_rad=abs(one.field),
-            focal_length_x_m=float(1.0 / abs(by_x[0])),
+            principal_distance_across_m=float(1.0 / abs(by_x[0])),
             d_f_per_alpha_m=float(by_x[3] / by_x[0]),
             d_gamma_per_beta=float(by_y[2] / by_y[1]),
         )

@@ -52,7 +52,7 @@ class StrayResult:
     """Stray light of some monitor channels in one state.
 
     Attributes:
-        photons: area CCD (``<camera>/<side>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from
+        photons: area CCD (``<camera>/<channel>/area_ccd``) -> (rows, columns) expected photons per pixel and frame from
             all traced sources, without the nominal families.
         runs: channel -> all that its source's light did.
         photons_per_power: channel -> photons per frame for a detected share 1 of the source's power.
@@ -310,7 +310,7 @@ class Ghost:
 
     Attributes:
         channel: whose area CCD it is.
-        source: channel that the strongest comes from, ``<camera>/<side>``.
+        source: channel that the strongest comes from, ``<camera>/<channel>``.
         body: path of the prism that throws it, the first whose face reflects what it should let pass; None where it
             comes from nothing but nominal surfaces in another order.
         text: all in words.

@@ -22,16 +22,16 @@ LIMIT = 5.0
 
 
 def _panels(run: RecoverRun, camera: str) -> list[tuple[str, list[tuple[str, SpotResult, np.ndarray]]]]:
-    """Side -> before and the last state after, with the centre on the CCD."""
+    """Channel -> before and the last state after, with the centre on the CCD."""
     out = []
     for i, result in enumerate(run.channels):
-        name, side = result.channel.name.split("/")
+        name, channel = result.channel.name.split("/")
         if name != camera:
             continue
         r = run.last.recovery
         states = result.states()
         name = state_name(run.times, len(states) - 1)
-        out.append((side, [("before", states[0][1], r.before[0, i]), (name, states[-1][1], r.after[0, i])]))
+        out.append((channel, [("before", states[0][1], r.before[0, i]), (name, states[-1][1], r.after[0, i])]))
     return out
 
 
@@ -54,12 +54,12 @@ def spots_svg(run: RecoverRun, camera: str) -> str:
         norm = stretch(np.concatenate([spot.mean.ravel() for _, states in panels for _, spot, _ in states]))
         figure, grid = _grid(len(panels))
         shown = None
-        for line, (side, states) in enumerate(panels):
+        for line, (channel, states) in enumerate(panels):
             for axes, (name, spot, place) in zip(grid[line], states, strict=True):
                 shown = axes.imshow(spot.mean, cmap=svg.GRAY, norm=norm, interpolation="none", extent=_extent(spot))
                 _mark_unused(axes, spot)
                 cross(axes, place, svg.BEFORE if name == "before" else svg.AFTER, 0.11 * spot.mean.shape[1])
-                _labels(axes, f"{side}, {name}", line == len(panels) - 1)
+                _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
         assert shown is not None
         _bar(figure, shown, grid, "mean frame [DN], asinh stretch")
         return svg.to_svg(figure)
@@ -71,14 +71,14 @@ def residuals_svg(run: RecoverRun, camera: str) -> str:
         panels = _panels(run, camera)
         figure, grid = _grid(len(panels))
         shown = None
-        for line, (side, states) in enumerate(panels):
+        for line, (channel, states) in enumerate(panels):
             for axes, (name, spot, _) in zip(grid[line], states, strict=True):
                 left = np.zeros_like(spot.mean) if spot.residual is None else spot.residual
                 shown = axes.imshow(
                     left, cmap=svg.DIVERGING, vmin=-LIMIT, vmax=LIMIT, interpolation="none", extent=_extent(spot)
                 )
                 _mark_unused(axes, spot)
-                _labels(axes, f"{side}, {name}", line == len(panels) - 1)
+                _labels(axes, f"{channel}, {name}", line == len(panels) - 1)
         assert shown is not None
         _bar(figure, shown, grid, "frame \N{MINUS SIGN} fit [σ]")
         return svg.to_svg(figure)

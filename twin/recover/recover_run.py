@@ -136,7 +136,7 @@ def run_recover(
         raise InputError(*issues)
     with one_blas_thread():
         results, recoveries, smoothed = _measured(setup, bench, channels, advance)
-    names = tuple((camera, side) for camera, side in (name.split("/") for name in setup.channels))
+    names = tuple((camera, channel) for camera, channel in (name.split("/") for name in setup.channels))
     ground = None if bench.calibration is None else bench.calibration.ground
     centroid = setup.test.analysis.centroid
     times = setup.test.times
@@ -180,11 +180,11 @@ def _formulas(setup: MeasurementSetup) -> _Bench:
     cameras = {}
     for name, given in (setup.test.geometry or {}).items():
         geometry = MonitorGeometry(
-            focal_length_m=given.principal_distance,
+            principal_distance_m=given.principal_distance,
             separation_m=given.separation,
-            pixel_m=given.pitch,
+            pitch_m=given.pitch,
             field_beta_rad=abs(given.field),
-            focal_length_x_m=given.principal_distance_across,
+            principal_distance_across_m=given.principal_distance_across,
         )
         by_pixel = coefficients("derived", geometry)
         labels = ("d_alpha", "d_beta", "d_gamma", "d_f")
@@ -193,7 +193,7 @@ def _formulas(setup: MeasurementSetup) -> _Bench:
         )
     exposure = setup.test.exposure or 0.0
     detector = EmvaDetector.from_sheet(setup.detector, exposure)
-    pitches = {camera.geometry.pixel_m for camera in cameras.values()}
+    pitches = {camera.geometry.pitch_m for camera in cameras.values()}
     return _Bench(cameras, detector.noise_model(exposure), None, max(pitches))
 
 

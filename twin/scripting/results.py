@@ -286,7 +286,7 @@ def found_table(reading: MonitorReading, warnings: Sequence[str] = ()) -> Found:
         warnings: of the instrument; those of the reading are added.
     """
     recovery, cameras = reading.recovery, list(reading.cameras)
-    channels = [f"{camera}/{side}" for camera, side in reading.channels]
+    channels = ["/".join(channel) for channel in reading.channels]
     disturbances = "" if reading.disturbances is None else reading.disturbances.name
     contradiction = contradicted(reading.disturbances, reading.consistency)
     told = (*warnings, *reading.doubts, *reading.notes, *contradiction, *reading.unseen)

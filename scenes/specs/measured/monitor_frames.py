@@ -255,9 +255,9 @@ def _model(spec: MeasurementSpec) -> ResolvedJob | None:
 
 def _channels(spec: MeasurementSpec, model: ResolvedJob | None) -> tuple[str, ...]:
     if model is None:
-        return tuple(f"{camera}/{side}" for camera in spec.geometry or {} for side in SIDES)
+        return tuple(f"{camera}/{channel}" for camera in spec.geometry or {} for channel in SIDES)
     instrument = model.instrument
-    return tuple(f"{camera}/{side}" for camera in instrument.cameras for side in instrument.channels_of(camera))
+    return tuple(f"{camera}/{channel}" for camera in instrument.cameras for channel in instrument.channels_of(camera))
 
 
 def _located(spec: MeasurementSpec, channels: tuple[str, ...], base: Path) -> MeasurementSpec:

@@ -286,10 +286,10 @@ def study_gradient(setup: StudySetup, backend: Backend, advance: Advance = silen
 def _spot_responses(resolved: ResolvedJob) -> list[_Asked]:
     out = []
     for camera in resolved.instrument.cameras:
-        for side in resolved.instrument.channels_of(camera):
+        for channel in resolved.instrument.channels_of(camera):
             for axis in ("row", "column"):
-                key = ("recovered", "spots", camera, side, "after", axis)
-                out.append(_Asked(f"spots.{camera}.{side}.{axis}", ResponseSpec(key=key, unit="px")))
+                key = ("recovered", "spots", camera, channel, "after", axis)
+                out.append(_Asked(f"spots.{camera}.{channel}.{axis}", ResponseSpec(key=key, unit="px")))
     return out
 
 

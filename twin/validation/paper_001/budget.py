@@ -73,7 +73,7 @@ def propagated(spot: float, geometry: MonitorGeometry, estimator: str = "paper_s
     Returns:
         d_alpha, d_beta, d_gamma in radians and d_f in metres.
     """
-    pixels = spot * geometry.focal_length_m / geometry.pixel_m
+    pixels = spot * geometry.principal_distance_m / geometry.pitch_m
     factors = np.sqrt(np.sum(monitoring.coefficients(estimator, geometry) ** 2, axis=1))
     return dict(zip(("d_alpha", "d_beta", "d_gamma", "d_f"), (float(v) for v in factors * pixels), strict=True))
 

@@ -214,7 +214,7 @@ def _monitored(context: Context, images: BudgetImages) -> Iterator[CheckResult]:
         how = (
             "Line CCD turned by 2.15 arcsec, traced; the shift of the line of sight of its end. At the middle of the "
             "line it is nothing. For comparison, Table 5's 0.05 arcsec of Δα moves the whole line by "
-            f"{0.05 * ARCSEC * images.geometry.focal_length_m / 7e-6:.2f} px of 7 µm."
+            f"{0.05 * ARCSEC * images.geometry.principal_distance_m / 7e-6:.2f} px of 7 µm."
         )
         pixel = Chosen.power("pixel of the line CCD", images.line_pixel * 1e6, "µm", images.roll_pixels, -1.0)
         limit = Supposed("one pixel taken for little", f"holds down to {images.roll_pixels:.2f} px")
@@ -253,12 +253,15 @@ def _propagated(context: Context, images: BudgetImages, name: str) -> CheckResul
     g = images.geometry
     how = (
         f"The printed factors on the printed Table 4 of every coordinate of both spots, independent; f = "
-        f"{g.focal_length_m:.3f} m, L = {g.separation_m:.4f} m of the camera made after Table 5."
+        f"{g.principal_distance_m:.3f} m, L = {g.separation_m:.4f} m of the camera made after Table 5."
     )
     inputs = []
     check = context.check(f"001.table5.{name}.propagated")
     if check.basis == "chosen":
-        for what, field, size in (("f", "focal_length_m", g.focal_length_m), ("L", "separation_m", g.separation_m)):
+        for what, field, size in (
+            ("f", "principal_distance_m", g.principal_distance_m),
+            ("L", "separation_m", g.separation_m),
+        ):
 
             def response(factor: float, field: str = field, size: float = size) -> float:
                 changed = replace(g, **{field: factor * size})

@@ -109,7 +109,7 @@ def without_cos2(geometry: MonitorGeometry, local: float) -> float:
 
 def _findings(images: motions.SingleMotions) -> Iterator[_Finding]:
     geometry = images.first
-    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     cos2 = math.cos(geometry.field_beta_rad) ** 2
     field = f"{math.degrees(geometry.field_beta_rad):.2f}°"
     rendered = f"{motions.FRAMES} frames of {INSTRUMENT} before and after"

@@ -145,7 +145,9 @@ class MonitorImages:
     def local_share(self) -> float:
         """Focal length along the line at its centre, where d_beta is taken, over the formulas' f; of both cameras."""
         cameras = self.experiment.instrument.cameras
-        return float(np.mean([cameras[c].line_focal_length / self.geometry(c).focal_length_m for c in self.cameras]))
+        return float(
+            np.mean([cameras[c].line_focal_length / self.geometry(c).principal_distance_m for c in self.cameras])
+        )
 
     def parameters(self) -> Mapping[str, Mapping[str, CameraParameters]]:
         """Camera -> estimator -> what it reads from the spots, (S,)."""
@@ -175,7 +177,7 @@ class MonitorImages:
         """
         state, k, column = self.motions.index(motion), self.cameras.index(camera), "YX".index(axis)
         moved = (self.before - self.after)[state, 2 * k : 2 * k + 2, column]
-        pitch = self.geometry(camera).pixel_m
+        pitch = self.geometry(camera).pitch_m
         variance = np.diagonal(self.covariance[state])[4 * k : 4 * k + 4][column::2]
         return float(moved[0]) * pitch, float(moved[1]) * pitch, float(np.sqrt(variance.mean())) * pitch
 
@@ -243,7 +245,7 @@ class SingleMotions(MonitorImages):
             geometry = self.geometry(camera)
             local, field = 1.0, geometry.field_alpha_rad
             if parameter == "d_beta":
-                local = self.experiment.instrument.cameras[camera].line_focal_length / geometry.focal_length_m
+                local = self.experiment.instrument.cameras[camera].line_focal_length / geometry.principal_distance_m
                 field = geometry.field_beta_rad
             value, sigma = self.reading(camera, motion, "paper_single", parameter)
             bare = math.tan(value) / math.cos(field) ** 2 / local
@@ -259,7 +261,7 @@ class SingleMotions(MonitorImages):
         out = {}
         for camera in self.cameras:
             geometry = self.geometry(camera)
-            f = geometry.focal_length_m if direction == "along" else geometry.focal_length_x_m
+            f = geometry.principal_distance_m if direction == "along" else geometry.principal_distance_across_m
             assert f is not None
             left, right, sigma = self.spots(camera, motion, axis)
             moved = 0.5 * (abs(left) + abs(right))
@@ -282,7 +284,7 @@ class SingleMotions(MonitorImages):
         for camera in self.cameras:
             left, right, sigma = self.spots(camera, "scale", "Y")
             g = self.geometry(camera)
-            should = g.separation_m * self.true(camera, "scale", "d_f") / g.focal_length_m
+            should = g.separation_m * self.true(camera, "scale", "d_f") / g.principal_distance_m
             moved = scale_displacement(left, right), sigma / math.sqrt(2.0)
             out[camera] = quotient(moved, (should, 0.0))
         return Ratio.mean(out)

@@ -218,7 +218,7 @@ def _table_1(context: Context, images: JointMotions) -> Iterator[CheckResult]:
     matrix, sigma = images.response("paper_joint")
     right, _ = images.response("derived")
     g = images.first
-    f, f_x = g.focal_length_m, g.focal_length_x_m or g.focal_length_m
+    f, f_x = g.principal_distance_m, g.principal_distance_across_m or g.principal_distance_m
     count = len(images.mixtures)
     how = (
         f"{count} random mixtures of all four changes in each camera (line CCD along X, Y, about Z; camera grown), "
@@ -263,7 +263,7 @@ def _couplings(
     context: Context, images: JointMotions, how: str, matrix: np.ndarray, sigma: np.ndarray, right: np.ndarray
 ) -> Iterator[CheckResult]:
     g = images.first
-    f, f_x = g.focal_length_m, g.focal_length_x_m or g.focal_length_m
+    f, f_x = g.principal_distance_m, g.principal_distance_across_m or g.principal_distance_m
     cases = (
         ("d_gamma_by_d_beta", 2, 1, -2.0 * f_x / f * g.d_gamma_per_beta),
         ("d_f_by_d_alpha", 3, 0, -0.5 * g.d_f_per_alpha_m * ARCSEC / 1e-6),
@@ -279,7 +279,7 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
     slope, sigma, rest = images.angle("paper_joint")
     better = images.angle("derived")
     g = images.first
-    f_x = g.focal_length_x_m or g.focal_length_m
+    f_x = g.principal_distance_across_m or g.principal_distance_m
     how = (
         f"{len(images.mixtures)} random mixtures of all four changes in each of both cameras, rendered; centres, Table "
         "1, and the angle between the two turned lines of sight, the forward camera's Δα counting plus; slope on the "
@@ -287,7 +287,7 @@ def _angle(context: Context, images: JointMotions) -> CheckResult:
         f"over: {rest / ARCSEC:.4f} arcsec rms; corrected factors: slope {better[0]:.4f}, left over "
         f"{better[2] / ARCSEC:.4f} arcsec rms."
     )
-    return context.check("001.fig4.angle").evaluate(slope, sigma, how, None, [f_x / g.focal_length_m])
+    return context.check("001.fig4.angle").evaluate(slope, sigma, how, None, [f_x / g.principal_distance_m])
 
 
 GROUP = group_of("001.joint", run)

@@ -87,7 +87,7 @@ def _range(context: Context, identifier: str, both: list[Range], geometry: Monit
     claimed = turns.CLAIMED[name]
     limit, whence = min(r.limit(criterion(PRINTED, "claimed")) for r in both)
     window = min(r.window for r in both)
-    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     share = {"d_alpha": f_x / f - 1.0, "d_gamma": 2.0 * f_x / f - 1.0}.get(name)
     explained = [] if share is None else [claimed / share * per]
     error = 100.0 * (share or 0.0)
@@ -183,7 +183,9 @@ def _joint(context: Context, data: dict[str, object]) -> Iterator[CheckResult]:
 
 def _box_limits(geometry: MonitorGeometry) -> dict[str, list[float]]:
     """To first order, the box in which Table 1 stays within the claims, from the factors that it lacks."""
-    anamorphism = (geometry.focal_length_x_m or geometry.focal_length_m) / geometry.focal_length_m
+    anamorphism = (
+        geometry.principal_distance_across_m or geometry.principal_distance_m
+    ) / geometry.principal_distance_m
     alpha, beta, gamma, f = turns.BOX
     roll = abs(geometry.d_gamma_per_beta) * beta
     growth = abs(geometry.d_f_per_alpha_m) * ARCSEC * 1e6 * alpha
@@ -221,7 +223,7 @@ def _defocus(context: Context, resolved: ResolvedJob, bench: Bench, data: dict[s
     places = [(v, 0.0) for v in x] + [(0.0, v) for v in y]
     pupil = defocus.pupil_study(resolved, context.backend, bench, places, depth)
     geometry = bench.geometry(camera)
-    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     show.defocus_shown(context, slope, curves, constant, pupil, (f_x, f), data)
     offset = next(iter(resolved.instrument.channels_of(camera).values())).pupil_offset[0]
     theory = {"d_alpha": abs(offset) / f_x**2 / ARCSEC}

@@ -218,7 +218,7 @@ def causes_shown(
     data: dict[str, object],
 ) -> None:
     """What limits every formula by itself; ``local``: focal length along the line at its centre, metres."""
-    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     cos2 = math.cos(geometry.field_beta_rad) ** 2
     causes: tuple[tuple[str, str, float | None, str], ...] = (
         ("d_beta", PRINTED, cos2 * local / f - 1.0, "cos²β, which does not belong; f at the line's centre for f"),

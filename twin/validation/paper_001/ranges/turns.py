@@ -87,7 +87,7 @@ def criterion(form: str, kind: str) -> str:
 def motion_of(camera: str, parameter: str, geometry: MonitorGeometry) -> tuple[ElementaryMotion, float]:
     """The single motion behind a parameter, and its amount (SI) for one table unit of change."""
     k = NAMES.index(parameter)
-    f, f_x = geometry.focal_length_m, geometry.focal_length_x_m or geometry.focal_length_m
+    f, f_x = geometry.principal_distance_m, geometry.principal_distance_across_m or geometry.principal_distance_m
     amount = (-f_x * ARCSEC, f * ARCSEC, ARCSEC * f_x / f, 1e-6 / f)[k]
     return line_family(camera)[k], amount
 
