@@ -22,7 +22,7 @@ from scenes.models.camera_model import LAUNCH_DISTANCE
 from scenes.specs.load import LIBRARY, load_detector
 from scenes.specs.resolved import resolve
 from tests.twin.commands import invoke
-from twin.monitor.image_quality import FIELDS, QUALITY, quality_dicts
+from twin.monitor.image_quality import FIELDS, PLACES, QUALITY, quality_dicts
 from twin.monitor.image_quality import image_quality as quality_of
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
 from twin.study.runs.base_job import Run
@@ -326,6 +326,23 @@ def test_a_job_and_a_study_with_image_quality(folder, backend) -> None:
     assert found["wfe_rms_waves"] == pytest.approx(after["wfe_rms_waves"], abs=1e-9)
     assert found["mtf_along_track"] == pytest.approx(after["mtf_along_track"], abs=1e-9)
     assert outcomes[1]["quality"]["cameras"]["one"]["wfe_rms_waves"] < after["wfe_rms_waves"]
+
+
+def test_files_have_each_number_under_its_key(quality) -> None:
+    """Numbers of the perturbed state, the second, at the places of the line; mean and worst over the fields."""
+    camera, fields = quality.cameras[CAMERA], quality.fields
+    told = QUALITY(quality)["cameras"][CAMERA]
+    numbers = {
+        "defocus_um": 1e6 * camera.defocus,
+        "mtf_along_line": camera.mtf_along_line,
+        "mtf_along_track": camera.mtf_along_track,
+        "light_lost": camera.light_lost,
+    }
+    for key, values in numbers.items():
+        assert told[key] == {place: values[1, fields.index(field)] for place, field in PLACES.items()}
+    assert told["wfe_rms_waves"] == camera.wfe[1].mean()
+    assert told["wfe_rms_waves_focus_removed"] == camera.wfe_refocused[1].mean()
+    assert told["wfe_worst_waves"] == camera.wfe[1].max()
 
 
 def test_nothing_is_worked_out_of_nothing(gf7_pair, backend) -> None:
