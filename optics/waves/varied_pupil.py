@@ -79,3 +79,18 @@ class VariedTransfer:
         """MTF where the optical paths of the rays are longer by ``paths`` (..., N), metres, than the known pupil's."""
         phase = paths @ (self.steps @ self.solve).T
         return np.asarray(np.abs(np.cos(phase) @ self.phasors + 1j * (np.sin(phase) @ self.phasors)))
+
+    def curvature(self, slopes: np.ndarray) -> np.ndarray:
+        """Second derivatives of the MTF by pairs of numbers, (K, K), at the known pupil.
+
+        Args:
+            slopes: of the rays' optical paths by the numbers, (K, N), metres.
+        """
+        phases = slopes @ (self.steps @ self.solve).T
+        whole = np.sum(self.phasors)
+        first = 1j * phases @ self.phasors
+        second = -(phases * self.phasors) @ phases.T
+        size = abs(whole)
+        along = np.real(np.conj(whole) * first) / size
+        across = np.real(np.outer(np.conj(first), first) + np.conj(whole) * second)
+        return np.asarray((across - np.outer(along, along)) / size)

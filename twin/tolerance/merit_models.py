@@ -6,7 +6,7 @@ of the merits' smooth parts, to the second order, and every sensitivity and ever
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,15 +14,18 @@ import numpy as np
 from twin.run.procedure import Advance, silent
 from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench, Tried
 
-MOST_PAIRED = 150
-"""Numbers up to which all pairs of them are tried; of more the second order has no products of two."""
+MOST_PAIRED = 600
+"""Numbers up to which the second order has products of two: of more they would fill the memory."""
 FARTHEST = 10.0
 """Largest and, inverted, smallest share of its limit at which a tolerance is tried."""
-_HALVINGS = 14
+_MOST_TURNS = 40
+_GRID = 241
 _CLOSE = 1e-4
 """Share of the loss to which a limit is found."""
-_AT_ONCE = 2_000_000
+_AT_ONCE = 8_000_000
 """Numbers of a product that are held in memory."""
+_MOST_HELD, _FEWEST = 25_000_000, 500
+"""Numbers of a scaled model that are held in memory, and draws that it has at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +59,48 @@ class MeritModel:
     def _bent(self, x: np.ndarray) -> np.ndarray:
         return np.asarray(np.sum((x @ self.curvature).transpose(1, 0, 2) * x[:, None], axis=-1))
 
-    def quadratic_slope(self, x: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Derivatives (S, K) at x (S, K) of one part (S,) each."""
-        return np.asarray(self.slope[parts] + np.einsum("skl,sl->sk", self.curvature[parts], x))
+
+@dataclass(frozen=True, eq=False)
+class ScaledModel:
+    """A model at fixed draws of which every tolerance may be scaled.
+
+    Attributes:
+        nominal: parts of the designed camera, (P,).
+        first: what each tolerance adds by itself to the first order, (S, P, E).
+        second: what pairs add to the second, symmetric, halves counted, (S, P, E, E).
+    """
+
+    nominal: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+
+    @classmethod
+    def of(cls, model: MeritModel, x: np.ndarray, entries: Sequence[Sequence[int]]) -> ScaledModel:
+        """Make it of a model.
+
+        Args:
+            model: of the numbers that vary.
+            x: draws, (S, K); of many numbers only as many are kept as the memory holds.
+            entries: numbers of each tolerance, E.
+        """
+        count, parts = len(entries), len(model.nominal)
+        draws = x[: max(_FEWEST, _MOST_HELD // (parts * count**2))]
+        first = np.stack([draws[:, own] @ model.slope[:, own].T for own in map(list, entries)], axis=-1)
+        second = np.zeros((len(draws), parts, count, count))
+        for e, own in enumerate(map(list, entries)):
+            pulled = np.einsum("sk,pkl->spl", draws[:, own], model.curvature[:, own], optimize=True)
+            for f, other in enumerate(map(list, entries[: e + 1])):
+                pair = 0.5 * np.einsum("spl,sl->sp", pulled[:, :, other], draws[:, other])
+                second[:, :, e, f] = second[:, :, f, e] = pair
+        return cls(model.nominal, first, second)
+
+    def parts(self, scales: np.ndarray) -> np.ndarray:
+        """Parts (S, P) where tolerances are scales (E,) times what they are."""
+        return np.asarray(self.nominal + (self.first + self.second @ scales) @ scales)
+
+    def slope(self, scales: np.ndarray, which: np.ndarray) -> np.ndarray:
+        """Derivatives of the parts (W, P, E) of some draws by the logarithms of the scales."""
+        return np.asarray((self.first[which] + 2.0 * (self.second[which] @ scales)) * scales)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,24 +124,23 @@ class Sensitivities:
 
 
 def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivities:
-    """Try every number at plus and minus its size, and all pairs."""
+    """Try every number at plus and minus its size; products of two follow from the wavefronts' derivatives."""
     count = len(bench.numbers)
-    first = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
-    i, j = np.triu_indices(count, 1)
+    x = np.concatenate([np.zeros((1, count)), np.eye(count), -np.eye(count)])
+    done = []
+    for start in range(0, len(x), AT_ONCE):
+        advance("sensitivities", start, len(x))
+        done.append(bench.try_out(x[start : start + AT_ONCE] * bench.sizes, paths=True))
+    advance("sensitivities", len(x), len(x))
+    tried = Tried.joined(done)
+    nominal, plus, minus = tried.parts[0], tried.parts[1 : 1 + count], tried.parts[1 + count :]
     paired = count <= MOST_PAIRED
-    pairs = np.eye(count)[i] + np.eye(count)[j] if paired else np.empty((0, count))
-    # a little less than the whole way, where numbers of two bodies add up to more than either may
-    total = len(first) + len(pairs)
-    alone = _tried(bench, first, 0, total, advance)
-    both = _tried(bench, pairs, len(first), total, advance) if len(pairs) else None
-    nominal, plus, minus = alone.parts[0], alone.parts[1 : 1 + count], alone.parts[1 + count :]
     curvature = np.zeros((bench.parts, count, count))
+    if paired and tried.paths is not None:
+        curvature = bench.pair_curvature(0.5 * (tried.paths[1 : 1 + count] - tried.paths[1 + count :]))
     k = np.arange(count)
     curvature[:, k, k] = (plus + minus - 2.0 * nominal).T
-    if both is not None:
-        product = (both.parts - plus[i] - plus[j] + nominal).T
-        curvature[:, i, j] = curvature[:, j, i] = product
-    model = MeritModel(nominal, 0.5 * (plus - minus).T, np.nan_to_num(curvature), paired)
+    model = MeritModel(nominal, np.nan_to_num(0.5 * (plus - minus).T), np.nan_to_num(curvature), paired)
     values = np.empty((len(bench.entries), 2, len(bench.merits)))
     moves = np.full((len(bench.entries), 2, len(bench.ranges)), np.nan)
     problems = []
@@ -107,27 +148,13 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
         rows = np.array(own)
         if len(rows) == 1:
             ends = np.array([1 + count + rows[0], 1 + rows[0]])
-            values[e], moves[e] = bench.values(alone.parts[ends]), alone.moves[ends]
+            values[e], moves[e] = bench.values(tried.parts[ends]), tried.moves[ends]
         else:
             mean = nominal + 0.5 * np.sum(curvature[:, rows, rows], axis=1)
             values[e] = bench.values(mean)
-        told = [alone.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
+        told = [tried.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
         problems.append(next((text for text in told if text), ""))
     return Sensitivities(bench.values(nominal), values, moves, tuple(problems), model)
-
-
-def _tried(bench: ToleranceBench, x: np.ndarray, done: int, total: int, advance: Advance) -> Tried:
-    parts = []
-    for start in range(0, len(x), AT_ONCE):
-        advance("sensitivities", done + start, total)
-        parts.append(bench.try_out(x[start : start + AT_ONCE] * bench.sizes))
-    advance("sensitivities", done + len(x), total)
-    return Tried(
-        np.concatenate([one.moves for one in parts]),
-        np.concatenate([one.parts for one in parts]),
-        tuple(text for one in parts for text in one.problems),
-        np.concatenate([one.settled for one in parts]),
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,66 +185,95 @@ def default_losses(bench: ToleranceBench, nominal: np.ndarray) -> np.ndarray:
 
 
 def inverse_limits(bench: ToleranceBench, found: Sensitivities, advance: Advance = silent) -> InverseLimits:
-    """Find the limits by exact traces: by halving in the logarithm, both signs, all tolerances and merits together."""
+    """Find the limits by exact traces of both signs, from where the model has them; those of a figure error by it."""
     losses = default_losses(bench, found.nominal)
     entries = list(bench.entries.values())
-    low = np.full((len(entries), len(losses)), np.log(1.0 / FARTHEST))
-    high = -low
-    known = np.isfinite(losses)
+    guess = np.array([[_modelled_share(bench, found, own, m, losses) for m in range(len(losses))] for own in entries])
+    open_ = [(e, m) for e, own in enumerate(entries) for m in range(len(losses)) if len(own) == 1 and losses[m] > 0.0]
+    shares = guess.copy()
+    if open_:
+        which = np.array(open_)
 
-    def loss_at(level: np.ndarray) -> np.ndarray:
-        """Largest loss of both signs at shares exp(level) (E, M), over the loss that is allowed."""
-        x = np.zeros((2, *level.shape, len(bench.numbers)))
-        spread = []
-        for e, own in enumerate(entries):
-            if len(own) == 1:
-                x[0, e, :, own[0]], x[1, e, :, own[0]] = np.exp(level[e]), -np.exp(level[e])
-            else:
-                spread.append(e)
-        tried = bench.try_out(x.reshape(-1, x.shape[-1]) * bench.sizes)
-        values = bench.values(tried.parts).reshape(2, *level.shape, -1)
-        lost = np.stack(
-            [merit.worse(values[..., m, m], found.nominal[m]) for m, merit in enumerate(bench.merits)], axis=-1
-        )
-        worst = np.where(np.isnan(lost), np.inf, lost).max(axis=0)
-        for e in spread:
-            rows = np.array(entries[e])
-            own = found.model.curvature[:, rows, rows].sum(axis=1)
-            mean = found.model.nominal + 0.5 * np.exp(2.0 * level[e])[:, None] * own
-            each = bench.values(mean)
-            worst[e] = [float(merit.worse(each[m, m], found.nominal[m])) for m, merit in enumerate(bench.merits)]
-        return np.asarray(worst / losses)
+        def excess(rows: np.ndarray, level: np.ndarray) -> np.ndarray:
+            """Logarithm of the larger loss of both signs over the allowed one, at shares exp(level)."""
+            own, m = np.array([entries[e][0] for e in which[rows, 0]]), which[rows, 1]
+            x = np.zeros((2, len(rows), len(bench.numbers)))
+            x[0, np.arange(len(rows)), own], x[1, np.arange(len(rows)), own] = np.exp(level), -np.exp(level)
+            values = bench.values(bench.try_out(x.reshape(-1, x.shape[-1]) * bench.sizes).parts).reshape(
+                2, len(rows), -1
+            )
+            worst = np.max([_loss(bench, found, values[:, k, j], j) for k, j in enumerate(m)], axis=1)
+            return np.asarray(np.log(np.maximum(worst / losses[m], 1e-12)))
 
-    return InverseLimits(losses, np.where(known, _crossing(loss_at, low, high, advance), np.nan))
+        start = np.log(np.clip(guess[which[:, 0], which[:, 1]], FARTHEST**-2, FARTHEST))
+        shares[which[:, 0], which[:, 1]] = np.exp(_roots(excess, start, advance))
+    return InverseLimits(losses, shares)
 
 
-def _crossing(
-    ratio: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray, advance: Advance
-) -> np.ndarray:
-    """exp of where ratios reach 1 between two levels; infinite where they do not, and exp(low) where they have before.
+def _loss(bench: ToleranceBench, found: Sensitivities, values: np.ndarray, m: int) -> np.ndarray:
+    """By how much values of a merit are worse than the designed camera's; infinite where the light is lost."""
+    lost = bench.merits[m].worse(values, found.nominal[m])
+    return np.asarray(np.where(np.isnan(lost), np.inf, lost))
 
-    Losses grow with about the first or the second power of a share: a straight line through both ends in logarithms,
-    kept within them (Illinois), halves the interval many times at once.
+
+def _modelled_share(
+    bench: ToleranceBench, found: Sensitivities, own: Sequence[int], m: int, losses: np.ndarray
+) -> float:
+    """Share of a tolerance's limit at which the model has the loss of a merit; infinite beyond ``FARTHEST``."""
+    if not losses[m] > 0.0:
+        return np.nan
+    share = np.geomspace(FARTHEST**-2, FARTHEST, _GRID)
+    model, rows = found.model, np.array(own)
+    bent = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
+    ways = [np.outer(share, sign * model.slope[:, rows[0]]) if len(rows) == 1 else 0.0 for sign in (1.0, -1.0)]
+    lost = np.max([_loss(bench, found, bench.merits[m].values(model.nominal + way + bent), m) for way in ways], axis=0)
+    beyond = np.flatnonzero(lost >= losses[m])
+    return float(share[beyond[0]]) if beyond.size else np.inf
+
+
+def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.ndarray, advance: Advance) -> np.ndarray:
+    """Where functions that grow cross zero, each from its own start, all together; infinite beyond the farthest level.
+
+    First a step that doubles until the zero lies between two levels, then the straight line through both ends, of which
+    the one that stays twice counts half (Illinois).
+
+    Args:
+        excess: numbers of the functions and a level for each -> values.
+        start: levels, (R,).
+        advance: shows how far it is.
     """
-    at_low, at_high = (np.log(np.maximum(ratio(level), 1e-12)) for level in (low, high))
-    out = np.where(at_high < 0.0, np.inf, np.where(at_low > 0.0, low, np.nan))
-    below, above = np.maximum(at_low, -60.0), np.minimum(at_high, 60.0)
-    side = np.zeros(low.shape)
-    for step in range(_HALVINGS):
-        advance("limits for a loss", step, _HALVINGS)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            middle = low - below * (high - low) / (above - below)
-        middle = np.where(np.isfinite(middle), middle, 0.5 * (low + high))
-        here = np.clip(np.log(np.maximum(ratio(middle), 1e-12)), -60.0, 60.0)
-        left = here < 0.0
-        # the end that stays twice counts half, so that the other comes nearer
-        above = np.where(left & (side < 0), 0.5 * above, np.where(left, above, here))
-        below = np.where(~left & (side > 0), 0.5 * below, np.where(left, here, below))
-        low, high = np.where(left, middle, low), np.where(left, high, middle)
-        side = np.where(left, -1.0, 1.0)
-        found = np.abs(here) < _CLOSE
-        out = np.where(np.isnan(out) & found, middle, out)
-        if not np.isnan(out).any():
+    count = len(start)
+    low, high = np.full(count, -np.inf), np.full(count, np.inf)
+    below, above = np.full(count, np.nan), np.full(count, np.nan)
+    side, step, out = np.zeros(count), np.full(count, 0.05), np.full(count, np.nan)
+    level = start.copy()
+    top, bottom = np.log(FARTHEST), -2.0 * np.log(FARTHEST)
+    for turn in range(_MOST_TURNS):
+        advance("limits for a loss", count - int(np.isnan(out).sum()), count)
+        rows = np.flatnonzero(np.isnan(out))
+        if not rows.size:
             break
-    advance("limits for a loss", _HALVINGS, _HALVINGS)
-    return np.exp(np.where(np.isnan(out), 0.5 * (low + high), out))
+        here = np.clip(excess(rows, level[rows]), -60.0, 60.0)
+        for r, value in zip(rows, here, strict=True):
+            under = value < 0.0
+            if abs(value) < _CLOSE:
+                out[r] = level[r]
+            elif under and level[r] >= top:
+                out[r] = np.inf
+            elif not under and level[r] <= bottom:
+                out[r] = bottom
+            elif under:
+                above[r] *= 0.5 if side[r] < 0.0 else 1.0
+                low[r], below[r], side[r] = level[r], value, -1.0
+            else:
+                below[r] *= 0.5 if side[r] > 0.0 else 1.0
+                high[r], above[r], side[r] = level[r], value, 1.0
+            if np.isfinite(low[r]) and np.isfinite(high[r]):
+                level[r] = low[r] - below[r] * (high[r] - low[r]) / (above[r] - below[r])
+                if high[r] - low[r] < _CLOSE:
+                    out[r] = level[r]
+            else:
+                level[r] = min(top, low[r] + step[r]) if under else max(bottom, high[r] - step[r])
+                step[r] *= 3.0
+    advance("limits for a loss", count, count)
+    return np.where(np.isnan(out), level, out)

@@ -305,4 +305,6 @@ def _journal(folder: Path, fingerprint: str) -> Iterator[None]:
                 head.flush()
             yield
     except OSError as error:
-        raise run_folder.RunFolderError(f"{folder}: {error.strerror}; what is done is kept, go on with --resume") from error
+        raise run_folder.RunFolderError(
+            f"{folder}: {error.strerror}; what is done is kept, go on with --resume"
+        ) from error

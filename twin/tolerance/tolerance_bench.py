@@ -7,7 +7,8 @@ points of the stop. What bodies and edges take of a beam is that of the designed
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -55,6 +56,8 @@ RESIDUAL = 1e-3
 """Rms of a wavefront that its polynomials may leave, waves."""
 TRANSFER = 1e-3
 """By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""
+EVERY = 4
+"""Distortion is told of each fourth point of the line."""
 _MOVE = 1e-3
 """Step of the derivatives by compensators, as a share of their range."""
 
@@ -68,12 +71,26 @@ class Tried:
         parts: of all merits, (S, P); NaN where the light is lost.
         problems: why it is lost, empty where it is not, (S,).
         settled: rms by which one further step would change the wavefront, waves, (S,).
+        paths: optical paths of the beams' rays less those of the chief rays, (S, F, N), metres; None if not asked for.
     """
 
     moves: np.ndarray
     parts: np.ndarray
     problems: tuple[str, ...]
     settled: np.ndarray
+    paths: np.ndarray | None = None
+
+    @classmethod
+    def joined(cls, several: Sequence[Tried]) -> Tried:
+        """Several, one after the other."""
+        paths = [one.paths for one in several if one.paths is not None]
+        return cls(
+            np.concatenate([one.moves for one in several]),
+            np.concatenate([one.parts for one in several]),
+            tuple(text for one in several for text in one.problems),
+            np.concatenate([one.settled for one in several]),
+            np.concatenate(paths) if len(paths) == len(several) else None,
+        )
 
 
 class ToleranceBench:
@@ -99,10 +116,11 @@ class ToleranceBench:
         self.experiment = MonitorExperiment(setup.base, backend)
         instrument = self.instrument = self.experiment.instrument
         self.camera = self._camera_name()
+        self.line = line_points(instrument, self.camera)
         thermal = self.experiment.thermal
         self.numbers: tuple[VariedNumber, ...] = tolerance_numbers(setup, instrument, thermal)
         self.compensators: tuple[VariedNumber, ...] = compensator_numbers(setup, instrument, thermal)
-        self.merits, self.fields = merits_of(dict(test.merits), LINE_POINTS)
+        self.merits, self.fields = merits_of(dict(test.merits), len(self._along))
         if not len(self.fields) and self.compensators:
             allowed = "a merit of kind wavefront, mtf or chief_ray, at whose fields the wavefront is made least"
             raise test.error("compensators need fields", ("merits",), allowed=allowed)
@@ -113,7 +131,6 @@ class ToleranceBench:
         self.optics = CameraOptics.within(instrument, self.camera, backend)
         self.wavelength = float(self.optics.model.spec.wavelength)
         self._wanted = {merit.spec.kind for merit in self.merits}
-        self.line = line_points(instrument, self.camera)
         if len(self.fields):
             self._prepare()
 
@@ -319,25 +336,23 @@ class ToleranceBench:
             held |= beyond
         return np.asarray(target * size)
 
-    def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None) -> Tried:
+    def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False) -> Tried:
         """Trace cameras, adjust them, and work out their merits.
 
         Args:
             amounts: of the numbers that vary, SI, (S, K).
             errors: of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with its
                 error, in their order, the later ones following the earlier; None for the ideal adjustment.
+            paths: whether their optical paths are wanted.
 
         Returns:
             The cameras; one whose light is lost does not change the others.
         """
-        parts = [self._try(amounts[s : s + AT_ONCE], None if errors is None else errors[s : s + AT_ONCE])
-                 for s in range(0, len(amounts), AT_ONCE)]
-        return Tried(
-            np.concatenate([one.moves for one in parts]),
-            np.concatenate([one.parts for one in parts]),
-            tuple(text for one in parts for text in one.problems),
-            np.concatenate([one.settled for one in parts]),
-        )
+        starts = range(0, len(amounts), AT_ONCE)
+        found = [
+            self._try(amounts[s : s + AT_ONCE], None if errors is None else errors[s : s + AT_ONCE]) for s in starts
+        ]
+        return Tried.joined(found if paths else [replace(one, paths=None) for one in found])
 
     def _try(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
         try:
@@ -345,18 +360,12 @@ class ToleranceBench:
         except PhysicalError as error:
             if len(amounts) == 1:
                 lost = np.full((1, self.parts), np.nan)
-                return Tried(np.full((1, len(self.ranges)), np.nan), lost, (str(error) or "lost",), np.full(1, np.nan))
+                paths = np.full((1, len(self.fields), len(self.points) - 1), np.nan) if len(self.fields) else None
+                moves = np.full((1, len(self.ranges)), np.nan)
+                return Tried(moves, lost, (str(error) or "lost",), np.full(1, np.nan), paths)
         half = len(amounts) // 2
-        pair = [
-            self._try(amounts[own], None if errors is None else errors[own])
-            for own in (slice(0, half), slice(half, None))
-        ]
-        return Tried(
-            np.concatenate([one.moves for one in pair]),
-            np.concatenate([one.parts for one in pair]),
-            tuple(text for one in pair for text in one.problems),
-            np.concatenate([one.settled for one in pair]),
-        )
+        both = slice(0, half), slice(half, None)
+        return Tried.joined([self._try(amounts[own], None if errors is None else errors[own]) for own in both])
 
     @one_blas_thread()
     def _adjusted(self, amounts: np.ndarray, errors: np.ndarray | None) -> Tried:
@@ -391,7 +400,7 @@ class ToleranceBench:
                 moves = self._made(self._residuals(paths), moves, errors)
                 states = state(moves)
                 paths, chiefs = self._errors(states)
-        return Tried(moves, self._parts(states, paths, chiefs), ("",) * count, settled)
+        return Tried(moves, self._parts(states, paths, chiefs), ("",) * count, settled, paths)
 
     def _made(self, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Moves as they are made: by whole steps and with errors, one after the other."""
@@ -411,6 +420,28 @@ class ToleranceBench:
         return wanted
 
     # merits
+
+    def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
+        """Second derivatives of the parts by pairs of numbers, (P, K, K), as first derivatives of the wavefronts make
+        them; 0 for parts that are no function of a wavefront.
+
+        Mean squares and MTFs bend because they are functions of a wavefront that hardly does.
+
+        Args:
+            slopes: of the optical paths by the numbers, metres, (K, F, N).
+        """
+        out = np.zeros((self.parts, len(slopes), len(slopes)))
+        residuals = self._residuals(slopes).reshape(len(slopes), len(self.fields), -1) if len(self.fields) else None
+        for k, merit in enumerate(self.merits):
+            if merit.spec.kind == "wavefront":
+                assert residuals is not None
+                for part, f in enumerate(merit.fields, merit.parts.start):
+                    out[part] = 2.0 * residuals[:, f] @ residuals[:, f].T
+            elif merit.spec.kind == "mtf":
+                every = [(f, one) for f, row in zip(merit.fields, self._transfers[k], strict=True) for one in row]
+                for part, (f, one) in enumerate(every, merit.parts.start):
+                    out[part] = one.curvature(slopes[:, f])
+        return out
 
     def _parts(self, states: Sequence[State], paths: np.ndarray | None, chiefs: np.ndarray | None) -> np.ndarray:
         """Parts of all merits, (S, P)."""
@@ -440,7 +471,11 @@ class ToleranceBench:
     def _modulations(self, k: int, merit: Merit, paths: np.ndarray) -> np.ndarray:
         longer = paths - self.designed
         return np.stack(
-            [one.modulation(longer[:, f]) for f, row in zip(merit.fields, self._transfers[k], strict=True) for one in row],
+            [
+                one.modulation(longer[:, f])
+                for f, row in zip(merit.fields, self._transfers[k], strict=True)
+                for one in row
+            ],
             axis=-1,
         )
 
@@ -456,13 +491,26 @@ class ToleranceBench:
         # what a shift and another principal distance explain is not distortion
         moved = (tangent[1:] - tangent[0]) * change.nominal_distance
         level = np.stack([np.ones_like(self.line), self.line], axis=-1)
-        rest = moved - moved @ np.linalg.pinv(level).T @ level.T
+        rest = (moved - moved @ np.linalg.pinv(level).T @ level.T)[:, self._along]
         return {
             "boresight": np.stack([change.d_alpha, change.d_beta], axis=-1),
             "roll": change.d_gamma[:, None],
             "principal_distance": change.d_f[:, None],
             "distortion": rest,
         }
+
+    @property
+    def _along(self) -> np.ndarray:
+        """Points of the line at which distortion is told."""
+        return np.arange(0, LINE_POINTS, EVERY)
+
+    def scaled(self, scales: np.ndarray) -> ToleranceBench:
+        """The same bench with limits that are scales (E,) times these."""
+        other = copy(self)
+        by_entry = dict(zip(self.entries, scales.tolist(), strict=True))
+        other.numbers = tuple(replace(one, size=one.size * by_entry[one.entry]) for one in self.numbers)
+        vars(other).pop("sizes", None)
+        return other
 
     @cached_property
     def entries(self) -> dict[str, tuple[int, ...]]:

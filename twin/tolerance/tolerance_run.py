@@ -18,7 +18,7 @@ from scenes.yaml.units import LENGTH
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
-from twin.tolerance.merit_models import InverseLimits, Sensitivities, inverse_limits, sensitivities
+from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
 from twin.tolerance.merits import Merit
 from twin.tolerance.samples import Samples, Workforce, adjustment_errors, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
@@ -32,6 +32,8 @@ LEVELS = (0.5, 0.9, 0.95)
 """Shares of cameras of which a merit's value is told."""
 _MORE = 7919
 """What is added to the seed for the cameras by which an allocation is judged, so that they are others."""
+_NOTHING = 1e-15
+"""Metres and radians below which a motion is rounding."""
 NEAR_MODEL = 0.05
 """Share by which a model's quantile may differ from the samples' without a warning."""
 
@@ -79,7 +81,7 @@ class MeritResult:
         linear, quadratic: the same by the models.
         passing: share that passes.
         model_passing: the same by the linear and the quadratic model.
-        shares: entry -> share of the variance that it causes by itself.
+        shares: entry -> share of the variance that is gone without it, by the quadratic model.
     """
 
     merit: Merit
@@ -153,10 +155,11 @@ def run_tolerance(
     inverse = inverse_limits(bench, found, advance)
     samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
     passing = bench.passing(samples.values)
-    merits = tuple(_merit_result(bench, found, samples, m, passing[:, m]) for m in range(len(bench.merits)))
+    models = Modelled.of(bench, found, samples)
+    merits = tuple(_merit_result(bench, found, samples, models, m, passing[:, m]) for m in range(len(bench.merits)))
     allocation, judged = None, None
     if test.allocation is not None:
-        allocation = allocate(setup, bench, found.model, samples.x, test.allocation, advance)
+        allocation = allocate(setup, bench, found.model, samples, test.allocation, advance)
         judged = _judged(setup, backend, allocation, seed, force, advance)
     return ToleranceRun(
         setup,
@@ -181,7 +184,8 @@ def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:
 def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
     """The budget with other limits."""
     entries = {
-        name: one.model_copy(update={"limit": limits.get(name, one.limit)}) for name, one in setup.test.tolerances.items()
+        name: one.model_copy(update={"limit": limits.get(name, one.limit)})
+        for name, one in setup.test.tolerances.items()
     }
     return setup.model_copy(update={"test": setup.test.model_copy(update={"tolerances": FrozenMap(entries)})})
 
@@ -201,8 +205,33 @@ def _judged(
     return Yield.count(np.all(bench.passing(drawn.values), axis=-1))
 
 
+@dataclass(frozen=True, eq=False)
+class Modelled:
+    """What the models say of the cameras that were drawn.
+
+    Attributes:
+        linear, quadratic: values of the merits, SI, (S, M).
+        without: the same to the second order without each tolerance, of the first of the cameras, (E, S', M).
+    """
+
+    linear: np.ndarray
+    quadratic: np.ndarray
+    without: np.ndarray
+
+    @classmethod
+    def of(cls, bench: ToleranceBench, found: Sensitivities, samples: Samples) -> Modelled:
+        """The models at the cameras' own draws."""
+        scaled = ScaledModel.of(found.model, samples.x, list(bench.entries.values()))
+        every = np.eye(len(bench.entries))
+        return cls(
+            bench.values(found.model.linear(samples.x)),
+            bench.values(found.model.quadratic(samples.x)),
+            np.stack([bench.values(scaled.parts(1.0 - one)) for one in every]),
+        )
+
+
 def _merit_result(
-    bench: ToleranceBench, found: Sensitivities, samples: Samples, m: int, passing: np.ndarray
+    bench: ToleranceBench, found: Sensitivities, samples: Samples, models: Modelled, m: int, passing: np.ndarray
 ) -> MeritResult:
     merit = bench.merits[m]
     values = samples.values[:, m]
@@ -213,24 +242,21 @@ def _merit_result(
         known = sign * own[np.isfinite(own)]
         return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
 
-    models = [merit.values(part(samples.x)) for part in (found.model.linear, found.model.quadratic)]
-    total = float(np.var(good)) if len(good) > 1 else np.nan
-    alone = {}
-    for entry, own in bench.entries.items():
-        x = np.zeros_like(samples.x)
-        x[:, list(own)] = samples.x[:, list(own)]
-        alone[entry] = float(np.var(merit.values(found.model.quadratic(x)))) / total if total > 0.0 else np.nan
+    without = np.var(models.without[:, :, m], axis=1)
+    modelled = float(np.var(models.quadratic[: models.without.shape[1], m]))
+    shares = np.maximum(0.0, 1.0 - without / modelled) if modelled > 0.0 else np.zeros(len(without))
+    by_model = models.linear[:, m], models.quadratic[:, m]
     return MeritResult(
         merit,
         float(found.nominal[m]),
         float(np.mean(good)) if len(good) else np.nan,
-        float(np.sqrt(total)),
+        float(np.std(good)) if len(good) else np.nan,
         levels(values),
-        levels(models[0]),
-        levels(models[1]),
+        levels(by_model[0]),
+        levels(by_model[1]),
         Yield.count(passing),
-        (float(np.mean(merit.passes(models[0]))), float(np.mean(merit.passes(models[1])))),
-        FrozenMap(alone),
+        (float(np.mean(merit.passes(by_model[0]))), float(np.mean(merit.passes(by_model[1])))),
+        FrozenMap(zip(bench.entries, shares.tolist(), strict=True)),
     )
 
 
@@ -269,7 +295,9 @@ def _warnings(
     at_end = np.abs(samples.moves) >= 0.999 * bench.ranges
     for c in np.flatnonzero(stuck & np.any(at_end, axis=0)):
         share = float(np.mean(at_end[:, c]))
-        out.append(f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all")
+        out.append(
+            f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all"
+        )
     if allocation is not None and judged is not None and spec is not None:
         if not allocation.reached:
             out.append(
@@ -304,8 +332,9 @@ def _perturb(motion: Any) -> dict[str, Any]:
     """A motion as a job's file says it."""
     out: dict[str, Any] = {}
     for kind in ("rotate", "shift"):
-        if any(getattr(motion, kind)):
-            out[kind] = [amount_text(value, kind) for value in getattr(motion, kind)]
+        values = [value if abs(value) > _NOTHING else 0.0 for value in getattr(motion, kind)]
+        if any(values):
+            out[kind] = [amount_text(value, kind) for value in values]
     if any(motion.figure.values()):
         out["figure"] = {f"Z{j}": amount_text(value, "figure") for j, value in motion.figure.items() if value}
     for kind in ("radius", "conic", "index"):
@@ -320,7 +349,9 @@ def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
     try:
         JobSpec.model_validate(data)
     except (InputError, ValueError) as error:  # a motion larger than a job may say
-        return f"# Camera {number} of the tolerance budget cannot be said as a job: {' '.join(str(error).split())[:200]}\n"
+        return (
+            f"# Camera {number} of the tolerance budget cannot be said as a job: {' '.join(str(error).split())[:200]}\n"
+        )
     head = f"# Camera {number} of the tolerance budget of {setup.test.instrument}, with its adjustments\n"
     return head + dump_yaml(data)
 
@@ -372,7 +403,8 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
     bench = run.bench
     for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
         below, above = (
-            {m.name: _shown(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)} for end in (0, 1)
+            {m.name: _shown(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
+            for end in (0, 1)
         )
         share = run.inverse.shares[e]
         out[name] = {

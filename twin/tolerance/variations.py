@@ -158,7 +158,9 @@ class _Maker:
         first = self.instrument.assembly.nominal_pose(body)
         way = first.rotation[:, AXES[axis]]
         point = first.apply(np.array(self._body(body).pivots[pivot or "origin"]))
-        return FrozenMap({path: _rigid(self.instrument.assembly.nominal_pose(path), kind, way, point) for path in bodies})
+        return FrozenMap(
+            {path: _rigid(self.instrument.assembly.nominal_pose(path), kind, way, point) for path in bodies}
+        )
 
     def _body(self, path: str) -> Body:
         return self.instrument.assembly.tree[path]
