@@ -108,8 +108,16 @@ class PlainPerturbationSpec(Spec):
     def motion(self) -> Motion:
         """All of it but the temperature, as a state has it."""
         figure = {noll(term): value for term, value in self.figure.items()}
-        shape = {"radius": self.radius or 0.0, "conic": self.conic or 0.0, "index": self.index or 0.0}
-        return Motion(self.rotate, self.shift, self.pivot, self.scale, figure, **shape)
+        return Motion(
+            self.rotate,
+            self.shift,
+            self.pivot,
+            self.scale,
+            figure,
+            index=self.index or 0.0,
+            radius=self.radius or 0.0,
+            conic=self.conic or 0.0,
+        )
 
 
 class PerturbationSpec(PlainPerturbationSpec):

@@ -108,8 +108,8 @@ class ToleranceSpec(Varied):
     """One tolerance.
 
     Attributes:
-        motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`, `M2 figure Z7`,
-            `base temperature`; `M1 figure` alone is a figure error of many terms.
+        motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
+            `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
         carrying: further bodies that move rigidly with the first.
         limit: largest amount either way; of a figure error its rms.
         law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
@@ -171,6 +171,11 @@ class ToleranceSpec(Varied):
     def spectrum(self) -> tuple[int, ...]:
         """Noll's numbers of the terms of a whole figure error; empty for anything else."""
         return () if self.terms is None else tuple(range(noll(self.terms[0]), noll(self.terms[1]) + 1))
+
+    @property
+    def words(self) -> str:
+        """The motion in words, `M1 figure` where it has many terms."""
+        return self.motion if self.terms is None else self.motion.rsplit(maxsplit=1)[0]
 
     @property
     def limit_si(self) -> float:
@@ -252,17 +257,17 @@ class MeritSpec(Spec):
 
     Attributes:
         kind: `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which
-            the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`, largest
-            change of an image's place along the line that neither of these three explains; `chief_ray`, largest turn of
-            a chief ray at the line CCD.
+            the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`,
+            largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
+            turn of a chief ray at the line CCD.
         fields: of wavefront and mtf, the worst of which counts: shares of the half field along the line and the track.
         frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
         direction: of mtf: along the line, along the track, or the worse of both.
         at_most: largest value that passes; a change counts either way.
         at_least: smallest value that passes, of mtf.
         probability: share of cameras that are to pass.
-        loss: of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design and
-            requirement over the square root of the number of tolerances.
+        loss: of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design
+            and requirement over the square root of the number of tolerances.
     """
 
     kind: Literal["wavefront", "mtf", "boresight", "roll", "principal_distance", "distortion", "chief_ray"]
@@ -365,13 +370,12 @@ class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
 
     Attributes:
         base: the nominal job of the instrument.
-        draws: by number that varies, what one camera has of it, in units of its limit; those that are left out are zero.
-        adjusting: seed of the errors of that camera's adjustments; None for adjustments without error.
+        draws: by number that varies, what one camera has of it, in units of its limit; those that are left out are
+            zero.
     """
 
     base: ResolvedJob
     draws: Annotated[dict[str, Number], NothingIsEmpty] = Field(default_factory=FrozenMap)
-    adjusting: Seed | None = None
 
 
 def resolve_tolerance(path: str | Path) -> ToleranceSetup:

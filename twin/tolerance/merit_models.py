@@ -1,7 +1,7 @@
 """Merits as functions of what varies: first and second derivatives, sensitivities, and limits for a stated loss.
 
-Where a camera is at its best a slope says nothing: there the second derivative is what a motion costs. So the models are
-of the merits' smooth parts, to the second order, and every sensitivity and every limit is traced exactly.
+Where a camera is at its best a slope says nothing: there the second derivative is what a motion costs. So the models
+are of the merits' smooth parts, to the second order, and every sensitivity and every limit is traced exactly.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def _roots(excess: Callable[[np.ndarray, np.ndarray], np.ndarray], start: np.nda
     side, step, out = np.zeros(count), np.full(count, 0.05), np.full(count, np.nan)
     level = start.copy()
     top, bottom = np.log(FARTHEST), -2.0 * np.log(FARTHEST)
-    for turn in range(_MOST_TURNS):
+    for _ in range(_MOST_TURNS):
         advance("limits for a loss", count - int(np.isnan(out).sum()), count)
         rows = np.flatnonzero(np.isnan(out))
         if not rows.size:

@@ -13,8 +13,8 @@ from scenes.specs.tolerance import MeritSpec
 class Merit:
     """One merit of a budget.
 
-    Its **parts** change smoothly with small motions, which its value, as the worst of some fields, does not: mean square
-    wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line.
+    Its **parts** change smoothly with small motions, which its value, as the worst of some fields, does not: mean
+    square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line.
 
     Attributes:
         name: in the file.

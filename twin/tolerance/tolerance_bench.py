@@ -30,7 +30,6 @@ from optics.waves.transfer import transfer
 from optics.waves.varied_pupil import VariedTransfer
 from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE
-from scenes.specs.instrument import BASE
 from scenes.specs.tolerance import ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
@@ -189,8 +188,8 @@ class ToleranceBench:
         self._aimed = aim(self.backend, systems, self._fan, self._target, near, slopes, AIM_TOLERANCE)
 
     def _lit_roots(self, pieces: np.ndarray) -> np.ndarray:
-        """Matrices (F, K, K) of which the squares of products with a wavefront's coefficients are its mean square, piston
-        and tilt taken out over the light.
+        """Matrices (F, K, K) of which the squares of products with a wavefront's coefficients are its mean square,
+        piston and tilt taken out over the light.
         """
         out = []
         free = not pieces.shape[1] or not np.any(area(pieces) > SMALLEST)
@@ -313,7 +312,9 @@ class ToleranceBench:
     # adjustments
 
     def _stepped(self, residuals: np.ndarray, moves: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Amounts (S, C) of the compensators that are free (C,) which make linearised residuals least, within ranges."""
+        """Amounts (S, C) of the compensators that make linearised residuals least, within ranges; others than those
+        that are free (C,) stay.
+        """
         size = np.where(self.ranges > 0.0, self.ranges, 1.0)
         slope = self._slope * size
         normal = slope.T @ slope
@@ -341,8 +342,8 @@ class ToleranceBench:
 
         Args:
             amounts: of the numbers that vary, SI, (S, K).
-            errors: of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with its
-                error, in their order, the later ones following the earlier; None for the ideal adjustment.
+            errors: of the compensators' moves in standard deviations, (S, C); then each is moved by whole steps with
+                its error, in their order, the later ones following the earlier; None for the ideal adjustment.
             paths: whether their optical paths are wanted.
 
         Returns:

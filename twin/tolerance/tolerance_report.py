@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, shown_unit
 from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.tolerance.merit_models import FARTHEST
 from twin.tolerance.tolerance_run import LEVELS, MeritResult, ToleranceRun, Yield, merit_unit
 
 _FEW = 3
@@ -28,9 +29,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
     sections = (
         Section(
             "Yield",
-            (
-                "Share of the cameras that keep a value, by exact traces and by the models; the line is the requirement.",
-            ),
+            ("Share of the cameras that keep a value, by exact traces and by the models; the line is what is asked.",),
             (SvgFigure("yield", "Merits over all cameras", "", curves), _levels_table(run)),
             name="yield",
         ),
@@ -46,7 +45,8 @@ def tolerance_report(run: ToleranceRun) -> Report:
         Section(
             "Sensitivities",
             (
-                "Each tolerance alone at its limit, below and above, with all compensators adjusted anew by exact traces.",
+                "Each tolerance alone at its limit, below and above, with all compensators adjusted anew, by exact "
+                "traces.",
             ),
             (_sensitivity_table(run),),
             name="sensitivities",
@@ -54,8 +54,9 @@ def tolerance_report(run: ToleranceRun) -> Report:
         Section(
             "Limits for a loss",
             (
-                "The limit at which a tolerance by itself spoils a merit by the loss in the head of its column, by exact "
-                f"traces of both signs. Empty where {10:g} times the limit does not, and where the design leaves nothing.",
+                "The limit at which a tolerance by itself spoils a merit by the loss in the head of its column, by "
+                f"exact traces of both signs. Empty where {FARTHEST:g} times the limit does not, and where the design "
+                "leaves nothing.",
             ),
             (_inverse_table(run),),
             name="inverse",
@@ -190,7 +191,7 @@ def _levels_table(run: ToleranceRun) -> Table:
 def _shares_table(run: ToleranceRun) -> Table:
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
-    rows = [[name, *(100.0 * one.shares[name] for one in run.merits)] for name in order]
+    rows: list[list[Cell]] = [[name, *(100.0 * one.shares[name] for one in run.merits)] for name in order]
     heads = ("tolerance", *(f"{one.merit.name} [percent]" for one in run.merits))
     return Table("variance", "Shares of variance", "Percent.", heads, rows, (None, *[1] * len(run.merits)))
 
@@ -200,7 +201,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
     for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
         cells: list[Cell] = [
             name,
-            one.motion if not one.spectrum else f"{one.motion.split()[0]} figure",
+            one.words,
             str(one.limit),
         ]
         for m, result in enumerate(run.merits):
@@ -221,12 +222,10 @@ def _inverse_table(run: ToleranceRun) -> Table:
             cells.append(_scaled_limit(one.limit, share) if np.isfinite(share) else "")
         rows.append(cells)
     heads = ["tolerance", "limit"]
-    for m, one in enumerate(run.merits):
-        unit, size = merit_unit(one.merit)
-        loss = float(run.inverse.losses[m]) / size
-        heads.append(
-            f"{one.merit.name}: loss {loss:.3g} {shown_unit(unit)}".rstrip() if np.isfinite(loss) else one.merit.name
-        )
+    for m, result in enumerate(run.merits):
+        unit, size = merit_unit(result.merit)
+        loss, name = float(run.inverse.losses[m]) / size, result.merit.name
+        heads.append(f"{name}: loss {loss:.3g} {shown_unit(unit)}".rstrip() if np.isfinite(loss) else name)
     return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
 
 
@@ -247,7 +246,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
         rows.append(
             [
                 name,
-                one.motion,
+                one.words,
                 str(one.limit),
                 _scaled_limit(one.limit, float(found.scales[e])),
                 str(found.limits[name]),
@@ -265,7 +264,7 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
     )
     text = (
         f"Cost {found.cost[0]:.3g} before and {found.cost[1]:.3g} after. By the model the yield goes from "
-        f"{_percent(found.predicted[0])} to {_percent(found.predicted[1])}; cameras of their own, traced exactly, yield "
+        f"{_percent(found.predicted[0])} to {_percent(found.predicted[1])}; other cameras, traced exactly, yield "
         f"{_interval(judged)}.",
     )
     return (Section("Allocation", text, (table, _tol_table(run)), name="allocation"),)
@@ -277,7 +276,7 @@ def _tol_table(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
     for name, one in run.setup.test.tolerances.items():
         law = "measured" if one.measured is not None else "figure" if one.spectrum else one.law
-        rows.append([name, one.motion, str(limits.get(name, one.limit)), law, " ".join(one.carrying)])
+        rows.append([name, one.words, str(limits.get(name, one.limit)), law, " ".join(one.carrying)])
     heads = ("tolerance", "motion", "limit (plus, minus)", "law", "carrying")
     return Table("tol", "Limits for the workshop", "As CSV in artefacts/tol.csv.", heads, rows)
 

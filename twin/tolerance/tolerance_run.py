@@ -20,7 +20,7 @@ from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
 from twin.tolerance.merits import Merit
-from twin.tolerance.samples import Samples, Workforce, adjustment_errors, draw_samples
+from twin.tolerance.samples import Samples, Workforce, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
 
@@ -301,8 +301,8 @@ def _warnings(
     if allocation is not None and judged is not None and spec is not None:
         if not allocation.reached:
             out.append(
-                f"no limits within {spec.tightest:g} times tighter reach a yield of {100 * spec.target:.0f} %: the table "
-                "has the tightest"
+                f"no limits up to {spec.tightest:g} times tighter reach a yield of {100 * spec.target:.0f} %: the "
+                "table has the tightest"
             )
         elif not judged.low <= allocation.predicted[1] <= judged.high:
             out.append(
@@ -408,7 +408,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
         )
         share = run.inverse.shares[e]
         out[name] = {
-            "motion": one.motion,
+            "motion": one.words,
             "limit": one.limit,
             "at_minus": below,
             "at_plus": above,

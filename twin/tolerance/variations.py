@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -122,15 +123,14 @@ class _Maker:
         except Problem as problem:
             raise self.test.error(problem, (*key, "motion" if name == one.parts[0] else "carrying")) from None
         _, kind, axis, _, pivot = one.parts
-        vector = tuple(float(k == AXES.get(axis)) for k in range(3))
-        does = {
-            "shift": {"shift": vector},
-            "rotate": {"rotate": vector},
-            "figure": {"figure": FrozenMap({axis: 1.0})},
-            "temperature": {},
-            "gradient": {},
-        }.get(kind, {kind: 1.0})
-        what = PlainPerturbationSpec.model_construct(**does, **({"pivot": pivot} if pivot else {}))
+        does: dict[str, Any] = {} if kind in HEAT else {kind: 1.0}
+        if kind in ("shift", "rotate"):
+            does = {kind: tuple(float(k == AXES[axis]) for k in range(3))}
+        elif kind == "figure":
+            does = {kind: FrozenMap({axis: 1.0})}
+        if pivot:
+            does["pivot"] = pivot
+        what = PlainPerturbationSpec.model_construct(**does)
         issues = perturbation_issues(self.test, self.instrument.nodes, body, what, key)
         if issues:
             raise InputError(*issues)
