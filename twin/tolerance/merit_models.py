@@ -109,8 +109,8 @@ class Sensitivities:
 
     Attributes:
         nominal: values of the merits of the designed camera, adjusted, (M,).
-        values: with each tolerance at its limit, below and above; of a figure error what its mean squares come to,
-            (E, 2, M).
+        values: with each tolerance at its limit, below and above, (E, 2, M); of a figure error what its terms come to
+            on the average.
         moves: of the compensators for that, SI, (E, 2, C); NaN for a figure error.
         problems: why a camera has no light there, empty where it has, (E,).
         model: of all numbers together.
@@ -150,11 +150,20 @@ def sensitivities(bench: ToleranceBench, advance: Advance = silent) -> Sensitivi
             ends = np.array([1 + count + rows[0], 1 + rows[0]])
             values[e], moves[e] = bench.values(tried.parts[ends]), tried.moves[ends]
         else:
-            mean = nominal + 0.5 * np.sum(curvature[:, rows, rows], axis=1)
-            values[e] = bench.values(mean)
+            values[e] = bench.values(_spread(bench, model, rows, np.ones(1))[0])
         told = [tried.problems[r] for r in (*(1 + rows), *(1 + count + rows))]
         problems.append(next((text for text in told if text), ""))
     return Sensitivities(bench.values(nominal), values, moves, tuple(problems), model)
+
+
+def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Parts (L, P) that stand for a figure error of shares (L,) of its limit: of what bends the mean, else the rms."""
+    mean = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
+    rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
+    bends = np.zeros(bench.parts, dtype=bool)
+    for merit in bench.merits:
+        bends[merit.parts] = merit.spec.kind in ("wavefront", "mtf")
+    return np.asarray(model.nominal + np.where(bends, mean, rms))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,9 +233,12 @@ def _modelled_share(
         return np.nan
     share = np.geomspace(FARTHEST**-2, FARTHEST, _GRID)
     model, rows = found.model, np.array(own)
-    bent = 0.5 * np.outer(share**2, model.curvature[:, rows, rows].sum(axis=1))
-    ways = [np.outer(share, sign * model.slope[:, rows[0]]) if len(rows) == 1 else 0.0 for sign in (1.0, -1.0)]
-    lost = np.max([_loss(bench, found, bench.merits[m].values(model.nominal + way + bent), m) for way in ways], axis=0)
+    if len(rows) > 1:
+        parts = [_spread(bench, model, rows, share)]
+    else:
+        bent = model.nominal + 0.5 * np.outer(share**2, model.curvature[:, rows[0], rows[0]])
+        parts = [bent + np.outer(sign * share, model.slope[:, rows[0]]) for sign in (1.0, -1.0)]
+    lost = np.max([_loss(bench, found, bench.merits[m].values(one), m) for one in parts], axis=0)
     beyond = np.flatnonzero(lost >= losses[m])
     return float(share[beyond[0]]) if beyond.size else np.inf
 

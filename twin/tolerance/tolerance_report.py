@@ -91,25 +91,26 @@ def _interval(one: Yield) -> str:
 
 
 def _verdict(run: ToleranceRun) -> str:
-    words = {"met": "met", "missed": "missed", "open": "open at this number of cameras"}
     judged = [(one.merit.name, one.passing.judged(one.merit.spec.probability)) for one in run.merits]
-    bad = [f"{name} {words[how]}" for name, how in judged if how != "met"]
-    text = f"Yield {_interval(run.passing)}: that share of the cameras meets all requirements"
-    return f"{text}; {', '.join(bad)}" if bad else f"{text}, and each requirement is met by the share that is asked"
+    missed, undecided = ([name for name, how in judged if how == what] for what in ("missed", "open"))
+    text = f"Yield: {_interval(run.passing)} of the cameras meet all requirements"
+    if missed:
+        text += f"; too few meet {', '.join(missed)}"
+    if undecided:
+        text += f"; more cameras have to be drawn to decide on {', '.join(undecided)}"
+    return text if missed or undecided else f"{text}, and enough meet each of them"
 
 
 def _dear(run: ToleranceRun) -> str:
     """The tolerances that cost most, and what may be loosened."""
     worst = _importance(run)
     order = sorted(worst, key=lambda name: -worst[name])
-    dear = [
-        f"{name} ({100.0 * worst[name]:.0f} % of the variance of a merit)" for name in order[:_FEW] if worst[name] > 0
-    ]
-    loose = [name for name in order if worst[name] < _LITTLE]
-    text = f"Most costly: {', '.join(dear)}" if dear else "No tolerance changes a merit"
+    dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
+    loose = [name for name in order if worst[name] < _LITTLE][::-1]
+    text = f"Most of a merit's variance is due to {', '.join(dear)}" if dear else "No tolerance changes a merit"
     if loose:
-        named = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")
-        text += f"; could be loosened: {named}"
+        named = ", ".join(loose[:_FEW]) + (f" and {len(loose) - _FEW} more" if len(loose) > _FEW else "")
+        text += f"; {named} could be loosened"
     return text
 
 
@@ -209,7 +210,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         rows.append(cells)
     heads = ("tolerance", "motion", "limit", *(sign for _ in run.merits for sign in ("\N{MINUS SIGN}", "+")))
     over = (("", 3), *((_head(one), 2) for one in run.merits))
-    caption = "Merits with one tolerance at its limit. Of a figure error: what its mean square comes to."
+    caption = "Merits with one tolerance at its limit. Of a figure error: what its terms come to on the average."
     return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over)
 
 
