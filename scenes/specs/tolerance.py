@@ -329,7 +329,8 @@ class AllocationSpec(Spec):
     Attributes:
         target: share of cameras that are to pass all requirements.
         grades: limits are rounded to these numbers times powers of ten.
-        loosest: by what limits may grow at most; tightest: by what they may shrink at most.
+        loosest: by what limits may grow at most.
+        tightest: by what limits may shrink at most.
     """
 
     target: Share = 0.9
