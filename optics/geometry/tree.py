@@ -65,6 +65,8 @@ class Motion:
         index: change of the refractive index of a glass body.
         index_gradient: gradient of that change in the body's frame, zero at its origin, 1/m.
         grid: surface error of a mirror or face beyond ``figure``, on a grid.
+        radius: relative change of the vertex radius of curvature of a mirror or face, e.g. 100e-6.
+        conic: change of its conic constant.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -76,13 +78,16 @@ class Motion:
     index: float = 0.0
     index_gradient: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grid: GridFigure | None = None
+    radius: float = 0.0
+    conic: float = 0.0
 
     def __post_init__(self) -> None:
         """Freeze the figure."""
         object.__setattr__(self, "figure", FrozenMap(self.figure))
 
     def component(self, kind: str, axis: int) -> float:
-        """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, ``scale``, or a ``figure`` term.
+        """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, a ``figure`` term, or one of ``scale``,
+        ``radius``, ``conic`` and ``index``.
 
         Raises:
             ValueError: there is no such kind of motion.
@@ -92,12 +97,12 @@ class Motion:
                 return float(self.rotate[axis])
             case "shift":
                 return float(self.shift[axis])
-            case "scale":
-                return float(self.scale)
+            case "scale" | "radius" | "conic" | "index":
+                return float(getattr(self, kind))
             case "figure":
                 return float(self.figure.get(axis, 0.0))
             case _:
-                raise ValueError(f"a motion is a rotate, shift, scale or figure, not a {kind!r}")
+                raise ValueError(f"a motion is a rotate, shift, scale, radius, conic, index or figure, not a {kind!r}")
 
 
 AT_REST = Motion()
@@ -294,7 +299,7 @@ def _local_motions(
 def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
     """One state that does ``then`` on top of ``first``: x -> first(then(x)) in every body's frame.
 
-    Exact for the rigid parts; figures and indices add.
+    Exact for the rigid parts; figures, conic constants and indices add.
 
     Raises:
         ValueError: both have a grid figure of the same body, on different samples.
@@ -319,6 +324,8 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
             index=before.index + motion.index,
             index_gradient=triple(np.array(before.index_gradient) + np.array(motion.index_gradient)),
             grid=_sum(before.grid, motion.grid),
+            radius=(1.0 + before.radius) * (1.0 + motion.radius) - 1.0,
+            conic=before.conic + motion.conic,
         )
     return out
 

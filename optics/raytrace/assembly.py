@@ -61,22 +61,25 @@ class Element:
         return self.surface.figure_disk(self.aperture)
 
     def figured(self, motion: Motion) -> Surface:
-        """The surface with what a motion adds to its figure.
+        """The surface with what a motion does to its radius and conic constant and adds to its figure.
 
         Raises:
             ValueError: nothing sets the disk of that figure, or two grids stand on different samples.
         """
+        own = self.surface
+        if motion.radius or motion.conic:
+            own = replace(own, curvature=own.curvature / (1.0 + motion.radius), conic=own.conic + motion.conic)
         if not motion.figure and motion.grid is None:
-            return self.surface
+            return own
         grid = self.grid_in(motion)
-        if not motion.figure and self.surface.zernike_figure is None:
-            return self.surface.with_figure(grid)
+        if not motion.figure and own.zernike_figure is None:
+            return own.with_figure(grid)
         disk = self.figure_disk
         terms = {**disk.terms}
         for j, amplitude in motion.figure.items():
             terms[j] = terms.get(j, 0.0) + amplitude
         whole = replace(disk, terms=terms)
-        return self.surface.with_figure(whole if grid is None else SummedFigure(whole, grid))
+        return own.with_figure(whole if grid is None else SummedFigure(whole, grid))
 
     def grid_in(self, motion: Motion) -> GridFigure | None:
         """The grid figure of the surface with the one that a motion adds to it.

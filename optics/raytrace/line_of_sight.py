@@ -105,15 +105,20 @@ class LineChange:
         return np.stack([self.d_alpha, self.d_beta, self.d_gamma, self.d_f], axis=-1)
 
 
-def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
-    """Compare perturbed states with the nominal one.
+def line_tangents(
+    sight: np.ndarray, position: np.ndarray, camera: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the points of a line look, in the tangent plane about each state's own line of sight.
 
     Args:
-        sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M
-        odd, the
-            middle point is the line's centre.
-        position: coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
-        camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
+        sight: object-space directions of the line's points, world, (S, M, 3); M odd, the middle point is the line's
+            centre.
+        position: as of `line_change`, (M,), metres.
+        camera: as of `line_change`, (3, 3).
+
+    Returns:
+        Lines of sight in the camera's axes (S, 3), roll of the imaged line about them (S,), radians, and tangents along
+        the imaged line, (S, M), positive as ``position``.
     """
     local = product(sight, camera)
     middle = sight.shape[1] // 2
@@ -129,7 +134,20 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
     # a lens inverts: an image point at +L looks toward -tan W
     weight = position / np.sum(position**2)
     roll = np.arctan2(inner(x, weight), -inner(y, weight))
-    tangent = -(y * np.cos(roll)[:, None] - x * np.sin(roll)[:, None])
+    return axis, roll, -(y * np.cos(roll)[:, None] - x * np.sin(roll)[:, None])
+
+
+def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> LineChange:
+    """Compare perturbed states with the nominal one.
+
+    Args:
+        sight: object-space directions of the line's points, world, (1 + B, M, 3); entry 0 is the nominal state; M
+        odd, the
+            middle point is the line's centre.
+        position: coordinate of the points along camera Y on the nominal line CCD, (M,), metres.
+        camera: columns = nominal camera axes X, Y, Z in the world, (3, 3); Z is the nominal line of sight.
+    """
+    axis, roll, tangent = line_tangents(sight, position, camera)
     distance = inner(tangent, position) / np.sum(tangent**2, axis=-1)
     return LineChange(
         d_alpha=np.arctan2(axis[1:, 0], axis[1:, 2]),

@@ -238,10 +238,12 @@ def _surface_numbers(
     states: Sequence[State],
     step: Sequence[tuple[str, str, int]] | None,
 ) -> SurfaceNumbers:
-    surface, count = element.surface, len(states)
+    surface = element.surface
     curvature, conic, even = None, None, []
     if not structure.plane:
-        curvature, conic = surface.curvature / scale, np.full(count, surface.conic)
+        motions = [state.get(element.body, AT_REST) for state in states]
+        radius = scale * (1.0 + np.array([motion.radius for motion in motions]))
+        curvature, conic = surface.curvature / radius, surface.conic + np.array([motion.conic for motion in motions])
         for n in range(structure.even):
             term = surface.even[n] if n < len(surface.even) else 0.0
             even.append(term / scale ** (2 * n + 3))

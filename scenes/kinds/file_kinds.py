@@ -16,6 +16,7 @@ from scenes.specs.measured.orbit_data import OrbitDataSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.procedures import PROCEDURES, FileKind
 from scenes.specs.study import StudySpec
+from scenes.specs.tolerance import ToleranceBudgetSpec
 from scenes.yaml.errors import InputError, Issue
 from scenes.yaml.yaml_file import read_yaml
 
@@ -52,6 +53,7 @@ FILE_KINDS = (
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
     ),
     FileKind("study", StudySpec, "a study", "twin.study"),
+    FileKind("tolerance", ToleranceBudgetSpec, "a tolerance budget", "twin.tolerance"),
 )
 """Every kind, in the order in which their schemas are listed; those of tests are in the list of these."""
 

@@ -18,7 +18,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Circle, Edge, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
-from optics.geometry.tree import AT_REST, Body, Motion, RigidTree, State
+from optics.geometry.tree import AT_REST, Body, RigidTree, State
 from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -31,7 +31,6 @@ from optics.waves.imaging import aim_collimated
 from scenes.models.stated_focal_length import TracedFocalLengths, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
-from scenes.specs.course import noll
 from scenes.specs.job import NodeInfo, perturbation_issues
 from scenes.yaml.errors import InputError
 
@@ -91,6 +90,25 @@ def camera_sequences(name: str, model: CameraModel) -> dict[str, tuple[str, ...]
     }
 
 
+def shape_changes(model: CameraModel, root: str) -> dict[str, tuple[str, ...]]:
+    """What may change of the shapes and glasses of a camera's surfaces.
+
+    Args:
+        model: of the camera.
+        root: path of its body.
+
+    Returns:
+        Body -> which of "figure", "radius", "conic" and "index"; surfaces that light passes have none.
+    """
+    glass = lenses(model.spec)
+    out = {}
+    for name, surface in model.surfaces.items():
+        if LIGHT[model.spec.mirrors[name].light] is not Interaction.PASS:
+            curved = () if surface.is_plane or surface.curvature == 0.0 else ("radius", "conic")
+            out[f"{root}/{name}"] = ("figure", *curved, *(("index",) if glass.get(name) == name else ()))
+    return out
+
+
 ROOT = "camera"
 
 
@@ -125,10 +143,10 @@ def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backe
     camera.require_mirrors("a camera under test")
     model = derive_camera(camera, backend)
     assembly = camera_alone(model)
-    shaped = {e.body for e in assembly.elements.values() if e.interaction is Interaction.REFLECT}
+    shaped = shape_changes(model, ROOT)
     nodes = {
         body.path.removeprefix(f"{ROOT}/"): NodeInfo(
-            tuple(body.pivots), frozenset({"rotate", "shift", *(("figure",) if body.path in shaped else ())})
+            tuple(body.pivots), frozenset({"rotate", "shift", *shaped.get(body.path, ())})
         )
         for body in assembly.tree.bodies
         if body.path != ROOT
@@ -140,10 +158,7 @@ def build_camera_under_test(test: CameraUnderTestSpec, camera: CameraSpec, backe
     ]
     if issues:
         raise InputError(*issues)
-    as_built = {
-        f"{ROOT}/{path}": Motion(p.rotate, p.shift, p.pivot, figure={noll(t): v for t, v in p.figure.items()})
-        for path, p in test.as_built.items()
-    }
+    as_built = {f"{ROOT}/{path}": what.motion() for path, what in test.as_built.items()}
     return CameraUnderTest(model, assembly, as_built)
 
 

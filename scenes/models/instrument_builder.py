@@ -29,6 +29,7 @@ from scenes.models.camera_model import (
     derive_camera,
     focal_plane_body,
     glass_indices,
+    shape_changes,
 )
 from scenes.models.camera_sharpness import no_cameras
 from scenes.models.clearance import check_clearance, check_solids
@@ -266,6 +267,9 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
     shaped = {e.body for e in assembly.elements.values() if e.interaction is not Interaction.PASS}
     roots = {f"{BASE}/{name}" for name in cameras}
     cold = _without_heat(cameras)
+    reshaped: dict[str, tuple[str, ...]] = {}
+    for name, model in cameras.items():
+        reshaped |= shape_changes(model, f"{BASE}/{name}")
     out = {}
     for body in assembly.tree.bodies:
         if body.path == BASE:
@@ -276,6 +280,7 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
             allows.add("temperature")
         if body.path in shaped:
             allows.add("figure")
+        allows |= {*reshaped.get(body.path, ())}
         if body.path in roots:
             allows.add("scale")
         out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows))

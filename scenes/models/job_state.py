@@ -12,7 +12,6 @@ from scenes.models.disturbances import UNITS, StatedMotions
 from scenes.models.instrument_model import Instrument
 from scenes.models.nodal_bodies import HeatedBody, deformed_face, heated_bodies, with_heat
 from scenes.models.thermal_model import TemperatureError, ThermalModel
-from scenes.specs.course import noll
 from scenes.specs.job import JobSpec, PerturbationSpec
 from scenes.specs.resolved import ResolvedJob
 
@@ -76,16 +75,13 @@ def on_deformed(
 
 
 def motions_of(job: JobSpec, time: int | None = None) -> State:
-    """The rigid motions, scales and figures that a job asks for; its temperatures come on top of them.
+    """The rigid motions, scales and shapes of surfaces that a job asks for; its temperatures come on top of them.
 
     Args:
         job: its perturbation.
         time: number of a time of its course, whose motions are added; None for none.
     """
-    out = {
-        path: Motion(p.rotate, p.shift, p.pivot, p.scale, {noll(term): value for term, value in p.figure.items()})
-        for path, p in job.perturb.items()
-    }
+    out = {path: what.motion() for path, what in job.perturb.items()}
     if job.course is not None and time is not None:
         for path, added in job.course.motions(time).items():
             own = out.get(path, Motion())
@@ -160,9 +156,11 @@ def _components(what: PerturbationSpec) -> Iterator[tuple[str, str, float]]:
     for kind, vector in vectors.items():
         yield from ((kind, f"{kind} {axis}", value) for axis, value in zip("xyz", vector, strict=True) if value)
     yield from (("figure", f"figure {term}", value) for term, value in what.figure.items() if value)
-    for kind, value in (("scale", what.scale), ("temperature", what.temperature.change)):
-        if value:
+    for kind in ("scale", "radius", "conic", "index"):
+        if value := getattr(what, kind):
             yield kind, kind, value
+    if what.temperature.change:
+        yield "temperature", "temperature", what.temperature.change
     if what.temperature.table is not None:
         yield "table", "temperatures at nodes", 0.0
     if what.deformation is not None:

@@ -27,6 +27,9 @@ TemperatureGradient = Annotated[
 Rotation = Annotated[tuple[float, float, float], Vector(Quantity(units.ANGLE, largest="5 deg"))]
 Shift = Annotated[tuple[float, float, float], Vector(Quantity(units.LENGTH, largest="100 mm"))]
 ScaleChange = Annotated[float, Quantity(units.SCALE, largest="1 percent")]
+RadiusChange = Annotated[float, Quantity(units.SCALE, largest="10 percent")]
+ConicChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1.0, le=1.0)]
+IndexChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-0.1, le=0.1)]
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 

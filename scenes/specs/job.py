@@ -8,11 +8,25 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
-from scenes.specs.course import DEFAULT_PIVOT, NO_MOTION, CourseSpec, Rotation, ScaleChange, Shift, Term, read_course
+from scenes.specs.course import (
+    DEFAULT_PIVOT,
+    NO_MOTION,
+    ConicChange,
+    CourseSpec,
+    IndexChange,
+    RadiusChange,
+    Rotation,
+    ScaleChange,
+    Shift,
+    Term,
+    noll,
+    read_course,
+)
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
 from scenes.specs.motion_text import meant, node_named, perturbation_in_words
@@ -50,13 +64,13 @@ class TargetsSpec(Spec):
 
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
 
-ACTIONS = ("rotate", "shift", "figure", "scale", "temperature")
+ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
 
 
 class PlainPerturbationSpec(Spec):
-    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, and
-    for a mirror or a prism's face a figure error.
+    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, for a
+    mirror or a face an error of its figure, radius or conic constant, and for a lens of its index.
 
     Attributes:
         rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
@@ -64,6 +78,9 @@ class PlainPerturbationSpec(Spec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
+        conic: change of the conic constant, a pure number.
+        index: change of the refractive index of the lens that begins at this face, a pure number.
         temperature: uniform change as `2 K`, or with a gradient.
     """
 
@@ -72,18 +89,35 @@ class PlainPerturbationSpec(Spec):
     pivot: Name = DEFAULT_PIVOT
     figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
+    radius: RadiusChange | None = None
+    conic: ConicChange | None = None
+    index: IndexChange | None = None
     temperature: job_tables.PlainTemperature = job_tables.TemperatureSpec()
 
     def uses(self) -> tuple[str, ...]:
-        """Which of rotate, shift, figure, scale and temperature do something."""
+        """Which of ACTIONS do something."""
         done = {
             "rotate": any(self.rotate),
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
-            "scale": self.scale != 0.0,
+            **{name: bool(getattr(self, name)) for name in ("scale", "radius", "conic", "index")},
             "temperature": self.temperature.warms,
         }
         return tuple(name for name, does in done.items() if does)
+
+    def motion(self) -> Motion:
+        """All of it but the temperature, as a state has it."""
+        figure = {noll(term): value for term, value in self.figure.items()}
+        return Motion(
+            self.rotate,
+            self.shift,
+            self.pivot,
+            self.scale,
+            figure,
+            index=self.index or 0.0,
+            radius=self.radius or 0.0,
+            conic=self.conic or 0.0,
+        )
 
 
 class PerturbationSpec(PlainPerturbationSpec):
@@ -96,6 +130,9 @@ class PerturbationSpec(PlainPerturbationSpec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
+        radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
+        conic: change of the conic constant, a pure number.
+        index: change of the refractive index of the lens that begins at this face, a pure number.
         temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes.
         deformation: the table of displaced nodes, or a mesh; None for none.
     """
@@ -320,7 +357,7 @@ class NodeInfo:
 
     Attributes:
         pivots: names of its pivots.
-        allows: which of "rotate", "shift", "figure", "scale" and "temperature".
+        allows: which of ACTIONS.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)

@@ -5,6 +5,7 @@ Jobs, studies, the command line and scripts share this grammar. The live page ca
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -19,16 +20,21 @@ KINDS = {
     "shift": "x|y|z LENGTH",
     "rotate": "x|y|z ANGLE",
     "scale": "SHARE",
+    "radius": "SHARE",
+    "conic": "NUMBER",
+    "index": "NUMBER",
     "figure": "Z5 LENGTH",
     "temperature": "DIFFERENCE",
     "gradient": "x|y|z DIFFERENCE/LENGTH",
 }
 """Kind of a perturbation -> what follows it."""
+PURE = ("conic", "index")
+"""Kinds whose amounts are pure numbers."""
 NOTHING = {"shift": "0 um", "rotate": "0 arcsec", "gradient": "0 K/m"}
 """Kind of a vector -> what its components are that nothing says."""
 FORMS = (
-    '"M2 shift z 20 um", "M2 rotate x 3 arcsec about centre", "M2 figure Z5 10 nm", "forward scale 20 ppm", '
-    '"base temperature 2 K", "base gradient z 50 mK/m"'
+    '"M2 shift z 20 um", "M2 rotate x 3 arcsec about centre", "M2 figure Z5 10 nm", "M2 radius 100 ppm", '
+    '"M2 conic 1e-4", "forward scale 20 ppm", "base temperature 2 K", "base gradient z 50 mK/m"'
 )
 """What perturbations in words look like, for messages and help."""
 _ABOUT = "about"
@@ -124,6 +130,17 @@ def put(keys: dict[str, Any], kind: str, axis: str, value: Any, nothing: Any) ->
     inner[last] = value
 
 
+def _pure(kind: str, quantity: str, text: str) -> float:
+    """An amount that is a pure number. Raises Problem."""
+    try:
+        amount = float(quantity)
+    except ValueError:
+        amount = math.nan
+    if not math.isfinite(amount):
+        raise Problem(f"a change of the {kind} is a pure number", shown(quantity or text), f"M2 {kind} 1e-4")
+    return amount
+
+
 def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     """What texts come to: ``perturb`` of a job's file. Nodes are called as in the texts.
 
@@ -137,13 +154,16 @@ def perturbation_in_words(texts: Iterable[str]) -> dict[str, dict[str, Any]]:
     said: set[tuple[str, str, str]] = set()
     for text in texts:
         node, kind, axis, quantity, pivot = motion_of(text)
-        if split_quantity(quantity) is None:
+        amount: str | float = quantity
+        if kind in PURE:
+            amount = _pure(kind, quantity, text)
+        elif split_quantity(quantity) is None:
             raise Problem("no amount with a unit", shown(quantity or text), FORMS)
         if (node, kind, axis) in said:
             raise Problem("said twice", shown(text), f"one {kind} {axis}".rstrip() + f" of {node}")
         said.add((node, kind, axis))
         what = out.setdefault(node, {})
-        put(what, kind, axis, quantity, NOTHING.get(kind))
+        put(what, kind, axis, amount, NOTHING.get(kind))
         if pivot:
             if what.setdefault("pivot", pivot) != pivot:
                 raise Problem(f"{node} has one pivot for all its turns", shown(pivot), what["pivot"])

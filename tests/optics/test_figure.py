@@ -127,3 +127,20 @@ def test_a_grid_on_the_samples_of_another() -> None:
     finer = grid.sampled_as(GridFigure(np.zeros((97, 121)), (-0.5, 0.5, -0.4, 0.4)))
     u, v = np.random.default_rng(1).uniform(-0.35, 0.35, (2, 200))
     np.testing.assert_allclose(finer.sag(u, v), grid.sag(u, v), rtol=0, atol=1e-12)
+
+
+def test_a_radius_and_a_conic_that_change_are_another_surface(backend) -> None:
+    """Of a state as of a prescription, with the terms of the asphere and a figure as they were."""
+    change = Motion(radius=2e-3, conic=-0.03, figure={5: 1e-7})
+    own = Surface(-0.2, -1.2, (-5e-5, 1e-6))
+    other = Surface(-0.2 / (1.0 + 2e-3), -1.23, (-5e-5, 1e-6))
+    position, direction = beam(disk_points(100, 0.4), -1.0, SLANTED)
+    aperture = Circle(0.5)
+    changed = run(backend, build(Stage(own, aperture=aperture)), position, direction, state={"e0": change})
+    made = run(
+        backend, build(Stage(other, aperture=aperture)), position, direction, state={"e0": Motion(figure={5: 1e-7})}
+    )
+    for one, two in zip(changed, made, strict=True):
+        np.testing.assert_array_equal(one, two)
+    seen = build(Stage(own, aperture=aperture)).elements["e0"].figured(change)
+    assert (seen.curvature, seen.conic) == (other.curvature, other.conic)

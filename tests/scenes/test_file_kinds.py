@@ -22,6 +22,7 @@ FOLDERS = {
     "examples/measured": "measurement",
     "examples/design_monitor": "monitor_design",
     "examples/design": "camera_design",
+    "examples/tolerance": "tolerance",
     "examples/": "job",
     "lab/focus": "focus_test",
     "lab/distortion": "distortion_test",

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
+from scenes.specs.job import JobSpec, NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit
@@ -189,8 +189,9 @@ def perturbation(
 
 
 def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
-    """What has no knob: tables of nodes and of temperatures."""
-    out = {key: value for key, value in what.items() if key not in (*ACTIONS, "pivot")}
+    """What has no knob: tables of nodes and of temperatures, radii, conic constants and indices."""
+    turned = {kind.key for kind in KINDS.values()}
+    out = {key: value for key, value in what.items() if key not in (*turned, "pivot")}
     heat = what.get("temperature")
     if isinstance(heat, Mapping) and "table" in heat:
         out["temperature"] = {key: value for key, value in heat.items() if key not in ("change", "gradient")}

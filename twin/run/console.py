@@ -26,6 +26,7 @@ PROGRAMS = {
     "orbit": ("twin.orbit", "angle, calibrate, check, export, match, monitor, simulate"),
     "study": ("twin.study", "vary any key of a job; statistics, sensitivities, gradients"),
     "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
+    "tolerance": ("twin.tolerance", "tolerances with compensators: sensitivities, yield, allocation"),
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
     "mtf": ("analysis.mtf", "MTF from a slanted edge or bars in any image"),

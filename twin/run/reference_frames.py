@@ -98,6 +98,11 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "angle": _ANGLE,
             "height": "up, at the middle of the line",
         },
+        "tolerance": {
+            "motions": "in the moved body's own nominal axes; turns about its pivot; of several bodies in the first's",
+            "fields": "shares of the half field, along the line (+Y of the focal plane) and along the track (+X)",
+            "boresight, roll, principal_distance": "of the line of sight, against the designed camera's",
+        },
         "optics": {
             "fields": "shares of the half field: along the line, positive at the end at +Y of the focal plane (left), "
             "and along the track, positive at its +X",

@@ -397,7 +397,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "shift": list(what.shift),
         "pivot": what.pivot,
         "figure": dict(what.figure),
-        "scale": what.scale,
+        **{name: getattr(what, name) for name in ("scale", "radius", "conic", "index")},
         "temperature": {**dict(heat), "gradient": list(heat.gradient)},
         "deformation": what.deformation,
     }
@@ -428,7 +428,7 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         shift=tuple(parts["shift"]),
         pivot=parts["pivot"],
         figure=FrozenMap(parts["figure"]),
-        scale=parts["scale"],
+        **{name: parts[name] for name in ("scale", "radius", "conic", "index")},
         temperature=TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
         deformation=parts["deformation"],
     )

@@ -1,0 +1,393 @@
+"""A tolerance budget, as its file gives it: what varies, what is adjusted for it, and what is asked of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from optics.geometry.zernike import MAX_NOLL
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.course import noll
+from scenes.specs.job import JobSpec
+from scenes.specs.motion_text import PURE, motion_of
+from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
+from scenes.specs.study import MOST_RUNS, LimitsSpec
+from scenes.yaml.errors import Problem, shown
+from scenes.yaml.spec import Flag, Name, Named, NothingIsEmpty, Number, Reference, Seed, Spec, Text, Whole, validate
+from scenes.yaml.units import (
+    ANGLE,
+    LENGTH,
+    SCALE,
+    TEMPERATURE_DIFFERENCE,
+    TEMPERATURE_GRADIENT,
+    Kind,
+    format_quantity,
+    parse_quantity,
+)
+from scenes.yaml.yaml_file import read_yaml
+
+Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
+"""A quantity with its unit, or a pure number where the motion has no unit."""
+Share = Annotated[Number, Field(gt=0.0, lt=1.0)]
+
+MEASURES: Mapping[str, Kind] = FrozenMap(
+    {
+        "shift": LENGTH,
+        "rotate": ANGLE,
+        "scale": SCALE,
+        "radius": SCALE,
+        "figure": LENGTH,
+        "temperature": TEMPERATURE_DIFFERENCE,
+        "gradient": TEMPERATURE_GRADIENT,
+    }
+)
+"""Kind of a motion -> what its amounts measure; the others are pure numbers."""
+SPECTRUM = "figure"
+"""Kind of a motion that, without a term, is a whole figure error."""
+
+
+class Varied(Spec):
+    """Base of what a motion in words says: which body, how, about which point.
+
+    Attributes:
+        motion: of one body, `M2 shift z`, `M2 rotate x about centre`, `M1 radius`; without an amount.
+        carrying: further bodies that move rigidly with it, about the same point.
+    """
+
+    motion: Text
+    carrying: tuple[Text, ...] = ()
+
+    @model_validator(mode="after")
+    def _is_a_motion(self) -> Varied:
+        node, kind, _, amount, _ = self.parts
+        if amount:
+            raise Problem("a motion without an amount", shown(self.motion), f"{node} {kind} ...", within=("motion",))
+        if self.carrying and kind not in ("shift", "rotate"):
+            raise Problem("only what shifts or rotates carries others", kind, "shift or rotate", within=("carrying",))
+        return self
+
+    @property
+    def parts(self) -> tuple[str, str, str, str, str]:
+        """Node, kind, axis or term, amount (empty) and pivot."""
+        return motion_of(self.motion)
+
+    def si(self, value: Amount, key: str, positive: bool = False) -> float:
+        """An amount of the motion in SI.
+
+        Raises:
+            Problem: another unit than the motion's, or not greater than zero where it has to be.
+        """
+        kind = self.parts[1]
+        try:
+            number = amount_si(value, kind)
+        except Problem as problem:
+            raise Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=(key,)) from None
+        if positive and not number > 0.0:
+            raise Problem("not greater than zero", shown(value), within=(key,))
+        return number
+
+
+def amount_si(value: Amount, kind: str) -> float:
+    """An amount of a kind of motion in SI. Raises Problem: another unit, or none."""
+    if kind in PURE:
+        if isinstance(value, str):
+            raise Problem(f"a change of the {kind} is a pure number", shown(value), "a number such as 1e-4")
+        return float(value)
+    return parse_quantity(value, MEASURES[kind])
+
+
+def amount_text(value: float, kind: str) -> str | float:
+    """An amount as files have it."""
+    return value if kind in PURE else format_quantity(value, MEASURES[kind])
+
+
+class ToleranceSpec(Varied):
+    """One tolerance.
+
+    Attributes:
+        motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
+            `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
+        carrying: further bodies that move rigidly with the first.
+        limit: largest amount either way; of a figure error its rms.
+        law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
+            it; `ends`, one of both ends.
+        sigmas: standard deviations that the limit of a normal law is.
+        mean: about which it is distributed, for what has been measured and is not adjusted.
+        measured: in place of the law, amounts that were measured of such parts, each drawn as often as the others.
+        terms: of a figure error, the first and the last term of Noll's, `[Z5, Z36]`.
+        power: of a figure error: the variance of its terms falls with the power of their radial order.
+        cost: of holding it as stated, in any unit.
+        exponent: the cost goes with the inverse limit to this power.
+        kept: whether the allocation leaves it as it is.
+    """
+
+    limit: Amount
+    law: Literal["normal", "uniform", "ends"] = "normal"
+    sigmas: Annotated[Number, Field(gt=0.0, le=6.0)] = 2.0
+    mean: Amount | None = None
+    measured: Annotated[tuple[Amount, ...], Field(min_length=2, max_length=10_000)] | None = None
+    terms: tuple[Text, Text] | None = None
+    power: Annotated[Number, Field(ge=0.0, le=10.0)] = 3.0
+    cost: Annotated[Number, Field(gt=0.0)] = 1.0
+    exponent: Annotated[Number, Field(gt=0.0, le=5.0)] = 1.0
+    kept: Flag = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _whole_figure(cls, data: Any) -> Any:
+        """`M1 figure` alone is one of many terms, kept as the first of them in words."""
+        if isinstance(data, Mapping) and isinstance(data.get("motion"), str):
+            text = data["motion"].split()
+            if len(text) == 2 and text[1] == SPECTRUM:
+                first, last = data.get("terms") or ("Z5", "Z36")
+                return {**data, "motion": f"{data['motion']} {first}", "terms": (first, last)}
+        return data
+
+    @model_validator(mode="after")
+    def _is_a_tolerance(self) -> ToleranceSpec:
+        self.si(self.limit, "limit", positive=True)
+        if self.mean is not None:
+            self.si(self.mean, "mean")
+        for value in self.measured or ():
+            self.si(value, "measured")
+        if self.measured is not None and (self.mean is not None or self.law != "normal"):
+            raise Problem("what was measured has no law and no mean", None, "measured: [...]", within=("measured",))
+        if self.terms is not None:
+            if self.parts[1] != SPECTRUM:
+                raise Problem("only a figure has terms", self.motion, "M1 figure", within=("terms",))
+            first, last = (noll(term) for term in self.terms)
+            if not 4 <= first < last <= MAX_NOLL:
+                found = f"{self.terms[0]} to {self.terms[1]}"
+                raise Problem("no range of terms", found, f"Z5 to Z36, at most Z{MAX_NOLL}", within=("terms",))
+            if self.law != "normal" or self.mean is not None or self.measured is not None:
+                problem = "the terms of a figure error are distributed normally about zero"
+                raise Problem(problem, None, "no law, mean or measured", within=("law",))
+        return self
+
+    @property
+    def spectrum(self) -> tuple[int, ...]:
+        """Noll's numbers of the terms of a whole figure error; empty for anything else."""
+        return () if self.terms is None else tuple(range(noll(self.terms[0]), noll(self.terms[1]) + 1))
+
+    @property
+    def words(self) -> str:
+        """The motion in words, `M1 figure` where it has many terms."""
+        return self.motion if self.terms is None else self.motion.rsplit(maxsplit=1)[0]
+
+    @property
+    def limit_si(self) -> float:
+        """The limit, SI."""
+        return amount_si(self.limit, self.parts[1])
+
+    @property
+    def mean_share(self) -> float:
+        """The mean, in units of the limit."""
+        return 0.0 if self.mean is None else amount_si(self.mean, self.parts[1]) / self.limit_si
+
+    @property
+    def measured_shares(self) -> tuple[float, ...]:
+        """What was measured, in units of the limit."""
+        return tuple(amount_si(value, self.parts[1]) / self.limit_si for value in self.measured or ())
+
+
+class CompensatorSpec(Varied):
+    """One adjustment; those that are listed first are made first.
+
+    Attributes:
+        motion: what is moved: `focal_plane shift z`.
+        carrying: further bodies that move rigidly with the first.
+        range: largest amount either way; zero leaves it as it is.
+        step: of which it is moved by a whole number, None for any amount.
+        accuracy: standard deviation of a move.
+    """
+
+    range: Amount
+    step: Amount | None = None
+    accuracy: Amount | None = None
+
+    @model_validator(mode="after")
+    def _is_a_compensator(self) -> CompensatorSpec:
+        if self.si(self.range, "range") < 0.0:
+            raise Problem("a range is not negative", shown(self.range), within=("range",))
+        if self.step is not None:
+            self.si(self.step, "step", positive=True)
+        if self.accuracy is not None and self.si(self.accuracy, "accuracy") < 0.0:
+            raise Problem("a standard deviation is not negative", shown(self.accuracy), within=("accuracy",))
+        return self
+
+    @property
+    def range_si(self) -> float:
+        """The range, SI."""
+        return amount_si(self.range, self.parts[1])
+
+    @property
+    def step_si(self) -> float:
+        """The step, SI; 0 for none."""
+        return 0.0 if self.step is None else amount_si(self.step, self.parts[1])
+
+    @property
+    def accuracy_si(self) -> float:
+        """Standard deviation of a move, SI; 0 for none."""
+        return 0.0 if self.accuracy is None else amount_si(self.accuracy, self.parts[1])
+
+
+FieldShare = Annotated[Number, Field(ge=-1.0, le=1.0)]
+NINE = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
+"""Fields that a merit has when it says none: shares of the half field, along the line and along the track."""
+MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
+    {
+        "wavefront": None,
+        "mtf": None,
+        "boresight": ANGLE,
+        "roll": ANGLE,
+        "principal_distance": LENGTH,
+        "distortion": LENGTH,
+        "chief_ray": ANGLE,
+    }
+)
+"""Kind of a merit -> what it measures; None for a pure number (waves of the design wavelength, MTF)."""
+MORE_IS_BETTER = ("mtf",)
+
+
+class MeritSpec(Spec):
+    """What is asked of the camera.
+
+    Attributes:
+        kind: `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which
+            the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`,
+            largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
+            turn of a chief ray at the line CCD.
+        fields: of wavefront and mtf, the worst of which counts: shares of the half field along the line and the track.
+        frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
+        direction: of mtf: along the line, along the track, or the worse of both.
+        at_most: largest value that passes; a change counts either way.
+        at_least: smallest value that passes, of mtf.
+        probability: share of cameras that are to pass.
+        loss: of the inverse: what one tolerance alone may spoil of the merit; by default what is left between design
+            and requirement over the square root of the number of tolerances.
+    """
+
+    kind: Literal["wavefront", "mtf", "boresight", "roll", "principal_distance", "distortion", "chief_ray"]
+    fields: Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=100)] = NINE
+    frequency: Annotated[Number, Field(gt=0.0, le=10_000.0)] | None = None
+    direction: Literal["line", "track", "worse"] = "worse"
+    at_most: Amount | None = None
+    at_least: Number | None = None
+    probability: Share = 0.9
+    loss: Amount | None = None
+
+    @model_validator(mode="after")
+    def _asks(self) -> MeritSpec:
+        more = self.kind in MORE_IS_BETTER
+        wanted, other = ("at_least", "at_most") if more else ("at_most", "at_least")
+        if getattr(self, wanted) is None or getattr(self, other) is not None:
+            raise Problem(f"of {self.kind} it is asked what it is {wanted}", other, f"{wanted}: ...")
+        for key in ("at_most", "loss"):
+            value = getattr(self, key)
+            if value is not None and not self._si(value, key) > 0.0:
+                raise Problem("not greater than zero", shown(value), within=(key,))
+        if self.kind != "mtf" and (self.frequency is not None or self.direction != "worse"):
+            raise Problem(f"{self.kind} has no frequency and no direction", self.kind, "kind: mtf", within=("kind",))
+        return self
+
+    def _si(self, value: Amount, key: str) -> float:
+        unit = MERIT_UNITS[self.kind]
+        if unit is None:
+            if isinstance(value, str):
+                raise Problem(f"of {self.kind} a pure number", shown(value), "a number without a unit", within=(key,))
+            return float(value)
+        try:
+            return parse_quantity(value, unit)
+        except Problem as problem:
+            raise Problem(problem.problem, problem.found, problem.allowed, problem.suggestion, within=(key,)) from None
+
+    @property
+    def more_is_better(self) -> bool:
+        """Whether large values are good."""
+        return self.kind in MORE_IS_BETTER
+
+    @property
+    def requirement(self) -> float:
+        """The value that just passes, SI."""
+        if self.at_least is not None:
+            return float(self.at_least)
+        assert self.at_most is not None
+        return self._si(self.at_most, "at_most")
+
+    @property
+    def loss_si(self) -> float | None:
+        """What one tolerance may spoil, SI; None for the default."""
+        return None if self.loss is None else self._si(self.loss, "loss")
+
+
+class AllocationSpec(Spec):
+    """Limits that meet the yield at the least cost.
+
+    Attributes:
+        target: share of cameras that are to pass all requirements.
+        grades: limits are rounded to these numbers times powers of ten.
+        loosest: by what limits may grow at most.
+        tightest: by what limits may shrink at most.
+    """
+
+    target: Share = 0.9
+    grades: Annotated[tuple[Annotated[Number, Field(ge=1.0, lt=10.0)], ...], Field(min_length=1)] = (1.0, 2.0, 5.0)
+    loosest: Annotated[Number, Field(ge=1.0, le=1000.0)] = 10.0
+    tightest: Annotated[Number, Field(ge=1.0, le=1000.0)] = 10.0
+
+
+class ToleranceBudgetSpec(Spec):
+    """A tolerance budget of a camera.
+
+    Attributes:
+        instrument: a camera or an instrument, by name or path, as in a job.
+        camera: which camera of an instrument is judged; may be left out where there is one.
+        tolerances: by name, what varies.
+        compensators: by name, what is adjusted in every camera, in this order; the mean square wavefront error over all
+            fields of the merits is made least.
+        merits: by name, what is asked.
+        samples: cameras that are drawn.
+        seed: of everything drawn.
+        allocation: whether limits are allocated anew, and for which yield.
+        limits: what the Monte Carlo run may use.
+    """
+
+    instrument: Reference
+    camera: Name | None = None
+    tolerances: Annotated[Named[ToleranceSpec], Field(min_length=1, max_length=300)]
+    compensators: Annotated[Named[CompensatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
+    merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
+    samples: Annotated[Whole, Field(ge=20, le=MOST_RUNS)] = 1000
+    seed: Seed = 0
+    allocation: AllocationSpec | None = None
+    limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec()
+
+
+class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
+    """A tolerance budget with its instrument.
+
+    Attributes:
+        base: the nominal job of the instrument.
+        draws: by number that varies, what one camera has of it, in units of its limit; those that are left out are
+            zero.
+    """
+
+    base: ResolvedJob
+    draws: Annotated[dict[str, Number], NothingIsEmpty] = Field(default_factory=FrozenMap)
+
+
+def resolve_tolerance(path: str | Path) -> ToleranceSetup:
+    """Read a tolerance budget and its instrument. The config.yaml of an earlier run can be given in its place.
+
+    Raises:
+        InputError: any of the files cannot be read or is not valid.
+    """
+    setup = read_setup(ToleranceSetup, path)
+    if setup is not None:
+        return setup
+    test = validate(ToleranceBudgetSpec, read_yaml(path))
+    job = JobSpec.model_validate({"instrument": test.instrument}).with_source(test.source)
+    return ToleranceSetup(test=test, base=resolve_job(job))

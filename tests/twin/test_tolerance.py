@@ -1,0 +1,367 @@
+"""Tolerances: what must not change, what the models and limits say against exact traces, and bad input."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from scenes.specs.job import checked_nodes
+from scenes.specs.resolved import resolve
+from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from twin.camera.camera_optics import CameraOptics
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.tolerance.merit_models import inverse_limits, sensitivities
+from twin.tolerance.samples import Workforce, draw_samples
+from twin.tolerance.tolerance_bench import ToleranceBench
+from twin.tolerance.tolerance_run import TOLERANCE, Yield, run_tolerance, with_limits, worst_jobs
+from twin.tolerance.variations import spectrum_shares, states_of
+
+ROOT = Path(__file__).parents[2]
+BUDGET: dict[str, Any] = {
+    "instrument": "gf7",
+    "tolerances": {
+        "despace": {"motion": "M2 shift z", "limit": "20 um"},
+        "tilt": {"motion": "M2 rotate x about centre", "limit": "10 arcsec", "law": "uniform"},
+        "radius": {"motion": "M1 radius", "limit": "50 ppm"},
+        "conic": {"motion": "M3 conic", "limit": 1e-4},
+        "figure": {"motion": "M3 figure", "limit": "5 nm", "terms": ["Z5", "Z11"]},
+    },
+    "compensators": {
+        "focus": {"motion": "focal_plane shift z", "range": "1 mm"},
+        "turn": {"motion": "focal_plane rotate x", "range": "5 arcmin"},
+    },
+    "merits": {
+        "wavefront": {"kind": "wavefront", "at_most": 0.06},
+        "mtf": {"kind": "mtf", "at_least": 0.35, "fields": [[0.0, 0.0], [1.0, 0.0]]},
+        "boresight": {"kind": "boresight", "at_most": "10 arcsec"},
+        "f": {"kind": "principal_distance", "at_most": "0.5 mm"},
+        "distortion": {"kind": "distortion", "at_most": "1 um"},
+        "chief": {"kind": "chief_ray", "at_most": "10 arcmin"},
+        "roll": {"kind": "roll", "at_most": "10 arcsec"},
+    },
+    "samples": 40,
+    "seed": 3,
+}
+
+
+def budget(folder: Path, **changes: Any) -> ToleranceSetup:
+    """The budget with other keys at its top, read from a file."""
+    file = folder / "budget.yaml"
+    file.write_text(dump_yaml({**BUDGET, **changes}), "utf-8")
+    return resolve_tolerance(file)
+
+
+@pytest.fixture(scope="module")
+def bench(backend, tmp_path_factory: pytest.TempPathFactory) -> ToleranceBench:
+    return ToleranceBench(budget(tmp_path_factory.mktemp("tolerance")), backend)
+
+
+@pytest.fixture(scope="module")
+def drawn(bench: ToleranceBench) -> np.ndarray:
+    return np.random.default_rng(5).uniform(-1.0, 1.0, (12, len(bench.numbers)))
+
+
+def test_without_tolerances_the_camera_is_the_designed_one(bench: ToleranceBench, backend) -> None:
+    tried = bench.try_out(np.zeros((2, len(bench.numbers))))
+    camera = CameraOptics.within(bench.instrument, bench.camera, backend, states_of(bench.compensators, tried.moves)[0])
+    rms = max(wave.rms for wave in camera.wavefronts(bench.fields))
+    values = bench.values(tried.parts)
+    assert values[0, 0] == pytest.approx(rms, rel=1e-6)
+    # what the adjustments alone do to lines of sight and distances: they start from a design that is nearly in focus
+    assert values[0, 3] < 1e-6
+    np.testing.assert_array_equal(values[0], values[1])
+
+
+def test_a_camera_is_that_of_the_main_program(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
+    """The worst camera, written as a job, traced by everything that other commands use."""
+    found = draw_samples(bench.setup, bench, backend, 20, 3, Workforce())
+    file = tmp_path / "worst.yaml"
+    file.write_text(next(iter(worst_jobs(bench.setup, bench, found).values())), "utf-8")
+    experiment = MonitorExperiment(resolve(file), backend)
+    job = checked_nodes(experiment.resolved.job, experiment.instrument.nodes)
+    state = experiment.state(job)
+    optics = CameraOptics.within(experiment.instrument, "gf7", backend, state)
+    margins = [merit.margin(found.values[:, k]) for k, merit in enumerate(bench.merits)]
+    values = found.values[int(np.argmax(np.max(margins, axis=0)))]
+    assert values[0] == pytest.approx(max(wave.rms for wave in optics.wavefronts(bench.fields)), rel=1e-5)
+    least = min(float(np.min(mtf.at(optics.nyquist))) for mtf in optics.mtfs([(0.0, 0.0), (1.0, 0.0)]))
+    assert values[1] == pytest.approx(least, abs=2e-5)
+    alpha, beta, gamma, d_f = experiment.sight.truth([state]).vector("gf7")[0]
+    assert values[2] == pytest.approx(np.hypot(alpha, beta), rel=1e-9)
+    assert values[3] == pytest.approx(abs(d_f), rel=1e-6)
+    assert values[6] == pytest.approx(abs(gamma), rel=1e-6, abs=1e-12)
+
+
+def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path) -> None:
+    turned = dict(reversed(BUDGET["tolerances"].items()))
+    other = ToleranceBench(budget(tmp_path, tolerances=turned), backend)
+    place = [[n.name for n in bench.numbers].index(number.name) for number in other.numbers]
+    own = bench.try_out(drawn * bench.sizes)
+    again = other.try_out(drawn[:, place] * other.sizes)
+    np.testing.assert_allclose(again.parts, own.parts, rtol=1e-9, atol=1e-15)
+    alone = np.concatenate([bench.try_out(row[None] * bench.sizes).parts for row in drawn[:3]])
+    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-9, atol=1e-15)
+
+
+def test_a_compensator_without_a_range_changes_nothing(
+    bench: ToleranceBench, drawn: np.ndarray, backend, tmp_path
+) -> None:
+    idle = {**BUDGET["compensators"], "idle": {"motion": "M3 shift z", "range": "0 um", "step": "1 um"}}
+    other = ToleranceBench(budget(tmp_path, compensators=idle), backend)
+    np.testing.assert_array_equal(other.try_out(drawn * other.sizes).parts, bench.try_out(drawn * bench.sizes).parts)
+
+
+def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBench, drawn, backend, tmp_path) -> None:
+    def squares(one: ToleranceBench, moves: np.ndarray) -> np.ndarray:
+        amounts = np.concatenate([drawn * one.sizes, moves], axis=1)
+        return np.sum(
+            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts))[0]) ** 2, axis=1
+        )
+
+    tried = bench.try_out(drawn * bench.sizes)
+    best = squares(bench, tried.moves)
+    for c, step in enumerate((2e-6, 2e-5)):
+        for sign in (1.0, -1.0):
+            away = tried.moves.copy()
+            away[:, c] += sign * step
+            assert np.all(squares(bench, away) > best - 1e-12)
+    one = {"focus": BUDGET["compensators"]["focus"]}
+    fewer = ToleranceBench(budget(tmp_path, compensators=one), backend)
+    without = squares(fewer, fewer.try_out(drawn * fewer.sizes).moves)
+    assert np.all(best <= without + 1e-10)
+    assert np.any(best < 0.999 * without)
+
+
+def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:
+    moved = {
+        "focus": {"motion": "focal_plane shift z", "range": "50 um", "step": "10 um"},
+        "turn": {"motion": "focal_plane rotate x", "range": "5 arcmin", "accuracy": "1 arcsec"},
+    }
+    bench = ToleranceBench(budget(tmp_path, compensators=moved), backend)
+    x = np.random.default_rng(1).uniform(-1.0, 1.0, (6, len(bench.numbers)))
+    errors = np.random.default_rng(2).standard_normal((6, 2))
+    ideal, made = bench.try_out(x * bench.sizes), bench.try_out(x * bench.sizes, errors)
+    assert np.all(np.abs(ideal.moves[:, 0]) <= 50e-6 * (1 + 1e-12))
+    np.testing.assert_allclose(made.moves[:, 0] / 10e-6, np.round(made.moves[:, 0] / 10e-6), atol=1e-9)
+    # the turn follows the rounded focus, then gets its error; without it it would be the best for that focus
+    calm = bench.try_out(x * bench.sizes, np.zeros((6, 2)))
+    np.testing.assert_allclose(made.moves[:, 1] - calm.moves[:, 1], errors[:, 1] * np.radians(1.0 / 3600.0), rtol=1e-3)
+
+
+def test_models_and_limits_hold_against_exact_traces(bench: ToleranceBench, drawn: np.ndarray) -> None:
+    found = sensitivities(bench)
+    exact = bench.values(bench.try_out(drawn * bench.sizes).parts)
+    modelled = bench.values(found.model.quadratic(drawn))
+    spread = np.std(exact, axis=0)
+    # the third order of motions within these limits; of an MTF it is larger
+    np.testing.assert_array_less(np.max(np.abs(modelled - exact)[:, [0, 2, 3]], axis=0), 0.01 * spread[[0, 2, 3]])
+    assert np.max(np.abs(modelled - exact)[:, 1]) < 0.1 * spread[1]
+    # a slope alone does not see what a camera at its best loses
+    linear = bench.values(found.model.linear(drawn))
+    assert np.max(np.abs(linear - exact)[:, 0]) > 5.0 * np.max(np.abs(modelled - exact)[:, 0])
+    inverse = inverse_limits(bench, found)
+    e = list(bench.entries).index("tilt")
+    for m in (0, 3):
+        share = inverse.shares[e, m]
+        if np.isfinite(share):
+            ends = np.zeros((2, len(bench.numbers)))
+            ends[:, bench.entries["tilt"][0]] = (share, -share)
+            lost = bench.merits[m].worse(bench.values(bench.try_out(ends * bench.sizes).parts)[:, m], found.nominal[m])
+            assert np.max(lost) == pytest.approx(inverse.losses[m], rel=1e-3)
+
+
+def test_a_group_moves_as_one_body(backend, tmp_path) -> None:
+    """All mirrors and the focal plane together: the image stays, only where it looks turns."""
+    every = {"motion": "M1 rotate x", "limit": "20 arcsec", "carrying": ["M2", "M3", "focal_plane"]}
+    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "boresight", "f", "distortion")}
+    # rays are those of the designed directions: a field of a degree does not end at 20 arcsec
+    setup = budget(tmp_path, tolerances={"all": every}, compensators={}, merits=merits)
+    bench = ToleranceBench(setup, backend)
+    nominal, turned = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
+    assert turned[1] == pytest.approx(bench.sizes[0], rel=1e-6)
+    assert turned[2] < 1e-9
+    assert turned[3] < 1e-11
+    # the designed directions are now others of its field, at whose end the error changes by a tenth within 2 arcmin
+    assert turned[0] == pytest.approx(nominal[0], rel=0.05)
+
+
+@pytest.mark.second
+def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> None:
+    setup = budget(
+        tmp_path,
+        instrument="ritchey_chretien",
+        tolerances={"tilt": {"motion": "M2 rotate x", "limit": "20 arcsec"}},
+        compensators={},
+        merits={
+            "w": {"kind": "wavefront", "at_most": 0.1, "fields": [[0.0, 0.0], [1.0, 0.0]]},
+            "m": {"kind": "mtf", "at_least": 0.1, "fields": [[0.0, 0.0], [1.0, 0.0]]},
+        },
+    )
+    bench = ToleranceBench(setup, backend)
+    tried = bench.values(bench.try_out(np.array([[0.0], [1.0]]) * bench.sizes).parts)
+    for x, values in zip((0.0, 1.0), tried, strict=True):
+        camera = bench.optics.in_state(states_of(bench.numbers, np.array([[x]]) * bench.sizes)[0])
+        assert values[0] == pytest.approx(max(wave.rms for wave in camera.wavefronts(bench.fields)), rel=1e-4)
+        least = min(float(np.min(mtf.at(camera.nyquist))) for mtf in camera.mtfs(bench.fields))
+        assert values[1] == pytest.approx(least, abs=1e-4)
+
+
+def test_shares_of_a_figure_and_of_a_yield() -> None:
+    shares = spectrum_shares(tuple(range(5, 37)), 3.0)
+    assert np.sum(shares**2) == pytest.approx(1.0)
+    assert shares[0] > shares[-1]
+    one = Yield.count(np.arange(100) < 90)
+    assert (one.low, one.high) == pytest.approx((0.8238, 0.9510), abs=1e-4)
+    assert [one.judged(p) for p in (0.8, 0.9, 0.97)] == ["met", "open", "missed"]
+
+
+def test_a_budget_from_a_script(backend, tmp_path) -> None:
+    """Whole, in this process: numbers, warnings, and the same again from its config.yaml."""
+    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "f")}
+    setup = budget(tmp_path, merits=merits, samples=20)
+    run = run_tolerance(setup, backend)
+    numbers = TOLERANCE(run)
+    assert numbers["yield"]["of"] == 20
+    assert set(numbers["merits"]) == set(merits)
+    assert numbers["merits"]["wavefront"]["variance_shares"]["tilt"] > 0.0
+    again = tmp_path / "config.yaml"
+    again.write_text(setup.to_yaml(), "utf-8")
+    assert TOLERANCE(run_tolerance(resolve_tolerance(again), backend)) == numbers
+
+
+@pytest.mark.slow
+def test_the_yield_of_an_allocation_is_that_of_other_cameras(backend, tmp_path) -> None:
+    merits = {k: BUDGET["merits"][k] for k in ("wavefront", "mtf", "f")}
+    setup = budget(tmp_path, merits=merits, samples=1000, allocation={"target": 0.9})
+    run = run_tolerance(setup, backend)
+    assert run.allocation is not None
+    assert run.judged is not None
+    assert run.allocation.reached
+    assert run.judged.low <= run.allocation.predicted[1] <= run.judged.high
+    assert run.judged.high >= 0.9
+    again = with_limits(setup, run.allocation.limits)
+    assert again.test.tolerances["despace"].limit_si == pytest.approx(
+        run.allocation.rounded[0] * setup.test.tolerances["despace"].limit_si
+    )
+
+
+BAD = {
+    "no such body": ({"tolerances": {"a": {"motion": "M7 shift z", "limit": "1 um"}}}, "no such node", "tolerances"),
+    "an amount in the motion": (
+        {"tolerances": {"a": {"motion": "M2 shift z 3 um", "limit": "1 um"}}},
+        "without an amount",
+        "tolerances",
+    ),
+    "no unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": 3.0}}}, "unit", "tolerances"),
+    "another unit": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "3 arcsec"}}}, "length", "tolerances"),
+    "nothing": ({"tolerances": {"a": {"motion": "M2 shift z", "limit": "0 um"}}}, "greater than zero", "tolerances"),
+    "a unit on a pure number": (
+        {"tolerances": {"a": {"motion": "M2 conic", "limit": "3 um"}}},
+        "pure number",
+        "tolerances",
+    ),
+    "a body that does not allow it": (
+        {"tolerances": {"a": {"motion": "focal_plane radius", "limit": "3 ppm"}}},
+        "does not allow radius",
+        "tolerances",
+    ),
+    "an unknown camera": ({"camera": "gf9"}, "no such camera", "camera"),
+    "an MTF that is at most": ({"merits": {"m": {"kind": "mtf", "at_most": 0.3}}}, "at_least", "merits"),
+    "beyond the cut-off": (
+        {"merits": {"m": {"kind": "mtf", "at_least": 0.3, "frequency": 5000.0}}},
+        "cut-off",
+        "merits",
+    ),
+    "compensators without fields": (
+        {"merits": {"b": {"kind": "boresight", "at_most": "1 arcsec"}}},
+        "need fields",
+        "merits",
+    ),
+    "carried twice": (
+        {"tolerances": {"a": {"motion": "gf7 shift z", "limit": "1 um", "carrying": ["M2"]}}},
+        "already",
+        "tolerances",
+    ),
+    "terms of no figure": (
+        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "terms": ["Z5", "Z9"]}}},
+        "figure",
+        "tolerances",
+    ),
+    "a negative range": (
+        {"compensators": {"c": {"motion": "M2 shift z", "range": "-1 um"}}},
+        "not negative",
+        "compensators",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_told_with_its_key(case: str, backend, tmp_path) -> None:
+    changes, words, key = BAD[case]
+    with pytest.raises(InputError) as caught:
+        ToleranceBench(budget(tmp_path, **changes), backend)
+    told = str(caught.value)
+    assert words in told
+    assert key in told
+    assert "budget.yaml:" in told
+
+
+COMMAND = """
+import sys
+sys.argv = ["twin.tolerance", *sys.argv[1:]]
+from twin.tolerance.__main__ import app
+app()
+"""
+
+
+@pytest.mark.slow
+def test_killed_at_five_moments_and_resumed_it_gives_the_same_bytes(tmp_path) -> None:
+    budget(tmp_path, samples=2000)
+    file = tmp_path / "budget.yaml"
+
+    def command(out: str, *more: str) -> list[str]:
+        return [
+            sys.executable,
+            "-c",
+            COMMAND,
+            str(file),
+            "--out",
+            str(tmp_path / out),
+            "--workers",
+            "2",
+            "--quiet",
+            *more,
+        ]
+
+    start = time.monotonic()
+    subprocess.run(command("whole"), check=True, cwd=ROOT)
+    took = time.monotonic() - start
+    wanted = result_bytes(tmp_path / "whole")
+    for k, share in enumerate((0.2, 0.4, 0.6, 0.75, 0.9)):
+        process = subprocess.Popen(command(f"killed{k}"), cwd=ROOT, start_new_session=True)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(share * took)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        if not (tmp_path / f"killed{k}").exists():
+            subprocess.run(command(f"killed{k}", "--resume"), check=True, cwd=ROOT)
+        assert result_bytes(tmp_path / f"killed{k}") == wanted
+        assert not (tmp_path / f"killed{k}.samples").exists()
+
+
+def result_bytes(folder: Path) -> dict[str, bytes]:
+    """All files of a run folder but those with times in them."""
+    files = [folder / "tolerance.json", folder / "config.yaml", *(folder / "artefacts").iterdir()]
+    return {path.name: path.read_bytes() for path in files}

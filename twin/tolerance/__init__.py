@@ -1,0 +1,1 @@
+"""Tolerances of a camera with compensators: sensitivities, limits, yield, allocation."""

@@ -1,0 +1,279 @@
+"""Limits allocated anew: the yield that is asked at the least cost.
+
+The same draws serve all limits: with x = scale * u the merits follow from their model to the second order, and the
+yield's quantile of the worst margin has a gradient. Limits move by a bounded factor in each round; then the model is
+made anew, and exact traces of some of the cameras say by how much it is off. A Monte Carlo run of other cameras judges
+what comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, amount_si
+from scenes.yaml.units import split_quantity
+from twin.run.procedure import Advance, silent
+from twin.tolerance.merit_models import MeritModel, ScaledModel, sensitivities
+from twin.tolerance.samples import Samples, adjustment_errors
+from twin.tolerance.tolerance_bench import ToleranceBench
+
+DRAWS = 2000
+"""Cameras by which limits are chosen."""
+CHECKED = 1000
+"""Of these, cameras that are traced in every round."""
+ROUNDS = 8
+BOUND = 2.0
+"""By which factor a limit may change in a round."""
+_STEPS = 60
+_STEP = 1e-5
+"""Step of the logarithm of a limit by which margins are differentiated: along the parts' own derivatives."""
+_SETTLED = 0.03
+"""Change of the logarithms of the limits below which no further round is made."""
+_NEAR = 0.02
+"""Share of the cameras about the quantile whose gradients are averaged."""
+_SAFE = 1.0
+"""Standard deviations of the checked yield's own uncertainty by which the chosen limits are to exceed what is asked."""
+
+
+@dataclass(frozen=True, eq=False)
+class Allocation:
+    """Limits that were chosen.
+
+    Attributes:
+        scales: of every entry, new limit over the old one, before and after rounding, (E,) each.
+        limits: entry -> new limit as files have it.
+        cost: of all entries, before and after.
+        predicted: yield of the old and of the new limits, by the model as it was corrected.
+        reached: whether that reaches the yield that was asked.
+    """
+
+    scales: np.ndarray
+    rounded: np.ndarray
+    limits: Mapping[str, str | float]
+    cost: tuple[float, float]
+    predicted: tuple[float, float]
+    reached: bool
+
+
+def allocate(
+    setup: ToleranceSetup,
+    bench: ToleranceBench,
+    model: MeritModel,
+    samples: Samples,
+    spec: AllocationSpec,
+    advance: Advance = silent,
+) -> Allocation:
+    """Choose limits.
+
+    Args:
+        setup: the budget.
+        bench: of it.
+        model: of its merits.
+        samples: cameras of it.
+        spec: what is asked.
+        advance: shows how far it is.
+    """
+    costs = _Costs.of(setup)
+    checked = min(CHECKED, len(samples.x))
+    share = spec.target + _SAFE * float(np.sqrt(spec.target * (1.0 - spec.target) / checked))
+    share = min(share, 1.0 - 1.0 / checked)
+    total = np.zeros(len(costs.kept))
+    low, high = -np.log(spec.tightest), np.log(spec.loosest)
+    trade = _Trade(bench, model, samples, costs, share, samples.values)
+    first = trade.passing(total)
+    for turn in range(ROUNDS):
+        advance("allocation", turn, ROUNDS)
+        bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
+        step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
+        total = total + step
+        now = bench.scaled(np.exp(total))
+        trade = _Trade(now, sensitivities(now).model, samples, costs, share)
+        if np.max(np.abs(step)) < _SETTLED and trade.quantile(np.zeros(len(step)))[0] <= 0.0:
+            break
+    reached = trade.quantile(np.zeros(len(total)))[0] <= 0.0
+    limits, rounded = _graded(setup, trade, total, spec, reached)
+    level = np.log(rounded) - total
+    advance("allocation", ROUNDS, ROUNDS)
+    cost = costs.of_level(np.zeros(len(total))), costs.of_level(np.log(rounded))
+    return Allocation(np.exp(total), rounded, FrozenMap(limits), cost, (first, trade.passing(level)), reached)
+
+
+@dataclass(frozen=True, eq=False)
+class _Costs:
+    """What limits cost.
+
+    Attributes:
+        cost, exponent: of every entry, (E,) each.
+        kept: whether its limit stays: as stated, and where its distribution is not about zero.
+    """
+
+    cost: np.ndarray
+    exponent: np.ndarray
+    kept: np.ndarray
+
+    @classmethod
+    def of(cls, setup: ToleranceSetup) -> _Costs:
+        entries = list(setup.test.tolerances.values())
+        kept = [one.kept or one.mean is not None or one.measured is not None for one in entries]
+        return cls(np.array([e.cost for e in entries]), np.array([e.exponent for e in entries]), np.array(kept))
+
+    def of_level(self, level: np.ndarray) -> float:
+        """Of limits at exp(level) times the stated ones."""
+        return float(np.sum(self.cost * np.exp(-self.exponent * level)))
+
+    def slope(self, level: np.ndarray) -> np.ndarray:
+        return np.asarray(-self.exponent * self.cost * np.exp(-self.exponent * level))
+
+
+class _Trade:
+    """Worst margins of cameras as functions of the limits, about those of a bench.
+
+    Args:
+        bench: at whose limits the model was made.
+        model: of its merits.
+        samples: draws and the errors of their adjustments.
+        costs: of the limits.
+        share: of the cameras that is to pass.
+        values: of the merits of the first of the cameras by exact traces; they are traced if they are not given.
+    """
+
+    def __init__(
+        self,
+        bench: ToleranceBench,
+        model: MeritModel,
+        samples: Samples,
+        costs: _Costs,
+        share: float,
+        values: np.ndarray | None = None,
+    ) -> None:
+        self.bench, self.costs, self.share = bench, costs, share
+        self.model = ScaledModel.of(model, samples.x[:DRAWS], list(bench.entries.values()))
+        count = min(CHECKED, len(self.model.first))
+        if values is None:
+            errors = adjustment_errors(bench, samples.seeds[:count].tolist())
+            values = bench.values(bench.try_out(samples.x[:count] * bench.sizes, errors).parts)
+        exact = self._margins(values[:count])
+        own = self._worst(self.model.parts(np.ones(len(costs.kept))))[:count]
+        self.offset = float(np.quantile(exact, share) - np.quantile(own, share))
+
+    def _margins(self, values: np.ndarray) -> np.ndarray:
+        """Worst margin of every camera, (S,), of values (S, M); infinite without light."""
+        each = np.stack([merit.margin(values[:, m]) for m, merit in enumerate(self.bench.merits)])
+        return np.asarray(np.where(np.isnan(each), 1e3, each).max(axis=0))
+
+    def _worst(self, parts: np.ndarray) -> np.ndarray:
+        return self._margins(self.bench.values(parts))
+
+    def passing(self, level: np.ndarray) -> float:
+        """Share of the cameras that pass with limits at exp(level) times the bench's."""
+        return float(np.mean(self._worst(self.model.parts(np.exp(level))) + self.offset <= 0.0))
+
+    def quantile(self, level: np.ndarray) -> tuple[float, np.ndarray]:
+        """The margin that the share keeps, and its gradient by ``level``, the mean of those of cameras near it."""
+        parts = self.model.parts(np.exp(level))
+        margin = self._worst(parts)
+        order = np.argsort(margin)
+        at = min(len(order) - 1, int(np.ceil(self.share * len(order))) - 1)
+        half = max(8, int(_NEAR * len(order)))
+        near = order[max(0, at - half) : at + half + 1]
+        change = self.model.slope(np.exp(level), near)
+        slope = np.zeros(len(level))
+        for e in np.flatnonzero(~self.costs.kept):
+            ahead = self._worst(parts[near] + _STEP * change[:, :, e])
+            slope[e] = float(np.mean(ahead - margin[near])) / _STEP
+        return float(margin[order[at]]) + self.offset, slope
+
+    def cheapest(self, low: np.ndarray, high: np.ndarray, total: np.ndarray) -> np.ndarray:
+        """The step (E,) within bounds to the cheapest limits that pass; without any, to the tightest.
+
+        Args:
+            low: bounds of the step, (E,).
+            high: likewise.
+            total: where the bench's own limits are, (E,).
+        """
+        start = np.zeros(len(low))
+        for part in np.linspace(0.0, 1.0, 17):
+            start = part * low
+            if self.quantile(start)[0] <= 0.0:
+                break
+        else:
+            return low
+        if self.costs.kept.all():
+            return start
+        size = self.costs.of_level(total)
+        found = minimize(
+            lambda step: self.costs.of_level(total + step) / size,
+            start,
+            jac=lambda step: self.costs.slope(total + step) / size,
+            bounds=list(zip(low, high, strict=True)),
+            constraints={
+                "type": "ineq",
+                "fun": lambda step: -self.quantile(step)[0],
+                "jac": lambda step: -self.quantile(step)[1],
+            },
+            method="SLSQP",
+            options={"maxiter": _STEPS, "ftol": 1e-4},
+        )
+        return self._between(start, np.clip(found.x, low, high), total)
+
+    def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
+        """The cheapest limits that pass on the way from those that do to others."""
+        best = inside
+        for part in np.linspace(0.0, 1.0, 17)[1:]:
+            step = inside + part * (outside - inside)
+            cheaper = self.costs.of_level(total + step) < self.costs.of_level(total + best)
+            if cheaper and self.quantile(step)[0] <= 0.0:
+                best = step
+        return best
+
+
+def _graded(
+    setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, reached: bool
+) -> tuple[dict[str, str | float], np.ndarray]:
+    """Limits rounded down to grades, then one after the other a grade up wherever the yield allows it.
+
+    Returns:
+        Entry -> limit, and limits over the stated ones, (E,).
+    """
+    entries = list(setup.test.tolerances.items())
+    old = np.array([one.limit_si for _, one in entries])
+    ladders: list[list[tuple[str | float, float]]] = []
+    for e, (_, one) in enumerate(entries):
+        stays = [(one.limit, one.limit_si)]
+        own = _ladder(one.limit, one.parts[1], one.limit_si * float(np.exp(total[e])), spec.grades)
+        ladders.append(stays if trade.costs.kept[e] else own)
+    chosen = np.zeros(len(entries), dtype=int)
+
+    def scales(which: np.ndarray) -> np.ndarray:
+        return np.array([ladder[k][1] for ladder, k in zip(ladders, which, strict=True)]) / old
+
+    if reached:
+        gain = trade.costs.cost * trade.costs.exponent
+        for e in np.argsort(-gain, kind="stable"):
+            for k in range(1, len(ladders[e])):
+                tried = chosen.copy()
+                tried[e] = k
+                if scales(tried)[e] > spec.loosest or trade.quantile(np.log(scales(tried)) - total)[0] > 0.0:
+                    break
+                chosen = tried
+    limits = {name: ladder[k][0] for (name, _), ladder, k in zip(entries, ladders, chosen, strict=True)}
+    return limits, scales(chosen)
+
+
+def _ladder(limit: str | float, kind: str, value: float, grades: Sequence[float]) -> list[tuple[str | float, float]]:
+    """The grade at or below a value and the next two above it, as files have them and in SI; grades are counted in the
+    unit of the old limit.
+    """
+    parts = split_quantity(limit)
+    unit = amount_si(f"1 {parts[1]}", kind) if parts is not None else 1.0
+    number = value / unit
+    decade = int(np.floor(np.log10(number)))
+    steps = sorted(float(f"{g}e{d}") for d in (decade - 1, decade, decade + 1) for g in grades)
+    below = max((k for k, step in enumerate(steps) if step <= number * (1.0 + 1e-9)), default=0)
+    texts: list[str | float] = [f"{step:g} {parts[1]}" if parts is not None else step for step in steps]
+    return [(text, amount_si(text, kind)) for text in texts[below : below + 3]]

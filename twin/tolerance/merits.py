@@ -1,0 +1,91 @@
+"""Merits of a camera that is out of tolerance: smooth parts of each, and what they come to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenes.specs.tolerance import MeritSpec
+
+
+@dataclass(frozen=True, eq=False)
+class Merit:
+    """One merit of a budget.
+
+    Its **parts** change smoothly with small motions, which its value, as the worst of some fields, does not: mean
+    square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line.
+
+    Attributes:
+        name: in the file.
+        spec: what is asked.
+        fields: numbers of its fields among those of the bench, (F,).
+        parts: columns of the bench's parts that are its own.
+    """
+
+    name: str
+    spec: MeritSpec
+    fields: np.ndarray
+    parts: slice
+
+    def values(self, parts: np.ndarray) -> np.ndarray:
+        """What parts (..., P) of the bench come to, (...,), SI; of a change its size."""
+        own = parts[..., self.parts]
+        match self.spec.kind:
+            case "wavefront":
+                return np.sqrt(np.maximum(np.max(own, axis=-1), 0.0))
+            case "mtf":
+                return np.asarray(np.min(own, axis=-1))
+            case "chief_ray":
+                return np.asarray(np.max(np.hypot(own[..., ::2], own[..., 1::2]), axis=-1))
+            case "boresight":
+                return np.asarray(np.hypot(own[..., 0], own[..., 1]))
+            case _:
+                return np.asarray(np.max(np.abs(own), axis=-1))
+
+    def passes(self, values: np.ndarray) -> np.ndarray:
+        """Whether values meet the requirement; what is not known does not."""
+        if self.spec.more_is_better:
+            return np.asarray(values >= self.spec.requirement)
+        return np.asarray(values <= self.spec.requirement)
+
+    def margin(self, values: np.ndarray) -> np.ndarray:
+        """How far values are beyond the requirement, in units of it; negative where they meet it."""
+        ratio = values / self.spec.requirement
+        return np.asarray(1.0 - ratio if self.spec.more_is_better else ratio - 1.0)
+
+    def worse(self, values: np.ndarray, than: float | np.ndarray) -> np.ndarray:
+        """By how much values are worse than another."""
+        return np.asarray(than - values if self.spec.more_is_better else values - than)
+
+
+PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
+"""Kind of a merit -> number of its parts, where that does not depend on fields."""
+
+
+def part_count(spec: MeritSpec, line_points: int) -> int:
+    """Number of a merit's parts."""
+    match spec.kind:
+        case "wavefront":
+            return len(spec.fields)
+        case "mtf":
+            return len(spec.fields) * (2 if spec.direction == "worse" else 1)
+        case "chief_ray":
+            return 2 * len(spec.fields)
+        case "distortion":
+            return line_points
+        case kind:
+            return PART_COUNTS[kind]
+
+
+def merits_of(specs: dict[str, MeritSpec], line_points: int) -> tuple[tuple[Merit, ...], np.ndarray]:
+    """The merits of a budget, and the fields (F, 2) that any of them has."""
+    fields: dict[tuple[float, float], int] = {}
+    out, start = [], 0
+    for name, spec in specs.items():
+        used = spec.fields if spec.kind in ("wavefront", "mtf", "chief_ray") else ()
+        numbers = np.array([fields.setdefault(place, len(fields)) for place in used], dtype=int)
+        count = part_count(spec, line_points)
+        out.append(Merit(name, spec, numbers, slice(start, start + count)))
+        start += count
+    return tuple(out), np.array(list(fields)).reshape(-1, 2)

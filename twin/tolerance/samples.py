@@ -1,0 +1,310 @@
+"""Cameras that are drawn within their tolerances: the base job of a study, whose engine runs them on all cores."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optics.numerics.backend import Backend
+from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
+from scenes.yaml.spec import Spec, validate
+from scenes.yaml.yaml_file import YamlFile
+from twin.run import durable, memory, run_folder
+from twin.run.procedure import Advance, silent
+from twin.study.runs import cluster
+from twin.study.runs.base_job import BlockResult, Failure, Outcome, Run, Tree, one_line, with_values
+from twin.study.runs.chunk_store import ChunkStore
+from twin.study.runs.engine import Engine, Progress
+from twin.study.runs.plan import Plan
+from twin.study.runs.setup import StudySetup
+from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench
+
+KIND = "tolerance"
+DRAWS = "draws"
+
+
+class ToleranceBase:
+    """``python -m twin.tolerance``: of every camera the merits after its adjustments, and the adjustments."""
+
+    def __init__(self) -> None:
+        self._benches: dict[int, tuple[Tree, ToleranceBench]] = {}
+
+    @property
+    def model(self) -> type[Spec]:
+        """A tolerance budget with its instrument."""
+        return ToleranceSetup
+
+    @property
+    def block(self) -> int:
+        """Cameras that are traced together."""
+        return AT_ONCE
+
+    def resolve(self, file: Path | str) -> Spec:
+        """Read a budget. Raises InputError."""
+        return resolve_tolerance(file)
+
+    def check(self, tree: Tree, backend: Backend) -> None:
+        """Whether all that the budget names is there. Raises InputError."""
+        self._bench(tree, backend)
+
+    def evaluate(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
+        """Outcome of every run."""
+        out: list[Outcome] = [Failure("not done")] * len(runs)
+        groups: dict[str, list[int]] = {}
+        others: dict[str, tuple[Any, ...]] = {}
+        for k, run in enumerate(runs):
+            other = tuple((key, value) for key, value in run.values if key[0] != DRAWS)
+            groups.setdefault(repr(other), []).append(k)
+            others[repr(other)] = other
+        for name, members in groups.items():
+            own = with_values(tree, others[name]) if others[name] else tree
+            for k, outcome in zip(members, self._together(own, [runs[k] for k in members], backend), strict=True):
+                out[k] = outcome
+        return out
+
+    def _together(self, tree: Tree, runs: Sequence[Run], backend: Backend) -> list[Outcome]:
+        bench = self._bench(tree, backend)
+        place = {number.name: k for k, number in enumerate(bench.numbers)}
+        x = np.zeros((len(runs), len(place)))
+        x[:] = [float(tree[DRAWS].get(name, 0.0)) for name in place]
+        for s, run in enumerate(runs):
+            for key, value in run.values:
+                if key[0] == DRAWS:
+                    x[s, place[str(key[1])]] = float(value)
+        seeds = [tree["test"].get("seed", 0) if run.seed is None else run.seed for run in runs]
+        return outcomes(bench, x, seeds)
+
+    def _bench(self, tree: Tree, backend: Backend) -> ToleranceBench:
+        """The tree of a study is the same object from block to block."""
+        known = self._benches.get(id(tree))
+        if known is None or known[0] is not tree:
+            setup = validate(ToleranceSetup, YamlFile("", tree, {}))
+            self._benches = {id(tree): (tree, ToleranceBench(setup, backend))}
+        return self._benches[id(tree)][1]
+
+
+def outcomes(bench: ToleranceBench, x: np.ndarray, seeds: Sequence[int]) -> list[Outcome]:
+    """What cameras come to.
+
+    Args:
+        bench: of the budget.
+        x: numbers that vary, in units of their sizes, (S, K).
+        seeds: of the errors of each camera's adjustments, S.
+    """
+    errors = adjustment_errors(bench, seeds)
+    tried = bench.try_out(x * bench.sizes, errors)
+    values = bench.values(tried.parts)
+    out: list[Outcome] = []
+    for s, problem in enumerate(tried.problems):
+        if problem:
+            out.append(Failure(one_line(RuntimeError(problem))))
+            continue
+        named = zip(bench.merits, values[s].tolist(), strict=True)
+        moved = zip(bench.compensators, tried.moves[s].tolist(), strict=True)
+        told = {
+            "merits": {merit.name: value for merit, value in named},
+            "moves": {number.name: move for number, move in moved},
+            "settled_waves": float(tried.settled[s]),
+        }
+        out.append({KIND: told})
+    return out
+
+
+def adjustment_errors(bench: ToleranceBench, seeds: Sequence[int]) -> np.ndarray | None:
+    """Errors of the adjustments in standard deviations, (S, C); None where they are made without steps and errors."""
+    if not np.any((bench.grid_steps > 0.0) | (bench.accuracies > 0.0)):
+        return None
+    return np.stack([np.random.default_rng([seed, 1]).standard_normal(len(bench.ranges)) for seed in seeds])
+
+
+def law_of(one: ToleranceSpec) -> dict[str, Any]:
+    """How a tolerance is distributed, in units of its limit, as a study's file says it."""
+    if one.measured is not None:
+        return {"values": list(one.measured_shares)}
+    middle = one.mean_share
+    ends = [middle - 1.0, middle + 1.0]
+    if one.law == "uniform":
+        return {"uniform": ends}
+    if one.law == "ends":
+        return {"values": ends}
+    return {"truncated": {"mean": middle, "sigma": 1.0 / one.sigmas, "limits": ends}}
+
+
+def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: int) -> StudySetup:
+    """The study that draws cameras of a budget.
+
+    Args:
+        setup: the budget.
+        bench: of it.
+        samples: number of cameras.
+        seed: of the draws.
+    """
+    from scenes.specs.study import StudySpec
+
+    test = setup.test
+    factors: dict[str, Any] = {}
+    for number in bench.numbers:
+        one = test.tolerances[number.entry]
+        law = {"normal": {"mean": 0.0, "sigma": 1.0}} if one.spectrum else law_of(one)
+        factors[number.name.replace(" ", "_")] = {"key": [DRAWS, number.name], **law}
+    responses = {
+        **{f"merit_{merit.name}": {"key": [KIND, "merits", merit.name]} for merit in bench.merits},
+        **{f"move_{one.name}": {"key": [KIND, "moves", one.name]} for one in bench.compensators},
+        "settled": {"key": [KIND, "settled_waves"]},
+    }
+    data = {
+        "name": "tolerance",
+        "base": {"command": KIND, "file": "config.yaml"},
+        "factors": factors,
+        "design": {"kind": "monte_carlo", "runs": samples, "seed": seed},
+        "responses": responses,
+        "limits": test.limits.plain(),
+    }
+    study = validate(StudySpec, YamlFile("", data, {}))
+    tree = setup.plain()
+    tree[DRAWS] = dict.fromkeys((number.name for number in bench.numbers), 0.0)
+    return StudySetup(study, tree)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Cameras that were drawn.
+
+    Attributes:
+        x: numbers that vary, in units of their sizes, (S, K).
+        values: of the merits, SI, (S, M); NaN for a camera without light.
+        moves: of the compensators, SI, (S, C).
+        settled: by how much a further step of the adjustments would change the wavefront, waves, (S,).
+        seeds: of the errors of each camera's adjustments, (S,).
+        problems: why a camera has no light, empty where it has, (S,).
+        seconds: that it took.
+    """
+
+    x: np.ndarray
+    values: np.ndarray
+    moves: np.ndarray
+    settled: np.ndarray
+    seeds: np.ndarray
+    problems: tuple[str, ...]
+    seconds: float = field(default=0.0, compare=False)
+
+
+@dataclass(frozen=True)
+class Workforce:
+    """Who draws cameras.
+
+    Attributes:
+        workers: number of processes; 0 for this one alone.
+        scheduler: address of a running cluster, None for none.
+        journal: folder that keeps what is done, to go on with; None for none, then nothing is kept.
+    """
+
+    workers: int = 0
+    scheduler: str | None = None
+    journal: Path | None = None
+
+
+def draw_samples(
+    setup: ToleranceSetup,
+    bench: ToleranceBench,
+    backend: Backend,
+    samples: int,
+    seed: int,
+    force: Workforce,
+    part: str = "samples",
+    advance: Advance = silent,
+) -> Samples:
+    """Draw cameras and try them; the numbers do not depend on who does it.
+
+    Args:
+        setup: the budget.
+        bench: of it, in this process.
+        backend: where to trace.
+        samples: number of cameras.
+        seed: of the draws.
+        force: who does it.
+        part: of the work, for the journal and the progress.
+        advance: shows how far it is.
+
+    Raises:
+        RunFolderError: the journal is another run's, or cannot be written.
+        IncompleteError, ProgramFault, ClusterError: as the engine of studies.
+    """
+    study = study_of(setup, bench, samples, seed)
+    plan = Plan.of(study)
+    x = np.stack([column.values for column in plan.columns], axis=-1).astype(np.float64)
+    seeds = plan.seeds if plan.seeds is not None else np.zeros(samples, np.int64)
+    advance(part, 0, samples)
+    if force.journal is None:
+        found = []
+        for numbers in map(plan.block, range(plan.blocks)):
+            own = slice(numbers.start, numbers.stop)
+            found.append(BlockResult.of(outcomes(bench, x[own], seeds[own].tolist()), study.study.responses))
+            advance(part, numbers.stop, samples)
+        result = BlockResult.joined(found)
+    else:
+        result = _by_engine(plan, backend, force, force.journal / part, part, advance)
+    merits, moves = len(bench.merits), len(bench.compensators)
+    values = result.values
+    return Samples(
+        x,
+        values[:, :merits],
+        values[:, merits : merits + moves],
+        values[:, -1],
+        seeds,
+        result.messages,
+        result.seconds,
+    )
+
+
+def _by_engine(
+    plan: Plan, backend: Backend, force: Workforce, folder: Path, part: str, advance: Advance
+) -> BlockResult:
+    with _journal(folder, plan.setup.fingerprint):
+        store = ChunkStore(folder, plan)
+        store.open()
+        engine = Engine(plan, store, backend.name, Progress(done=lambda done, total: advance(part, done, total)))
+        if store.missing:
+            who = (
+                cluster.remote_workers(force.scheduler, lambda text: None)
+                if force.scheduler is not None
+                else cluster.local_workers(max(1, force.workers))
+            )
+            with who as workers:
+                engine.run(workers, memory.largest_memory())
+        return store.result()
+
+
+@contextmanager
+def _journal(folder: Path, fingerprint: str) -> Iterator[None]:
+    """Keep a folder for one run of one budget.
+
+    Raises:
+        RunFolderError: it is another's, or in use.
+    """
+    try:
+        durable.make_folders(folder)
+        with (folder / "of.txt").open("a+", encoding="utf-8") as head:
+            try:
+                fcntl.flock(head, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise run_folder.RunFolderError(f"{folder} is in use by another command") from None
+            head.seek(0)
+            said = head.read()
+            if said and said != f"{fingerprint}\n":
+                text = "is of another budget, or of another version of this program; remove it to begin anew"
+                raise run_folder.RunFolderError(f"{folder} {text}")
+            if not said:
+                head.write(f"{fingerprint}\n")
+                head.flush()
+            yield
+    except OSError as error:
+        raise run_folder.RunFolderError(
+            f"{folder}: {error.strerror}; what is done is kept, go on with --resume"
+        ) from error

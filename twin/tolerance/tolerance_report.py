@@ -1,0 +1,354 @@
+"""Report of a tolerance budget: yield first, then what costs most, limits for a loss, and limits chosen anew."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, shown_unit
+from twin.run.report import Report, Section, answer
+from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.tolerance.merit_models import FARTHEST
+from twin.tolerance.tolerance_run import LEVELS, MeritResult, ToleranceRun, Yield, merit_unit
+
+_FEW = 3
+"""Tolerances that the verdict names."""
+_LITTLE = 0.01
+"""Share of every merit's variance below which a tolerance may be loosened."""
+_MOST_CURVES = 6
+
+
+def tolerance_report(run: ToleranceRun) -> Report:
+    """Report of a tolerance budget."""
+    test = run.setup.test
+    with look("tolerance"):
+        curves = to_svg(_yield_figure(run))
+        bars = to_svg(_share_figure(run))
+    told, more = answer(_verdict(run), _dear(run), *_further(run))
+    sections = (
+        Section(
+            "Yield",
+            ("Share of the cameras that keep a value, by exact traces and by the models; the line is what is asked.",),
+            (SvgFigure("yield", "Merits over all cameras", "", curves), _levels_table(run)),
+            name="yield",
+        ),
+        Section(
+            "What costs most",
+            (
+                "Share of the variance of each merit that is gone without the tolerance. Shares of merits that are the "
+                "worst of several fields need not add up to 100 %.",
+            ),
+            (SvgFigure("shares", "Shares of variance", "", bars), _shares_table(run)),
+            name="shares",
+        ),
+        Section(
+            "Sensitivities",
+            (
+                "Each tolerance alone at its limit, below and above, with all compensators adjusted anew, by exact "
+                "traces.",
+            ),
+            (_sensitivity_table(run),),
+            name="sensitivities",
+        ),
+        Section(
+            "Limits for a loss",
+            (
+                "The limit at which a tolerance by itself spoils a merit by the loss in the head of its column, by "
+                f"exact traces of both signs. Empty where {FARTHEST:g} times the limit does not, and where the design "
+                "leaves nothing.",
+            ),
+            (_inverse_table(run),),
+            name="inverse",
+        ),
+        *_allocation_sections(run),
+        *_compensator_sections(run),
+        Section(
+            "Worst cameras",
+            ("The worst cameras as jobs, with their adjustments: `python -m twin.camera FILE` shows each.",),
+            tuple(CameraFile(name, f"Camera {name[-2:]}", "", text) for name, text in run.jobs.items()),
+            closed=True,
+            name="worst",
+        ),
+    )
+    facts = (
+        ("camera", run.bench.camera),
+        ("tolerances", str(len(test.tolerances))),
+        ("compensators", str(len(test.compensators)) or "none"),
+        ("cameras drawn", str(len(run.samples.problems))),
+        ("seed", str(test.seed)),
+    )
+    title = f"Tolerances of {run.bench.camera}"
+    return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f} %"
+
+
+def _interval(one: Yield) -> str:
+    return f"{_percent(one.share)} ({100.0 * one.low:.1f} to {100.0 * one.high:.1f} %)"
+
+
+def _verdict(run: ToleranceRun) -> str:
+    judged = [(one.merit.name, one.passing.judged(one.merit.spec.probability)) for one in run.merits]
+    missed, undecided = ([name for name, how in judged if how == what] for what in ("missed", "open"))
+    text = f"Yield: {_interval(run.passing)} of the cameras meet all requirements"
+    if missed:
+        text += f"; too few meet {', '.join(missed)}"
+    if undecided:
+        text += f"; more cameras have to be drawn to decide on {', '.join(undecided)}"
+    return text if missed or undecided else f"{text}, and enough meet each of them"
+
+
+def _dear(run: ToleranceRun) -> str:
+    """The tolerances that cost most, and what may be loosened."""
+    worst = _importance(run)
+    order = sorted(worst, key=lambda name: -worst[name])
+    dear = [f"{name} ({100.0 * worst[name]:.0f} %)" for name in order[:_FEW] if worst[name] > 0.0]
+    loose = [name for name in order if worst[name] < _LITTLE][::-1]
+    text = f"Most of a merit's variance is due to {', '.join(dear)}" if dear else "No tolerance changes a merit"
+    if loose:
+        named = ", ".join(loose[:_FEW]) + (f" and {len(loose) - _FEW} more" if len(loose) > _FEW else "")
+        text += f"; {named} could be loosened"
+    return text
+
+
+def _importance(run: ToleranceRun) -> dict[str, float]:
+    """Entry -> largest share of a merit's variance, of those merits that are not met by every camera with room."""
+    tight = [one for one in run.merits if one.passing.share < 1.0] or list(run.merits)
+    return {name: max(one.shares[name] for one in tight) for name in run.bench.entries}
+
+
+def _further(run: ToleranceRun) -> list[str]:
+    out = []
+    found, judged = run.allocation, run.judged
+    if found is not None and judged is not None:
+        asked = run.setup.test.allocation
+        assert asked is not None
+        if found.reached:
+            out.append(
+                f"Limits allocated for a yield of {_percent(asked.target)} give {_interval(judged)} at a cost of "
+                f"{found.cost[1]:.3g} against {found.cost[0]:.3g}"
+            )
+        else:
+            out.append(f"No allocation within the bounds reaches a yield of {_percent(asked.target)}")
+    return out
+
+
+def _scaled(value: float, one: MeritResult, decimals: int | None = None) -> Cell:
+    """A value in the merit's unit, with decimals by its spread."""
+    size = merit_unit(one.merit)[1]
+    if not np.isfinite(value):
+        return None
+    places = decimals_for(one.deviation / size, 2, most=5) if decimals is None else decimals
+    return OwnDecimals(value / size, max(places, 1) if merit_unit(one.merit)[0] else max(places, 3))
+
+
+def _head(one: MeritResult) -> str:
+    unit = merit_unit(one.merit)[0]
+    return f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name
+
+
+def _summary(run: ToleranceRun) -> Table:
+    rows: list[list[Cell]] = []
+    for one in run.merits:
+        spec = one.merit.spec
+        sign = "at least" if spec.more_is_better else "at most"
+        rows.append(
+            [
+                _head(one),
+                f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g} in {100 * spec.probability:.0f} %",
+                _scaled(one.nominal, one),
+                _scaled(one.mean, one),
+                _scaled(one.levels[1], one),
+                _scaled(one.quadratic[1], one),
+                _interval(one.passing),
+                one.passing.judged(spec.probability),
+            ]
+        )
+    caption = (
+        "Designed: adjusted, without any error. 90 %: the value that nine of ten cameras keep, by exact traces and by "
+        "derivatives of the second order. Yield: share that meets the requirement, with its interval at 95 %."
+    )
+    heads = ("merit", "asked", "designed", "mean", "90 %", "90 % quadratic", "yield", "requirement")
+    return Table("merits", "Merits", caption, heads, rows)
+
+
+def _levels_table(run: ToleranceRun) -> Table:
+    rows: list[list[Cell]] = []
+    for one in run.merits:
+        for k, share in enumerate(LEVELS):
+            values = (one.levels[k], one.quadratic[k], one.linear[k])
+            rows.append([_head(one), f"{100 * share:.0f} %", *(_scaled(value, one) for value in values)])
+        rows.append(
+            [_head(one), "yield", *(_percent(share) for share in (one.passing.share, *reversed(one.model_passing)))]
+        )
+    caption = "Values that a share of the cameras keep, by exact traces of every camera and by models of all together."
+    heads = ("merit", "share", "exact", "quadratic", "linear")
+    return Table("levels", "Exact, quadratic and linear", caption, heads, rows)
+
+
+def _shares_table(run: ToleranceRun) -> Table:
+    worst = _importance(run)
+    order = sorted(worst, key=lambda name: -worst[name])
+    rows: list[list[Cell]] = [[name, *(100.0 * one.shares[name] for one in run.merits)] for name in order]
+    heads = ("tolerance", *(f"{one.merit.name} [percent]" for one in run.merits))
+    return Table("variance", "Shares of variance", "Percent.", heads, rows, (None, *[1] * len(run.merits)))
+
+
+def _sensitivity_table(run: ToleranceRun) -> Table:
+    rows: list[list[Cell]] = []
+    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+        cells: list[Cell] = [
+            name,
+            one.words,
+            str(one.limit),
+        ]
+        for m, result in enumerate(run.merits):
+            cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
+        rows.append(cells)
+    heads = ("tolerance", "motion", "limit", *(sign for _ in run.merits for sign in ("\N{MINUS SIGN}", "+")))
+    over = (("", 3), *((_head(one), 2) for one in run.merits))
+    caption = "Merits with one tolerance at its limit. Of a figure error: what its terms come to on the average."
+    return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over)
+
+
+def _inverse_table(run: ToleranceRun) -> Table:
+    rows: list[list[Cell]] = []
+    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+        cells: list[Cell] = [name, str(one.limit)]
+        for m in range(len(run.merits)):
+            share = float(run.inverse.shares[e, m])
+            cells.append(_scaled_limit(one.limit, share) if np.isfinite(share) else "")
+        rows.append(cells)
+    heads = ["tolerance", "limit"]
+    for m, result in enumerate(run.merits):
+        unit, size = merit_unit(result.merit)
+        loss, name = float(run.inverse.losses[m]) / size, result.merit.name
+        heads.append(f"{name}: loss {loss:.3g} {shown_unit(unit)}".rstrip() if np.isfinite(loss) else name)
+    return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
+
+
+def _scaled_limit(limit: str | float, share: float) -> str:
+    """A share of a limit, in the limit's own unit."""
+    if isinstance(limit, str):
+        number, _, unit = limit.strip().partition(" ")
+        return f"{float(number) * share:.3g} {unit}"
+    return f"{limit * share:.3g}"
+
+
+def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
+    found, judged = run.allocation, run.judged
+    if found is None or judged is None:
+        return ()
+    rows: list[list[Cell]] = []
+    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+        rows.append(
+            [
+                name,
+                one.words,
+                str(one.limit),
+                _scaled_limit(one.limit, float(found.scales[e])),
+                str(found.limits[name]),
+                float(found.rounded[e]),
+                one.cost,
+                one.cost * float(found.rounded[e]) ** -one.exponent,
+            ]
+        )
+    heads = ("tolerance", "motion", "limit", "chosen", "rounded", "ratio", "cost", "new cost")
+    caption = (
+        "Limits as stated, as the least cost asks for, and rounded to the grades; costs go with the inverse limit."
+    )
+    table = Table(
+        "allocation", "Limits before and after", caption, heads, rows, (None, None, None, None, None, 3, 2, 2)
+    )
+    text = (
+        f"Cost {found.cost[0]:.3g} before and {found.cost[1]:.3g} after. By the model the yield goes from "
+        f"{_percent(found.predicted[0])} to {_percent(found.predicted[1])}; other cameras, traced exactly, yield "
+        f"{_interval(judged)}.",
+    )
+    return (Section("Allocation", text, (table, _tol_table(run)), name="allocation"),)
+
+
+def _tol_table(run: ToleranceRun) -> Table:
+    """The TOL table: what a workshop gets."""
+    limits = run.allocation.limits if run.allocation is not None else {}
+    rows: list[list[Cell]] = []
+    for name, one in run.setup.test.tolerances.items():
+        law = "measured" if one.measured is not None else "figure" if one.spectrum else one.law
+        rows.append([name, one.words, str(limits.get(name, one.limit)), law, " ".join(one.carrying)])
+    heads = ("tolerance", "motion", "limit (plus, minus)", "law", "carrying")
+    return Table("tol", "Limits for the workshop", "As CSV in artefacts/tol.csv.", heads, rows)
+
+
+def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
+    if not run.bench.compensators:
+        return () if run.allocation is not None else (Section("Limits", (), (_tol_table(run),), name="tol"),)
+    moves = run.samples.moves
+    rows: list[list[Cell]] = []
+    for c, (name, one) in enumerate(run.setup.test.compensators.items()):
+        own = moves[np.isfinite(moves[:, c]), c]
+        unit = one.range_si or 1.0
+        size = [
+            _scaled_limit(one.range, float(part) / unit) for part in (np.std(own), np.max(np.abs(own), initial=0.0))
+        ]
+        rows.append([name, one.motion, str(one.range), str(one.step or ""), str(one.accuracy or ""), *size])
+    heads = ("compensator", "motion", "range", "step", "accuracy", "std of moves", "largest move")
+    table = Table("compensators", "Adjustments", "Over all cameras.", heads, rows)
+    tables = (table,) if run.allocation is not None else (table, _tol_table(run))
+    return (Section("Compensators", (), tables, name="compensators"),)
+
+
+def _yield_figure(run: ToleranceRun) -> Figure:
+    """Share of cameras that keep a value, merit by merit."""
+    shown = run.merits[:_MOST_CURVES]
+    columns = min(3, len(shown))
+    lines = -(-len(shown) // columns)
+    figure = new_figure(2.6 * lines)
+    axes = np.atleast_1d(figure.subplots(lines, columns, squeeze=False)).ravel()
+    for one, ax in zip(shown, axes, strict=False):
+        _curve(ax, run, one)
+    for ax in axes[len(shown) :]:
+        ax.set_axis_off()
+    axes[0].legend(loc="lower right")
+    return figure
+
+
+def _curve(ax: Axes, run: ToleranceRun, one: MeritResult) -> None:
+    size, m = merit_unit(one.merit)[1], run.bench.merits.index(one.merit)
+    models = (run.found.model.quadratic, run.found.model.linear)
+    own = [run.samples.values[:, m], *(one.merit.values(part(run.samples.x)) for part in models)]
+    looks = ((BLUE, "-", 1.8, "exact"), (ORANGE, "--", 1.4, "quadratic"), (GREY, ":", 1.2, "linear"))
+    for values, (colour, style, width, label) in zip(own, looks, strict=True):
+        known = np.sort(values[np.isfinite(values)]) / size
+        share = np.arange(1, len(known) + 1) / len(values)
+        if one.merit.spec.more_is_better:
+            share = 1.0 - share + 1.0 / len(values)
+        ax.plot(known, 100.0 * share, style, color=colour, lw=width, label=label)
+    ax.axvline(one.merit.spec.requirement / size, color=VERMILION, lw=1.0)
+    ax.axhline(100.0 * one.merit.spec.probability, color=INK, lw=0.5, alpha=0.5)
+    unit = merit_unit(one.merit)[0]
+    ax.set_xlabel(f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name)
+    ax.set_ylabel("cameras [%]")
+    ax.set_ylim(0.0, 102.0)
+    plain_axes(ax)
+
+
+def _share_figure(run: ToleranceRun) -> Figure:
+    """Shares of variance of the tolerances that matter."""
+    worst = _importance(run)
+    order = sorted(worst, key=lambda name: -worst[name])[:12][::-1]
+    figure = new_figure(0.9 + 0.32 * len(order))
+    ax = figure.subplots()
+    shown = run.merits[:_MOST_CURVES]
+    colours = (BLUE, ORANGE, VERMILION, GREY, INK, "#009E73")
+    step = 0.8 / max(1, len(shown))
+    for k, one in enumerate(shown):
+        at = np.arange(len(order)) + 0.4 - (k + 0.5) * step
+        ax.barh(at, [100.0 * one.shares[name] for name in order], 0.9 * step, color=colours[k], label=one.merit.name)
+    ax.set_yticks(np.arange(len(order)), order)
+    ax.set_xlabel("share of the variance [%]")
+    ax.legend(loc="lower right")
+    plain_axes(ax)
+    return figure

@@ -1,0 +1,475 @@
+"""A tolerance budget computed: sensitivities, limits for a loss, yield by models and by exact traces, allocation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest
+
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.job import JobSpec
+from scenes.specs.tolerance import MERIT_UNITS, ToleranceSetup, amount_text
+from scenes.yaml.errors import InputError
+from scenes.yaml.units import LENGTH
+from twin.run.procedure import Advance, silent
+from twin.run.quantity import Quantity, Record
+from twin.tolerance.allocation import Allocation, allocate
+from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
+from twin.tolerance.merits import Merit
+from twin.tolerance.samples import Samples, Workforce, draw_samples
+from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
+from twin.tolerance.variations import states_of
+
+CONFIDENCE = 0.95
+"""Of the intervals of yields."""
+WORST = 10
+"""Cameras that are handed over as jobs."""
+LEVELS = (0.5, 0.9, 0.95)
+"""Shares of cameras of which a merit's value is told."""
+_MORE = 7919
+"""What is added to the seed for the cameras by which an allocation is judged, so that they are others."""
+_NOTHING = 1e-15
+"""Metres and radians below which a motion is rounding."""
+NEAR_MODEL = 0.05
+"""Share by which a model's quantile may differ from the samples' without a warning."""
+
+
+@dataclass(frozen=True)
+class Yield:
+    """Share of cameras that pass.
+
+    Attributes:
+        passed: number of cameras that do; of: all.
+        low, high: limits of the share, at ``CONFIDENCE`` (Clopper and Pearson).
+    """
+
+    passed: int
+    of: int
+    low: float
+    high: float
+
+    @classmethod
+    def count(cls, passing: np.ndarray) -> Yield:
+        """Of cameras that pass or not, (S,)."""
+        passed, total = int(np.sum(passing)), len(passing)
+        low, high = binomtest(passed, total).proportion_ci(CONFIDENCE, "exact")
+        return cls(passed, total, float(low), float(high))
+
+    @property
+    def share(self) -> float:
+        """Passed of all."""
+        return self.passed / self.of
+
+    def judged(self, wanted: float) -> str:
+        """``met``, ``missed``, or ``open`` where the interval holds what is wanted."""
+        return "met" if self.low >= wanted else "missed" if self.high < wanted else "open"
+
+
+@dataclass(frozen=True, eq=False)
+class MeritResult:
+    """One merit over all cameras.
+
+    Attributes:
+        merit: the merit.
+        nominal: of the designed camera, adjusted, SI.
+        mean, deviation: over the cameras, SI.
+        levels: value that shares ``LEVELS`` of the cameras do not exceed (of MTF: exceed), SI.
+        linear, quadratic: the same by the models.
+        passing: share that passes.
+        model_passing: the same by the linear and the quadratic model.
+        shares: entry -> share of the variance that is gone without it, by the quadratic model.
+    """
+
+    merit: Merit
+    nominal: float
+    mean: float
+    deviation: float
+    levels: tuple[float, ...]
+    linear: tuple[float, ...]
+    quadratic: tuple[float, ...]
+    passing: Yield
+    model_passing: tuple[float, float]
+    shares: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ToleranceRun:
+    """A tolerance budget and what it comes to.
+
+    Attributes:
+        setup: the budget.
+        bench: on which it was tried.
+        found: sensitivities and model.
+        inverse: limits for a loss.
+        samples: cameras that were drawn.
+        merits: of them.
+        passing: share of cameras that meet all requirements.
+        allocation: limits chosen anew; None where none are asked.
+        judged: share of cameras with these limits that meet all requirements, of cameras of their own.
+        jobs: the worst cameras as files of jobs, by name.
+        warnings: what the user should know.
+    """
+
+    setup: ToleranceSetup
+    bench: ToleranceBench
+    found: Sensitivities
+    inverse: InverseLimits
+    samples: Samples
+    merits: tuple[MeritResult, ...]
+    passing: Yield
+    allocation: Allocation | None
+    judged: Yield | None
+    jobs: Mapping[str, str]
+    warnings: tuple[str, ...]
+
+
+def run_tolerance(
+    setup: ToleranceSetup,
+    backend: Backend,
+    seed: int | None = None,
+    advance: Advance = silent,
+    force: Workforce | None = None,
+) -> ToleranceRun:
+    """Compute a tolerance budget.
+
+    Args:
+        setup: the budget.
+        backend: where to trace.
+        seed: of the draws; the budget's own by default.
+        advance: shows how far it is.
+        force: who draws the cameras; this process alone by default.
+
+    Raises:
+        InputError: names that do not exist, or a designed camera without the light that is asked.
+        RunFolderError, IncompleteError, ProgramFault, ClusterError: as ``draw_samples``.
+    """
+    test, force = setup.test, force or Workforce()
+    seed = test.seed if seed is None else seed
+    bench = ToleranceBench(setup, backend)
+    found = sensitivities(bench, advance)
+    _require_light(setup, found)
+    inverse = inverse_limits(bench, found, advance)
+    samples = draw_samples(setup, bench, backend, test.samples, seed, force, "cameras", advance)
+    passing = bench.passing(samples.values)
+    models = Modelled.of(bench, found, samples)
+    merits = tuple(_merit_result(bench, found, samples, models, m, passing[:, m]) for m in range(len(bench.merits)))
+    allocation, judged = None, None
+    if test.allocation is not None:
+        allocation = allocate(setup, bench, found.model, samples, test.allocation, advance)
+        judged = _judged(setup, backend, allocation, seed, force, advance)
+    return ToleranceRun(
+        setup,
+        bench,
+        found,
+        inverse,
+        samples,
+        merits,
+        Yield.count(np.all(passing, axis=-1)),
+        allocation,
+        judged,
+        FrozenMap(worst_jobs(setup, bench, samples)),
+        tuple(_warnings(bench, found, samples, merits, allocation, judged, test.allocation)),
+    )
+
+
+def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:
+    if not np.all(np.isfinite(found.nominal)):
+        raise setup.test.error("the designed camera has no light at these fields", ("merits",))
+
+
+def with_limits(setup: ToleranceSetup, limits: Mapping[str, str | float]) -> ToleranceSetup:
+    """The budget with other limits."""
+    entries = {
+        name: one.model_copy(update={"limit": limits.get(name, one.limit)})
+        for name, one in setup.test.tolerances.items()
+    }
+    return setup.model_copy(update={"test": setup.test.model_copy(update={"tolerances": FrozenMap(entries)})})
+
+
+def _judged(
+    setup: ToleranceSetup,
+    backend: Backend,
+    allocation: Allocation,
+    seed: int,
+    force: Workforce,
+    advance: Advance,
+) -> Yield:
+    """Yield of the allocated limits by cameras of their own."""
+    other = with_limits(setup, allocation.limits)
+    bench = ToleranceBench(other, backend)
+    drawn = draw_samples(other, bench, backend, setup.test.samples, seed + _MORE, force, "allocated", advance)
+    return Yield.count(np.all(bench.passing(drawn.values), axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Modelled:
+    """What the models say of the cameras that were drawn.
+
+    Attributes:
+        linear, quadratic: values of the merits, SI, (S, M).
+        without: the same to the second order without each tolerance, of the first of the cameras, (E, S', M).
+    """
+
+    linear: np.ndarray
+    quadratic: np.ndarray
+    without: np.ndarray
+
+    @classmethod
+    def of(cls, bench: ToleranceBench, found: Sensitivities, samples: Samples) -> Modelled:
+        """The models at the cameras' own draws."""
+        scaled = ScaledModel.of(found.model, samples.x, list(bench.entries.values()))
+        every = np.eye(len(bench.entries))
+        return cls(
+            bench.values(found.model.linear(samples.x)),
+            bench.values(found.model.quadratic(samples.x)),
+            np.stack([bench.values(scaled.parts(1.0 - one)) for one in every]),
+        )
+
+
+def _merit_result(
+    bench: ToleranceBench, found: Sensitivities, samples: Samples, models: Modelled, m: int, passing: np.ndarray
+) -> MeritResult:
+    merit = bench.merits[m]
+    values = samples.values[:, m]
+    good = values[np.isfinite(values)]
+    sign = -1.0 if merit.spec.more_is_better else 1.0
+
+    def levels(own: np.ndarray) -> tuple[float, ...]:
+        known = sign * own[np.isfinite(own)]
+        return tuple(float(sign * np.quantile(known, share)) for share in LEVELS) if len(known) else (np.nan,) * 3
+
+    without = np.var(models.without[:, :, m], axis=1)
+    modelled = float(np.var(models.quadratic[: models.without.shape[1], m]))
+    shares = np.maximum(0.0, 1.0 - without / modelled) if modelled > 0.0 else np.zeros(len(without))
+    by_model = models.linear[:, m], models.quadratic[:, m]
+    return MeritResult(
+        merit,
+        float(found.nominal[m]),
+        float(np.mean(good)) if len(good) else np.nan,
+        float(np.std(good)) if len(good) else np.nan,
+        levels(values),
+        levels(by_model[0]),
+        levels(by_model[1]),
+        Yield.count(passing),
+        (float(np.mean(merit.passes(by_model[0]))), float(np.mean(merit.passes(by_model[1])))),
+        FrozenMap(zip(bench.entries, shares.tolist(), strict=True)),
+    )
+
+
+def _warnings(
+    bench: ToleranceBench,
+    found: Sensitivities,
+    samples: Samples,
+    merits: tuple[MeritResult, ...],
+    allocation: Allocation | None,
+    judged: Yield | None,
+    spec: Any,
+) -> list[str]:
+    out = []
+    lost = [problem for problem in samples.problems if problem]
+    if lost:
+        out.append(f"{len(lost)} of {len(samples.problems)} cameras have no light and count as failed: {lost[0]}")
+    for name, problem in zip(bench.entries, found.problems, strict=True):
+        if problem:
+            out.append(f"tolerance {name}: no light at its limit ({problem}), so that the models know nothing of it")
+    unsettled = int(np.sum(samples.settled > SETTLED))
+    if unsettled:
+        out.append(f"the adjustments of {unsettled} cameras have not settled: their merits may be better than told")
+    if not found.model.paired:
+        out.append(f"{len(bench.numbers)} numbers vary: the second order has no products of two of them")
+    for one in merits:
+        level = one.levels[1]
+        for what, own in (("first", one.linear[1]), ("second", one.quadratic[1])):
+            away = abs(own - level) / max(abs(level), 1e-30)
+            if away > NEAR_MODEL:
+                kind = "linear" if what == "first" else "quadratic"
+                out.append(
+                    f"{one.merit.name}: the {kind} model's value for {100 * LEVELS[1]:.0f} % of the cameras differs by "
+                    f"{100 * away:.0f} % from the exact one; do not use derivatives of the {what} order for it"
+                )
+    stuck = bench.ranges > 0.0
+    at_end = np.abs(samples.moves) >= 0.999 * bench.ranges
+    for c in np.flatnonzero(stuck & np.any(at_end, axis=0)):
+        share = float(np.mean(at_end[:, c]))
+        out.append(
+            f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all"
+        )
+    if allocation is not None and judged is not None and spec is not None:
+        if not allocation.reached:
+            out.append(
+                f"no limits up to {spec.tightest:g} times tighter reach a yield of {100 * spec.target:.0f} %: the "
+                "table has the tightest"
+            )
+        elif not judged.low <= allocation.predicted[1] <= judged.high:
+            out.append(
+                f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
+                f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
+            )
+    return out
+
+
+def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -> dict[str, str]:
+    """The worst cameras as jobs that ``python -m twin.render`` and ``twin.camera`` take, the worst first."""
+    margins = np.stack([m.margin(samples.values[:, k]) for k, m in enumerate(bench.merits)], axis=-1)
+    worst = np.where(np.isnan(margins), np.inf, margins).max(axis=-1)
+    out = {}
+    for rank, s in enumerate(np.argsort(-worst, kind="stable")[:WORST]):
+        moves = np.nan_to_num(samples.moves[s])
+        amounts = np.concatenate([samples.x[s] * bench.sizes, moves])[None]
+        state = states_of((*bench.numbers, *bench.compensators), amounts)[0]
+        perturb = {path: _perturb(motion) for path, motion in state.items()}
+        data = {"instrument": setup.test.instrument, "perturb": {path: what for path, what in perturb.items() if what}}
+        number = f"worst_{rank + 1:02d}"
+        out[number] = _job_text(data, int(s), setup)
+    return out
+
+
+def _perturb(motion: Any) -> dict[str, Any]:
+    """A motion as a job's file says it."""
+    out: dict[str, Any] = {}
+    for kind in ("rotate", "shift"):
+        values = [value if abs(value) > _NOTHING else 0.0 for value in getattr(motion, kind)]
+        if any(values):
+            out[kind] = [amount_text(value, kind) for value in values]
+    if any(motion.figure.values()):
+        out["figure"] = {f"Z{j}": amount_text(value, "figure") for j, value in motion.figure.items() if value}
+    for kind in ("radius", "conic", "index"):
+        if getattr(motion, kind):
+            out[kind] = amount_text(getattr(motion, kind), kind)
+    return out
+
+
+def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
+    from scenes.yaml.yaml_file import dump_yaml
+
+    try:
+        JobSpec.model_validate(data)
+    except (InputError, ValueError) as error:  # a motion larger than a job may say
+        return (
+            f"# Camera {number} of the tolerance budget cannot be said as a job: {' '.join(str(error).split())[:200]}\n"
+        )
+    head = f"# Camera {number} of the tolerance budget of {setup.test.instrument}, with its adjustments\n"
+    return head + dump_yaml(data)
+
+
+def merit_unit(merit: Merit) -> tuple[str, float]:
+    """Unit in which people read a merit, and its size in SI."""
+    unit = MERIT_UNITS[merit.spec.kind]
+    if unit is None:
+        return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
+    return ("um", 1e-6) if unit is LENGTH else ("arcsec", float(np.radians(1.0 / 3600.0)))
+
+
+def _shown(value: float, merit: Merit) -> float | None:
+    size = merit_unit(merit)[1]
+    return float(value / size) if np.isfinite(value) else None
+
+
+def _yield_plain(one: Yield) -> dict[str, Any]:
+    return {"share": one.share, "passed": one.passed, "of": one.of, "interval": [one.low, one.high]}
+
+
+def _merit_plain(one: MeritResult) -> dict[str, Any]:
+    merit = one.merit
+
+    def row(values: tuple[float, ...]) -> dict[str, float | None]:
+        return {f"p{100 * share:.0f}": _shown(value, merit) for share, value in zip(LEVELS, values, strict=True)}
+
+    return {
+        "kind": merit.spec.kind,
+        "unit": merit_unit(merit)[0],
+        "requirement": _shown(merit.spec.requirement, merit),
+        "probability": merit.spec.probability,
+        "nominal": _shown(one.nominal, merit),
+        "mean": _shown(one.mean, merit),
+        "std": _shown(one.deviation, merit),
+        "monte_carlo": row(one.levels),
+        "linear": row(one.linear),
+        "quadratic": row(one.quadratic),
+        "yield": _yield_plain(one.passing),
+        "yield_linear": one.model_passing[0],
+        "yield_quadratic": one.model_passing[1],
+        "judged": one.passing.judged(merit.spec.probability),
+        "variance_shares": dict(one.shares),
+    }
+
+
+def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
+    out = {}
+    bench = run.bench
+    for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
+        below, above = (
+            {m.name: _shown(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
+            for end in (0, 1)
+        )
+        share = run.inverse.shares[e]
+        out[name] = {
+            "motion": one.words,
+            "limit": one.limit,
+            "at_minus": below,
+            "at_plus": above,
+            "share_for_loss": {
+                m.name: (float(share[k]) if np.isfinite(share[k]) else None) for k, m in enumerate(bench.merits)
+            },
+        }
+        if run.allocation is not None:
+            out[name]["allocated"] = run.allocation.limits[name]
+    return out
+
+
+def _allocation_plain(run: ToleranceRun) -> dict[str, Any] | None:
+    found = run.allocation
+    if found is None or run.judged is None:
+        return None
+    return {
+        "reached": found.reached,
+        "cost_before": found.cost[0],
+        "cost_after": found.cost[1],
+        "yield_predicted_before": found.predicted[0],
+        "yield_predicted": found.predicted[1],
+        "yield": _yield_plain(run.judged),
+        "limits": dict(found.limits),
+    }
+
+
+def _moves_plain(run: ToleranceRun) -> dict[str, Any]:
+    out = {}
+    for c, number in enumerate(run.bench.compensators):
+        own = run.samples.moves[:, c]
+        own = own[np.isfinite(own)]
+        spread = float(np.std(own)) if len(own) else 0.0
+        largest = float(np.max(np.abs(own))) if len(own) else 0.0
+        out[number.name] = {
+            "motion": run.setup.test.compensators[number.name].motion,
+            "std": amount_text(spread, number.kind),
+            "largest": amount_text(largest, number.kind),
+        }
+    return out
+
+
+TOLERANCE: Record[ToleranceRun] = Record(
+    "tolerance.json: a tolerance budget.",
+    Quantity("instrument", lambda run: run.setup.test.instrument),
+    Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
+    Quantity("samples", lambda run: len(run.samples.problems), "cameras that were drawn"),
+    Quantity("lost", lambda run: sum(map(bool, run.samples.problems)), "cameras without light, which count as failed"),
+    Quantity("yield", lambda run: _yield_plain(run.passing), "share of cameras that meet all requirements"),
+    Quantity(
+        "merits",
+        lambda run: {one.merit.name: _merit_plain(one) for one in run.merits},
+        "each in its unit; p90 is the value that 90 % of the cameras keep",
+    ),
+    Quantity("tolerances", _tolerance_plain, "each at its limits, and the share of its limit that costs the loss"),
+    Quantity("compensators", _moves_plain, "how far they are moved"),
+    Quantity(
+        "losses",
+        lambda run: {m.name: _shown(float(run.inverse.losses[k]), m) for k, m in enumerate(run.bench.merits)},
+        "of the inverse limits",
+    ),
+    Quantity("allocation", _allocation_plain, "limits chosen anew", where_known=True),
+    Quantity("unsettled_waves", lambda run: float(np.nanmax(run.samples.settled)), "largest change of a further step"),
+)

@@ -1,0 +1,276 @@
+"""What varies in a tolerance budget: numbers, each a motion of bodies per unit, and the states that they add up to.
+
+Several numbers may move one body. Their rotation vectors and shifts add up, each turn about its own point, so that the
+order in which a file lists them does not matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from optics.geometry.pose import Pose, rotation_matrix, triple
+from optics.geometry.tree import Body, Motion, State
+from optics.geometry.zernike import noll_to_nm
+from optics.numerics.frozen_map import FrozenMap
+from optics.thermal.heat import Temperature
+from scenes.models.instrument_model import Instrument
+from scenes.models.thermal_model import TemperatureError, ThermalModel
+from scenes.specs.course import noll
+from scenes.specs.job import PlainPerturbationSpec, perturbation_issues
+from scenes.specs.motion_text import AXES, node_named
+from scenes.specs.tolerance import CompensatorSpec, ToleranceBudgetSpec, ToleranceSetup, ToleranceSpec, Varied
+from scenes.yaml.errors import InputError, KeyPath, Problem, shown
+
+HEAT = ("temperature", "gradient")
+SHAPE = ("scale", "stretch", "radius", "conic", "index")
+"""Numbers of a motion that are neither rigid nor a figure."""
+
+
+@dataclass(frozen=True, eq=False)
+class BodyMove:
+    """What one number does to one body, per SI unit, in the body's own frame.
+
+    Attributes:
+        rotate: rotation vector, (3,).
+        shift: (3,), metres.
+        pivot: point that the turn leaves in place, (3,), metres.
+        figure: Noll index -> metres of sag.
+        shape: name of ``SHAPE`` -> change.
+    """
+
+    rotate: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    shift: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    pivot: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    figure: FrozenMap[int, float] = field(default_factory=FrozenMap)
+    shape: FrozenMap[str, float] = field(default_factory=FrozenMap)
+
+
+@dataclass(frozen=True, eq=False)
+class VariedNumber:
+    """One number that varies.
+
+    Attributes:
+        name: of the entry of the file, with the term where it is one of a whole figure error.
+        entry: name of the entry.
+        kind: of the motion.
+        size: SI amount of one unit of it: the limit of a tolerance, 1 of a compensator; of a term of a figure error its
+            standard deviation.
+        moves: body -> what it does.
+    """
+
+    name: str
+    entry: str
+    kind: str
+    size: float
+    moves: FrozenMap[str, BodyMove]
+
+
+def tolerance_numbers(setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel) -> tuple[VariedNumber, ...]:
+    """The numbers of all tolerances, in the order of the file; a figure error has one for each of its terms.
+
+    Raises:
+        InputError: a body that is not there, or that does not allow what a tolerance says.
+    """
+    maker = _Maker(setup.test, instrument, thermal)
+    out: list[VariedNumber] = []
+    for name, one in setup.test.tolerances.items():
+        out += maker.tolerance(name, one)
+    return tuple(out)
+
+
+def compensator_numbers(
+    setup: ToleranceSetup, instrument: Instrument, thermal: ThermalModel
+) -> tuple[VariedNumber, ...]:
+    """One number for each compensator, as ``tolerance_numbers``."""
+    maker = _Maker(setup.test, instrument, thermal)
+    return tuple(maker.compensator(name, one) for name, one in setup.test.compensators.items())
+
+
+@dataclass(frozen=True, eq=False)
+class _Maker:
+    """Makes numbers of entries."""
+
+    test: ToleranceBudgetSpec
+    instrument: Instrument
+    thermal: ThermalModel
+
+    def tolerance(self, name: str, one: ToleranceSpec) -> list[VariedNumber]:
+        key: KeyPath = ("tolerances", name)
+        kind = one.parts[1]
+        if not one.spectrum:
+            return [VariedNumber(name, name, kind, one.limit_si, self._moves(one, key, one.limit_si))]
+        body = self._node(one, one.parts[0], key)
+        sizes = one.limit_si * spectrum_shares(one.spectrum, one.power)
+        return [
+            VariedNumber(
+                f"{name} Z{j}", name, kind, float(size), FrozenMap({body: BodyMove(figure=FrozenMap({j: 1.0}))})
+            )
+            for j, size in zip(one.spectrum, sizes, strict=True)
+        ]
+
+    def compensator(self, name: str, one: CompensatorSpec) -> VariedNumber:
+        moves = self._moves(one, ("compensators", name), one.range_si or 1.0)
+        return VariedNumber(name, name, one.parts[1], 1.0, moves)
+
+    def _node(self, one: Varied, name: str, key: KeyPath) -> str:
+        """Path of a body that allows the motion. Raises InputError."""
+        try:
+            body = node_named(name, self.instrument.nodes)
+        except Problem as problem:
+            raise self.test.error(problem, (*key, "motion" if name == one.parts[0] else "carrying")) from None
+        _, kind, axis, _, pivot = one.parts
+        does: dict[str, Any] = {} if kind in HEAT else {kind: 1.0}
+        if kind in ("shift", "rotate"):
+            does = {kind: tuple(float(k == AXES[axis]) for k in range(3))}
+        elif kind == "figure":
+            does = {kind: FrozenMap({axis: 1.0})}
+        if pivot:
+            does["pivot"] = pivot
+        what = PlainPerturbationSpec.model_construct(**does)
+        issues = perturbation_issues(self.test, self.instrument.nodes, body, what, key)
+        if issues:
+            raise InputError(*issues)
+        if kind in HEAT and "temperature" not in self.instrument.nodes[body].allows:
+            raise self.test.error("this node does not allow temperature", (*key, "motion"), found=one.motion)
+        return body
+
+    def _moves(self, one: Varied, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
+        name, kind, axis, _, pivot = one.parts
+        body = self._node(one, name, key)
+        if kind in HEAT:
+            return self._heat(body, kind, axis, key, limit)
+        if kind == "figure":
+            return FrozenMap({body: BodyMove(figure=FrozenMap({noll(axis): 1.0}))})
+        if kind not in ("shift", "rotate"):
+            about = np.array(self._body(body).pivots[pivot or "origin"])
+            shift = -about if kind == "scale" else np.zeros(3)
+            return FrozenMap({body: BodyMove(shift=shift, shape=FrozenMap({kind: 1.0}))})
+        bodies = [body, *(self._node(one, other, key) for other in one.carrying)]
+        for other in bodies:
+            above = next((path for path in bodies if other.startswith(f"{path}/")), None)
+            if above is not None or bodies.count(other) > 1:
+                problem = f"{other} is carried already" if above is None else f"{other} moves with {above} already"
+                raise self.test.error(problem, (*key, "carrying"), found=shown(list(one.carrying)))
+        first = self.instrument.assembly.nominal_pose(body)
+        way = first.rotation[:, AXES[axis]]
+        point = first.apply(np.array(self._body(body).pivots[pivot or "origin"]))
+        return FrozenMap(
+            {path: _rigid(self.instrument.assembly.nominal_pose(path), kind, way, point) for path in bodies}
+        )
+
+    def _body(self, path: str) -> Body:
+        return self.instrument.assembly.tree[path]
+
+    def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
+        """What a change of temperature does, taken between none and the limit."""
+        if kind == "temperature":
+            heat = Temperature(limit)
+        else:
+            heat = Temperature(0.0, triple(limit * np.eye(3)[AXES[axis]]))
+        try:
+            self.thermal.check({body: heat})
+            state = self.thermal.state({body: heat})
+        except TemperatureError as error:
+            raise self.test.error(str(error), (*key, "limit"), allowed=error.allowed) from error
+        return FrozenMap({path: self._per_unit(path, motion, limit) for path, motion in state.items()})
+
+    def _per_unit(self, path: str, motion: Motion, amount: float) -> BodyMove:
+        about = np.array(self._body(path).pivots[motion.pivot])
+        growth = (1.0 + motion.scale) * (1.0 + motion.stretch) - 1.0
+        turned = rotation_matrix(np.array(motion.rotate))
+        shift = about + np.array(motion.shift) - (1.0 + growth) * turned @ about
+        return BodyMove(
+            rotate=np.array(motion.rotate) / amount,
+            shift=shift / amount,
+            figure=FrozenMap({j: a / amount for j, a in motion.figure.items()}),
+            shape=FrozenMap({name: getattr(motion, name) / amount for name in SHAPE if getattr(motion, name)}),
+        )
+
+
+def _rigid(pose: Pose, kind: str, way: np.ndarray, point: np.ndarray) -> BodyMove:
+    """A motion along or about a direction of the world (3,), about a point (3,), in a body's own frame."""
+    own = pose.rotation.T @ way
+    if kind == "shift":
+        return BodyMove(shift=own)
+    return BodyMove(rotate=own, pivot=pose.inverse().apply(point))
+
+
+def spectrum_shares(terms: Sequence[int], power: float) -> np.ndarray:
+    """Standard deviation of each term of a figure error whose rms is 1, (T,).
+
+    The variance of a term falls with the power of its radial order n, as (n + 1)^-power.
+
+    Args:
+        terms: Noll's numbers.
+        power: of the radial order.
+    """
+    order = np.array([noll_to_nm(j)[0] for j in terms])
+    variance = (order + 1.0) ** -power
+    return np.asarray(np.sqrt(variance / np.sum(variance)))
+
+
+def states_of(numbers: Sequence[VariedNumber], amounts: np.ndarray) -> list[State]:
+    """The states that numbers add up to.
+
+    Args:
+        numbers: K of them.
+        amounts: SI, (S, K).
+
+    Returns:
+        S states; bodies that nothing moves in any of them are left out.
+    """
+    count = len(amounts)
+    bodies = tuple(dict.fromkeys(path for number in numbers for path in number.moves))
+    made: dict[str, list[Motion]] = {}
+    for path in bodies:
+        rotate, offset = np.zeros((count, 3)), np.zeros((count, 3))
+        turns: dict[tuple[float, float, float], np.ndarray] = {}
+        figure: dict[int, np.ndarray] = {}
+        shape: dict[str, np.ndarray] = {}
+        for k, number in enumerate(numbers):
+            move = number.moves.get(path)
+            if move is None:
+                continue
+            own = amounts[:, k]
+            offset += np.outer(own, move.shift)
+            if np.any(move.rotate):
+                turn = np.outer(own, move.rotate)
+                rotate += turn
+                about = triple(move.pivot)
+                turns[about] = turns.get(about, 0.0) + turn
+            for j, per in move.figure.items():
+                figure[j] = figure.get(j, 0.0) + per * own
+            for name, per in move.shape.items():
+                shape[name] = shape.get(name, 0.0) + per * own
+        for about, turn in turns.items():
+            point = np.array(about)
+            if np.any(point):
+                offset += point - np.einsum("sij,j->si", rotation_matrix(turn), point)
+        made[path] = _motions(count, rotate, offset, figure, shape)
+    return [FrozenMap({path: motions[s] for path, motions in made.items()}) for s in range(count)]
+
+
+def _motions(
+    count: int,
+    rotate: np.ndarray,
+    shift: np.ndarray,
+    figure: dict[int, np.ndarray],
+    shape: dict[str, np.ndarray],
+) -> list[Motion]:
+    """Motions of one body in S states."""
+    turns, shifts = rotate.tolist(), shift.tolist()
+    figures = {j: values.tolist() for j, values in figure.items()}
+    shapes = {name: values.tolist() for name, values in shape.items()}
+    return [
+        Motion(
+            rotate=tuple(turns[s]),
+            shift=tuple(shifts[s]),
+            figure={j: values[s] for j, values in figures.items()},
+            **{name: values[s] for name, values in shapes.items()},
+        )
+        for s in range(count)
+    ]
