@@ -64,7 +64,8 @@ class PlainPerturbationSpec(Spec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        temperature: uniform change as `2 K`, or with a gradient.
+        temperature: uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that
+            carries it, also where the change is `0 K`; None for what it inherits.
     """
 
     rotate: Rotation = NO_MOTION
@@ -72,18 +73,31 @@ class PlainPerturbationSpec(Spec):
     pivot: Name = DEFAULT_PIVOT
     figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
     scale: ScaleChange = 0.0
-    temperature: job_tables.PlainTemperature = job_tables.TemperatureSpec()
+    temperature: job_tables.PlainTemperature | None = None
+
+    @property
+    def heat(self) -> job_tables.TemperatureSpec:
+        """Its own temperature; no change where none is given."""
+        return job_tables.TemperatureSpec() if self.temperature is None else self.temperature
 
     def uses(self) -> tuple[str, ...]:
-        """Which of rotate, shift, figure, scale and temperature do something."""
+        """Which of rotate, shift, figure, scale and temperature do something; a temperature that is given does, since
+        no change is another one than that of a warmed carrier.
+        """
         done = {
             "rotate": any(self.rotate),
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
             "scale": self.scale != 0.0,
-            "temperature": self.temperature.warms,
+            "temperature": self.temperature is not None,
         }
         return tuple(name for name, does in done.items() if does)
+
+    def needs(self) -> tuple[str, ...]:
+        """Which of these a node has to allow: all but a temperature that is no change, which a node without heat may
+        have as well.
+        """
+        return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
 
 
 class PerturbationSpec(PlainPerturbationSpec):
@@ -96,12 +110,18 @@ class PerturbationSpec(PlainPerturbationSpec):
         pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
         figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
         scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes.
+        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the
+            body inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
         deformation: the table of displaced nodes, or a mesh; None for none.
     """
 
-    temperature: job_tables.TableTemperature = job_tables.TableTemperatureSpec()
+    temperature: job_tables.TableTemperature | None = None
     deformation: job_tables.Deformation | None = None
+
+    @property
+    def heat(self) -> job_tables.TableTemperatureSpec:
+        """Its own temperature; no change where none is given."""
+        return job_tables.TableTemperatureSpec() if self.temperature is None else self.temperature
 
     @classmethod
     def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
@@ -111,7 +131,9 @@ class PerturbationSpec(PlainPerturbationSpec):
                 path: cls.model_construct(
                     **{
                         **dict(what),
-                        "temperature": job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
+                        "temperature": None
+                        if what.temperature is None
+                        else job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
                     }
                 )
                 for path, what in perturb.items()
@@ -271,7 +293,7 @@ class JobSpec(Spec):
 
     def fields(self, time: int | None = None) -> dict[str, Temperature]:
         """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
-        out = {path: what.temperature.linear for path, what in self.perturb.items() if "temperature" in what.uses()}
+        out = {path: what.heat.linear for path, what in self.perturb.items() if what.temperature is not None}
         if self.course is not None and time is not None:
             for path, added in self.course.fields(time).items():
                 out[path] = out.get(path, Temperature()) + added
@@ -302,8 +324,8 @@ def with_tables(job: JobSpec) -> JobSpec:
         update: dict[str, Any] = {}
         if what.deformation is not None:
             update["deformation"] = job_tables.checked(job, ("perturb", path, "deformation"), what.deformation)
-        if what.temperature.table is not None:
-            update["temperature"] = job_tables.checked(job, ("perturb", path, "temperature"), what.temperature)
+        if what.heat.table is not None:
+            update["temperature"] = job_tables.checked(job, ("perturb", path, "temperature"), what.heat)
         if update:
             changed[path] = what.model_copy(update=update)
     whole: dict[str, Any] = {"perturb": FrozenMap({**job.perturb, **changed})} if changed else {}
@@ -415,7 +437,7 @@ def perturbation_issues(
     if path not in nodes:
         return [_no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
-    for action in what.uses():
+    for action in what.needs():
         # nodes are displaced where a surface has a figure
         if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(_not_allowed(owner, info, action, (*key, action)))

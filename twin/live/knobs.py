@@ -189,10 +189,10 @@ def perturbation(
 
 
 def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
-    """What has no knob: tables of nodes and of temperatures."""
+    """What has no knob: tables of nodes and of temperatures, and that a body has a temperature of its own."""
     out = {key: value for key, value in what.items() if key not in (*ACTIONS, "pivot")}
     heat = what.get("temperature")
-    if isinstance(heat, Mapping) and "table" in heat:
+    if isinstance(heat, Mapping):
         out["temperature"] = {key: value for key, value in heat.items() if key not in ("change", "gradient")}
     return out
 

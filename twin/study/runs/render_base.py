@@ -398,7 +398,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "pivot": what.pivot,
         "figure": dict(what.figure),
         "scale": what.scale,
-        "temperature": {**dict(heat), "gradient": list(heat.gradient)},
+        "temperature": None if heat is None else {**dict(heat), "gradient": list(heat.gradient)},
         "deformation": what.deformation,
     }
 
@@ -410,7 +410,7 @@ def _copy(parts: Mapping[str, Any]) -> dict[str, Any]:
         "rotate": list(parts["rotate"]),
         "shift": list(parts["shift"]),
         "figure": dict(parts["figure"]),
-        "temperature": {**heat, "gradient": list(heat["gradient"])},
+        "temperature": None if heat is None else {**heat, "gradient": list(heat["gradient"])},
     }
 
 
@@ -429,7 +429,9 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         pivot=parts["pivot"],
         figure=FrozenMap(parts["figure"]),
         scale=parts["scale"],
-        temperature=TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
+        temperature=None
+        if heat is None
+        else TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
         deformation=parts["deformation"],
     )
 
