@@ -222,7 +222,8 @@ def test_names_of_cameras_are_none_of_instruments(name: str) -> None:
 @pytest.mark.parametrize(
     ("says", "problem"),
     [
-        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}}, "a course"),
+        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}},
+         "a course.*python -m twin.study"),
         ({"render": {"stray": True}}, "stray light"),
         ({"disturbances": {"file": "launch"}}, "sigmas on disturbances"),
     ],

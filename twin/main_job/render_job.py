@@ -206,6 +206,12 @@ def require_one_state(resolved: ResolvedJob) -> None:
     ):
         if asked:
             allowed = "without it: the job's one state, with image quality and targets; or an instrument with a monitor"
+            if key == ("course",):
+                allowed = (
+                    "a study, which works out every row of a table as a state, with image quality: factors such as "
+                    "`M2_z: {motion: M2 shift z, table: {file: course.csv, column: M2_z}}` and design: {kind: grid}, "
+                    "by python -m twin.study; or an instrument with a monitor"
+                )
             raise job.error(f"{what}, and {resolved.instrument.name} has none", key, allowed=allowed)
 
 

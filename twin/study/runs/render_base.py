@@ -76,6 +76,16 @@ def monitor_results(
     return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
 
 
+def true_results(
+    resolved: ResolvedJob, experiment: MonitorExperiment, state: State, frames: int, seed: int, truth: Truth
+) -> dict[str, Any]:
+    """``truth`` of an instrument without a monitor: contents of truth.json; arguments as of `monitor_results`."""
+    run = JobRun(
+        resolved=resolved, experiment=experiment, state=state, frames=frames, seed=seed, truth=truth, warnings=()
+    )
+    return {"truth": run.truth_dict()}
+
+
 @dataclass(frozen=True, eq=False)
 class MonitorRun:
     """One run.
@@ -140,17 +150,7 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
             return [Failure(one_line(error))]
         return [found for run in runs for found in _traced_together(experiment, [run])]
     return [
-        {
-            "truth": JobRun(
-                resolved=run.resolved,
-                experiment=experiment,
-                state=run.state,
-                frames=run.frames,
-                seed=run.seed,
-                truth=truth.at(slice(k, k + 1)),
-                warnings=(),
-            ).truth_dict()
-        }
+        true_results(run.resolved, experiment, run.state, run.frames, run.seed, truth.at(slice(k, k + 1)))
         for k, run in enumerate(runs)
     ]
 
