@@ -343,10 +343,12 @@ class NodeInfo:
     Attributes:
         pivots: names of its pivots.
         allows: which of "rotate", "shift", "figure", "scale" and "temperature".
+        cold: why it has no temperature, where that is not plain.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
     allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
+    cold: str = ""
 
     @property
     def known_pivots(self) -> tuple[str, ...]:
@@ -453,4 +455,5 @@ def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: Ke
 
 def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
     allowed = names_text(sorted(info.allows)) or "nothing"
-    return owner.issue(f"this node does not allow {action}", key, allowed=allowed)
+    why = f": {info.cold}" if action == "temperature" and info.cold else ""
+    return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)
