@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import twin
+from optics.geometry.tree import Motion
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, NodeInfo, checked_nodes
@@ -27,6 +28,7 @@ from twin.live.messages import AskedState
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import image_quality
+from twin.monitor.truth import trace_truth
 from twin.render import app as render_app
 from twin.study.runs.base_job import Run
 from twin.study.runs.render_base import RenderBase
@@ -344,3 +346,16 @@ def test_the_commands(tmp_path) -> None:
     assert again.exit_code == 0, again.stderr
     seen = json.loads((tmp_path / "again/optics.json").read_text("utf-8"))
     assert seen["perturbed"]["d_f_um"] == pytest.approx(told["perturbed"]["d_f_um"], rel=1e-9)
+
+
+def test_a_camera_that_images_upright_has_no_full_turn(backend) -> None:
+    """Its roll is half a turn, which rounding calls by either sign; a turn of its focal plane is told as it is."""
+    spec = InstrumentSpec.of_camera("korsch", "korsch")
+    built = build_instrument(spec, {"korsch": load_camera("korsch")}, backend)
+    small = 1e-5
+    states = [{"base/korsch/M2": Motion(shift=(0.0, 0.0, z))} for z in np.linspace(-6e-6, 6e-6, 25)]
+    turned = [{"base/korsch/focal_plane": Motion(rotate=(0.0, 0.0, sign * small))} for sign in (-1.0, 1.0)]
+    roll = trace_truth(built, backend, [*states, *turned]).vector("korsch")[:, 2]
+    assert np.all(np.abs(roll[:25]) < 1e-9)
+    np.testing.assert_allclose(np.abs(roll[25:]), small, rtol=0.1)
+    assert roll[25] == pytest.approx(-roll[26], rel=1e-3)
