@@ -100,6 +100,7 @@ from twin.study.runs.plan import Plan
 from twin.study.runs.setup import resolve_study
 from twin.study.runs.study_folder import StudyFolder
 from twin.study.study_files import write_data
+from twin.targets.band_light import BandPupils
 from twin.targets.target_images import View
 from twin.validation.checks.check import Check
 from twin.validation.checks.group import CheckGroup
@@ -524,7 +525,9 @@ def test_a_target(monkeypatch: pytest.MonkeyPatch) -> None:
     add(monkeypatch, TARGETS, "one_bar", one_bar)
     assert validate(JobSpec, parse_yaml(job)).render.target_images == ("star", "one_bar")
     assert json_schema("job")["$defs"]["RenderSpec"]["properties"]["images"]["items"]["enum"][-1] == "one_bar"
-    view = View(line_ccd(), circular_pupil(F_NUMBER), identity(), np.zeros(2), 1000, np.zeros(2), REGION)
+    ccd = line_ccd()
+    pupil = BandPupils.alike(circular_pupil(F_NUMBER), ccd.band)
+    view = View(ccd, pupil, identity(), np.zeros(2), 1000, np.zeros(2), REGION)
     image = view.image(registered(TARGETS)[2]["one_bar"](PITCH, REGION))
     # the optics take some light from the middle of the bar, and add nothing to its area
     assert bar_size(image) == (pytest.approx(BAR[0], rel=0.1), pytest.approx(BAR[1], rel=0.02))

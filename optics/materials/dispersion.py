@@ -60,6 +60,8 @@ class CatalogueGlass:
         formula: number of its dispersion formula.
         coefficients: of it, for micrometres.
         shortest, longest: between which it holds, metres.
+        expansion: linear thermal expansion, 1/K, mean of -30..70 C; None where the catalogue does not say it.
+        thermal: Schott's constants of dn/dT, D0, D1, D2, E0, E1 and Lambda_TK, likewise.
     """
 
     name: str
@@ -67,6 +69,8 @@ class CatalogueGlass:
     coefficients: tuple[float, ...]
     shortest: float
     longest: float
+    expansion: float | None = None
+    thermal: tuple[float, ...] | None = None
 
     def __call__(self, wavelength: float) -> float:
         """Index against air.

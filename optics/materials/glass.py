@@ -44,6 +44,26 @@ class ThermalDispersion:
     lambda_tk: float
     known: TemperatureRange = SCHOTT_RANGE
 
+    def change(self, index: float, wavelength_m: float, temperature_k: float) -> float:
+        """Change of the absolute index from 20 C to a temperature.
+
+        Args:
+            index: at 20 C.
+            wavelength_m: metres.
+            temperature_k: of the glass, kelvin; at which the formula holds, see ``known``.
+        """
+        t, w2 = temperature_k - REFERENCE_TEMPERATURE, (wavelength_m * 1e6) ** 2
+        polynomial = self.d0 * t + self.d1 * t**2 + self.d2 * t**3
+        polynomial += (self.e0 * t + self.e1 * t**2) / (w2 - self.lambda_tk**2)
+        return (index * index - 1.0) / (2.0 * index) * polynomial
+
+    def slope(self, index: float, wavelength_m: float, temperature_k: float) -> float:
+        """Derivative of ``change`` by the temperature, 1/K; arguments likewise."""
+        t, w2 = temperature_k - REFERENCE_TEMPERATURE, (wavelength_m * 1e6) ** 2
+        slope = self.d0 + 2.0 * self.d1 * t + 3.0 * self.d2 * t**2
+        slope += (self.e0 + 2.0 * self.e1 * t) / (w2 - self.lambda_tk**2)
+        return (index * index - 1.0) / (2.0 * index) * slope
+
 
 @dataclass(frozen=True)
 class Glass:
@@ -88,12 +108,9 @@ class Glass:
         n = sqrt(1.0 + sum(b * w2 / (w2 - c) for b, c in zip(self.b, self.c, strict=True)))
         if not 0.0 < temperature_k < float("inf"):
             raise UnphysicalError(f"{self.name}: a temperature must be above 0 K and finite, found {temperature_k} K")
-        t = temperature_k - REFERENCE_TEMPERATURE
-        if t == 0.0:
+        if temperature_k == REFERENCE_TEMPERATURE:
             return n
-        k = self._constants(temperature_k)
-        polynomial = k.d0 * t + k.d1 * t**2 + k.d2 * t**3 + (k.e0 * t + k.e1 * t**2) / (w2 - k.lambda_tk**2)
-        return n + (n * n - 1.0) / (2.0 * n) * polynomial
+        return n + self._constants(temperature_k).change(n, wavelength_m, temperature_k)
 
     def vacuum_index(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
         """Absolute refractive index, for glass in vacuum; arguments and errors as ``index``, wavelength in air."""
@@ -104,11 +121,7 @@ class Glass:
     def dn_dt(self, wavelength_m: float, temperature_k: float = REFERENCE_TEMPERATURE) -> float:
         """Derivative of the absolute index by temperature, 1/K; errors as ``index``."""
         n = self.index(wavelength_m)
-        k = self._constants(temperature_k)
-        t = temperature_k - REFERENCE_TEMPERATURE
-        w2 = (wavelength_m * 1e6) ** 2
-        slope = k.d0 + 2.0 * k.d1 * t + 3.0 * k.d2 * t**2 + (k.e0 + 2.0 * k.e1 * t) / (w2 - k.lambda_tk**2)
-        return (n * n - 1.0) / (2.0 * n) * slope
+        return self._constants(temperature_k).slope(n, wavelength_m, temperature_k)
 
     def _constants(self, temperature_k: float) -> ThermalDispersion:
         if self.thermal is None:
@@ -117,6 +130,36 @@ class Glass:
         if not known.holds(temperature_k, temperature_k):
             raise UnphysicalError(f"{self.name}: its index is known from {known.text}, not at {temperature_k:.6g} K")
         return self.thermal
+
+
+@dataclass(frozen=True)
+class WarmGlass:
+    """What heat does to the glass of a lens.
+
+    Attributes:
+        name: of the glass.
+        expansion: linear thermal expansion (CTE), 1/K.
+        known: temperatures at which expansion and index may be used.
+        index: at 20 C and the wavelength in question.
+        wavelength: metres.
+        thermal: dn/dT.
+    """
+
+    name: str
+    expansion: float
+    known: TemperatureRange
+    index: float
+    wavelength: float
+    thermal: ThermalDispersion
+
+    def change(self, start_k: float, end_k: float) -> float:
+        """Change of the absolute index from one temperature to another, kelvin."""
+        start, end = (self.thermal.change(self.index, self.wavelength, t) for t in (start_k, end_k))
+        return end - start
+
+    def slope(self, temperature_k: float) -> float:
+        """Derivative of the absolute index by temperature, 1/K."""
+        return self.thermal.slope(self.index, self.wavelength, temperature_k)
 
 
 def air_index(wavelength_m: float) -> float:

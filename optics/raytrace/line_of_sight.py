@@ -149,10 +149,13 @@ def line_change(sight: np.ndarray, position: np.ndarray, camera: np.ndarray) -> 
     """
     axis, roll, tangent = line_tangents(sight, position, camera)
     distance = inner(tangent, position) / np.sum(tangent**2, axis=-1)
+    rolled = roll[1:] - roll[0]
+    # a camera that images upright has a roll of half a turn, by either sign
+    rolled = rolled - 2.0 * np.pi * np.round(rolled / (2.0 * np.pi))
     return LineChange(
         d_alpha=np.arctan2(axis[1:, 0], axis[1:, 2]),
         d_beta=np.arctan2(-axis[1:, 1], np.hypot(axis[1:, 0], axis[1:, 2])),
-        d_gamma=roll[1:] - roll[0],
+        d_gamma=rolled,
         principal_distance=distance[1:],
         d_f=distance[1:] - distance[0],
         nominal_distance=float(distance[0]),

@@ -34,7 +34,7 @@ from scenes.lens.prescription import (
 from scenes.models.camera_model import LINE_AXIS, CameraModel, collimated, derive_camera, field_direction
 from scenes.specs.camera import CameraSpec
 from scenes.yaml.errors import InputError, Problem, printable
-from scenes.yaml.units import ANGLE, LENGTH, format_quantity, power_of_length
+from scenes.yaml.units import ANGLE, EXPANSION, LENGTH, format_quantity, power_of_length
 
 PITCH = 7e-6
 """Pitch of a line CCD's pixels where none is asked for, metres."""
@@ -283,7 +283,12 @@ def _behind(lens: Prescription, surface: LensSurface) -> dict[str, Any]:
     if isinstance(known, CatalogueGlass):
         ends = [format_quantity(w, LENGTH) for w in (known.shortest, known.longest)]
         coefficients = list(known.coefficients)
-        return {"glass": {"name": known.name, "formula": known.formula, "coefficients": coefficients, "range": ends}}
+        glass = {"name": known.name, "formula": known.formula, "coefficients": coefficients, "range": ends}
+        if known.expansion is not None:
+            glass["expansion"] = format_quantity(known.expansion, EXPANSION)
+        if known.thermal is not None:
+            glass["thermal"] = list(known.thermal)
+        return {"glass": glass}
     own = next((name for name, one in GLASSES.items() if one.index == known), None)
     return {"index": surface.index} if own is None else {"glass": own}
 

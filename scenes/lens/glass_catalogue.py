@@ -11,7 +11,10 @@ from pathlib import Path
 from optics.materials.dispersion import FORMULAS, CatalogueGlass
 from optics.materials.glass import GLASSES
 from optics.numerics.frozen_map import FrozenMap
-from scenes.lens.statements import Glasses, Source, glass_key, read_lines, statement_of
+from scenes.lens.statements import Glasses, Source, glass_key, is_number, read_lines, statement_of
+
+_CONSTANTS = 6
+"""Numbers of Schott's formula of dn/dT on a TD line; the seventh is the temperature of reference, 20 C."""
 
 
 def own_glasses() -> Glasses:
@@ -46,6 +49,8 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
     glasses: list[CatalogueGlass] = []
     name, formula, begun = "", 0, 0
     coefficients: tuple[float, ...] = ()
+    expansion: float | None = None
+    thermal: tuple[float, ...] | None = None
     for number, text in enumerate(read_lines(source, "a glass catalogue"), start=1):
         if (s := statement_of(number, text)) is None:
             continue
@@ -54,6 +59,7 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
                 if name:
                     raise source.error(f"{name} has no wavelengths (LD)", begun)
                 name, begun, coefficients = (s.words[0] if s.words else ""), number, ()
+                expansion = thermal = None
                 formula = source.whole(s, 1, "the dispersion formula", 0, 1000)
                 if formula not in FORMULAS:
                     known = ", ".join(f"{k} {title}" for k, (title, _) in FORMULAS.items())
@@ -61,11 +67,17 @@ def read_catalogue(path: str | Path) -> tuple[CatalogueGlass, ...]:
             case "CD" if name:
                 given = source.numbers(s, "a coefficient")
                 coefficients = tuple([*given, *[0.0] * 12][: max(12, len(given))])
+            case "ED" if name and s.words and is_number(s.words[0]):
+                # a zero stands for what the maker does not say
+                expansion = 1e-6 * source.finite(s, 0, "the expansion") or None
+            case "TD" if name and len(s.words) >= _CONSTANTS and all(is_number(word) for word in s.words):
+                constants = source.numbers(s, "a constant of dn/dT")[:_CONSTANTS]
+                thermal = constants if any(constants) else None
             case "LD" if name:
                 if not coefficients:
                     raise source.error(f"{name} has no coefficients (CD)", begun)
                 first, last = (source.finite(s, k, "the range") * 1e-6 for k in (0, 1))
-                glasses.append(CatalogueGlass(name, formula, coefficients, first, last))
+                glasses.append(CatalogueGlass(name, formula, coefficients, first, last, expansion, thermal))
                 name = ""
             case _:
                 pass

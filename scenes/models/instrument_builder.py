@@ -29,6 +29,7 @@ from scenes.models.camera_model import (
     derive_camera,
     focal_plane_body,
     glass_indices,
+    lenses,
     shape_changes,
 )
 from scenes.models.camera_sharpness import no_cameras
@@ -273,7 +274,7 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
     out = {}
     for body in assembly.tree.bodies:
         if body.path == BASE:
-            out[BASE] = NodeInfo(allows=frozenset(() if BASE in cold else ("temperature",)))
+            out[BASE] = NodeInfo(allows=frozenset(() if BASE in cold else ("temperature",)), cold=cold.get(BASE, ""))
             continue
         allows = {"rotate", "shift"}
         if body.path not in cold and not any(body.path.startswith(f"{solid.path}/") for solid in solids):
@@ -283,18 +284,27 @@ def _nodes(assembly: Assembly, cameras: Mapping[str, CameraModel], solids: tuple
         allows |= {*reshaped.get(body.path, ())}
         if body.path in roots:
             allows.add("scale")
-        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows))
+        out[body.path] = NodeInfo(tuple(body.pivots), frozenset(allows), cold.get(body.path, ""))
     return out
 
 
-def _without_heat(cameras: Mapping[str, CameraModel]) -> set[str]:
-    """Bodies of which nothing says what heat does to them: faces of lenses, whose index and expansion are not given,
-    planes that light passes, and what carries a lens.
+def _without_heat(cameras: Mapping[str, CameraModel]) -> dict[str, str]:
+    """Bodies that have no temperature of their own -> why: further faces of a lens, which has that of its first one,
+    planes that light passes, which are of the structure, lenses of which nothing says what heat does to them, and what
+    carries such a lens.
     """
-    out = set()
+    out: dict[str, str] = {}
     for name, model in cameras.items():
-        root = f"{BASE}/{name}"
-        out |= {f"{root}/{face}" for face, mirror in model.spec.mirrors.items() if mirror.light is not None}
-        if any(mirror.light == "refracts" for mirror in model.spec.mirrors.values()):
-            out |= {root, BASE}
+        root, faces = f"{BASE}/{name}", lenses(model.spec)
+        for face, mirror in model.spec.mirrors.items():
+            if mirror.light == "passes":
+                out[f"{root}/{face}"] = f"it is part of the structure, {root}"
+        for face, lens in faces.items():
+            if face != lens:
+                out[f"{root}/{face}"] = f"it is a face of the lens that {root}/{lens} stands for"
+                continue
+            try:
+                model.spec.warm_glass(lens)
+            except ValueError as error:
+                out |= dict.fromkeys((f"{root}/{lens}", root, BASE), f"{lens}: {error}")
     return out

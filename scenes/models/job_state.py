@@ -152,16 +152,16 @@ def _excesses(job: JobSpec, variance: Mapping[tuple[str, str], float]) -> Iterat
 
 def _components(what: PerturbationSpec) -> Iterator[tuple[str, str, float]]:
     """Kind, name and amount of all that is done to a body."""
-    vectors = {"shift": what.shift, "rotate": what.rotate, "gradient": what.temperature.gradient}
+    vectors = {"shift": what.shift, "rotate": what.rotate, "gradient": what.heat.gradient}
     for kind, vector in vectors.items():
         yield from ((kind, f"{kind} {axis}", value) for axis, value in zip("xyz", vector, strict=True) if value)
     yield from (("figure", f"figure {term}", value) for term, value in what.figure.items() if value)
     for kind in ("scale", "radius", "conic", "index"):
         if value := getattr(what, kind):
             yield kind, kind, value
-    if what.temperature.change:
-        yield "temperature", "temperature", what.temperature.change
-    if what.temperature.table is not None:
+    if what.heat.change:
+        yield "temperature", "temperature", what.heat.change
+    if what.heat.table is not None:
         yield "table", "temperatures at nodes", 0.0
     if what.deformation is not None:
         yield "table", "deformation", 0.0

@@ -277,7 +277,7 @@ def heated_bodies(job: JobSpec, thermal: ThermalModel) -> dict[str, HeatedBody]:
     Raises:
         InputError: a table that does not describe its body.
     """
-    named = {path: what.temperature for path, what in job.perturb.items() if what.temperature.table is not None}
+    named = {path: what.heat for path, what in job.perturb.items() if what.heat.table is not None}
     return {path: heated_body(thermal, job, path, spec) for path, spec in named.items()}
 
 

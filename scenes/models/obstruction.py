@@ -7,13 +7,14 @@ in which a body or the edge of a clear aperture takes a part of one is refused.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from optics.geometry.solid import solid_mesh
-from optics.geometry.tree import PlacedBodies
+from optics.geometry.tree import PlacedBodies, State
 from optics.numerics.backend import Backend
 from optics.numerics.quadrature import even_disk
 from optics.raytrace.aim import AimError, RayFan, aim, alive_along, transverse_axes
@@ -32,6 +33,7 @@ RAYS = 400
 """Rays in a beam, spread evenly over its cross-section: shares are good to about half a percent."""
 
 _TOUCHING = 1e-6  # length inside a body below which a ray only touches it, metres
+_TOUCHING_MOVED = 1e-3  # the same in a perturbed state, whose faces are not where flat meshes have them
 _AIM = 1e-6  # how well rays meet their places on a stop or face, metres
 _RINGS, _AROUND = 6, 24
 
@@ -82,8 +84,10 @@ def find_obstructions(instrument: Instrument, backend: Backend) -> tuple[Obstruc
     return tuple(found[name] for name in sorted(found))
 
 
-def rays_taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Which rays, segments (N, K, 2, 3), go through the body ``planes`` . (x, 1) <= 0, (F, 4); (N,)."""
+def rays_taken(segments: np.ndarray, planes: np.ndarray, touching: float = _TOUCHING) -> np.ndarray:
+    """Which rays, segments (N, K, 2, 3), go through the body ``planes`` . (x, 1) <= 0, (F, 4), for more than
+    ``touching`` metres; (N,).
+    """
     start, way = segments[:, :, 0], segments[:, :, 1] - segments[:, :, 0]
     height = start @ planes[:, :3].T + planes[:, 3]
     slope = way @ planes[:, :3].T
@@ -93,7 +97,7 @@ def rays_taken(segments: np.ndarray, planes: np.ndarray) -> np.ndarray:
     leave = np.min(np.where(slope > 0.0, at, 1.0), axis=-1, initial=1.0)
     beside = np.any((slope == 0.0) & (height >= 0.0), axis=-1)
     length = (leave - enter) * np.linalg.norm(way, axis=-1)
-    return np.asarray(np.any((length > _TOUCHING) & ~beside, axis=-1))
+    return np.asarray(np.any((length > touching) & ~beside, axis=-1))
 
 
 def _disk(rays: int = RAYS) -> np.ndarray:
@@ -169,26 +173,30 @@ class MonitorBeam:
         return self.segments[:, [medium != path for medium in self.inside]]
 
 
-def monitor_beams(instrument: Instrument, backend: Backend, points: np.ndarray) -> list[MonitorBeam]:
+def monitor_beams(
+    instrument: Instrument, backend: Backend, points: np.ndarray, state: State | None = None
+) -> list[MonitorBeam]:
     """Trace the beams of all channels.
 
     Args:
         instrument: the instrument.
         backend: where to trace.
         points: of the return faces that the rays meet, (N, 2), the faces' radius being 1.
+        state: of the instrument; as designed unless one is given.
 
     Raises:
         AimError: no such rays.
     """
-    assembly, channels, placed = instrument.assembly, instrument.channels, instrument.assembly.place()
+    states = [state or {}]
+    assembly, channels, placed = instrument.assembly, instrument.channels, instrument.assembly.place(states)
     radius = [assembly.elements[f"{c.key}/return_face"].aperture.inscribed for c in channels]  # type: ignore[union-attr]
     start = np.array([placed.pose(c.reticle_body).translation for c in channels])[:, None]
     guess = np.array([instrument.toward_optics(placed, c.camera)[0] for c in channels])[:, None]
-    systems = assemble(assembly, [f"{c.key}/outgoing" for c in channels], placed=placed)
+    systems = assemble(assembly, [f"{c.key}/outgoing" for c in channels], states, placed=placed)
     target = np.array(radius)[:, None, None] * points
     position, direction = _through(backend, systems, start, guess, target)
     chains = [assembly.sequences[f"{c.key}/monitor"] for c in channels]
-    systems = assemble(assembly, chains, placed=placed)
+    systems = assemble(assembly, chains, states, placed=placed)
     traced = trace(backend, systems, make_rays(backend, position, direction), keep=range(len(chains[0])))
     hits, valid = [traced.hit(k) for k in range(len(chains[0]))], traced.numpy()[3]
     out = []
@@ -215,13 +223,46 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
         problem = f"light of the monitor does not get to its return faces: {error}"
         choice = "a field, prisms and a pupil_offset with which the mirrors of both cameras carry the whole beam"
         raise MisplacedError(problem, ("monitor",), choice) from error
-    placed = instrument.assembly.place()
+    issues = [_cut(instrument, backend, beam) for beam in beams if not beam.valid.all()]
+    for beam, what, plate, taken in _standing_in(instrument, beams, instrument.assembly.place(), _TOUCHING):
+        text = f"{what} stands in the beam {beam.channel.key} and takes {_count(taken)}"
+        if plate is None:
+            where, choice = _way_out(instrument, beam.channel, what)
+        else:
+            where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
+            choice = "a size and place beside the beam"
+        issues.append(instrument.spec.issue(text, where, allowed=choice))
+    if issues:
+        raise InputError(*dict.fromkeys(issues))
+
+
+def moved_into_beams(instrument: Instrument, backend: Backend, state: State) -> tuple[str, ...]:
+    """What stands in beams of the monitor in a perturbed state, sentences without their end. Edges of clear apertures
+    cut the spots' light by themselves; bodies do not.
+    """
+    if not instrument.channels or not state:
+        return ()
+    try:
+        beams = monitor_beams(instrument, backend, _WHOLE, state)
+    except AimError:
+        return ()  # the spots themselves are lost, which is said with its cause
+    together: dict[tuple[str, str], np.ndarray] = {}
+    for beam, what, _, taken in _standing_in(instrument, beams, instrument.assembly.place([state]), _TOUCHING_MOVED):
+        # a baffle has several plates
+        together[beam.channel.key, what] = taken | together.get((beam.channel.key, what), False)
+    return tuple(
+        f"{key}: {what} has moved into the beam and would take {_count(taken)}; the spot is that of the whole beam"
+        for (key, what), taken in together.items()
+    )
+
+
+def _standing_in(
+    instrument: Instrument, beams: list[MonitorBeam], placed: PlacedBodies, touching: float
+) -> Iterator[tuple[MonitorBeam, str, Plate | None, np.ndarray]]:
+    """Beam, body or plate in words, the plate if it is one, and which of the beam's rays it takes, (N,)."""
     bodies = convex_bodies(instrument, placed)
     hulls = {path: ConvexHull(corners).equations for path, corners in bodies.items()}
-    issues = []
     for beam in beams:
-        if not beam.valid.all():
-            issues.append(_cut(instrument, backend, beam))
         camera = instrument.cameras[beam.channel.camera]
         within = len(camera.mirrors)  # segments inside the camera, on the way out and on the way back
         for path, planes in hulls.items():
@@ -234,19 +275,13 @@ def check_beams(instrument: Instrument, backend: Backend) -> None:
             near = np.all((low <= bodies[path].max(axis=0)) & (high >= bodies[path].min(axis=0)), axis=-1)
             if not near.any():
                 continue
-            taken = rays_taken(segments[:, near], planes)
+            taken = rays_taken(segments[:, near], planes, touching)
             if taken.any():
-                text = f"{path} stands in the beam {beam.channel.key} and takes {_count(taken)}"
-                where, choice = _way_out(instrument, beam.channel, path)
-                issues.append(instrument.spec.issue(text, where, allowed=choice))
+                yield beam, path, None, taken
         for plate in instrument.baffles:
             taken = _crossing(beam.segments, plate, placed)
             if taken.any():
-                text = f"a plate of {plate.name} stands in the beam {beam.channel.key} and takes {_count(taken)}"
-                where = ("baffles", plate.name) if plate.name in instrument.spec.baffles else ("baffles",)
-                issues.append(instrument.spec.issue(text, where, allowed="a size and place beside the beam"))
-    if issues:
-        raise InputError(*dict.fromkeys(issues))
+                yield beam, f"a plate of {plate.name}", plate, taken
 
 
 def _way_out(instrument: Instrument, channel: Channel, path: str) -> tuple[KeyPath, str]:

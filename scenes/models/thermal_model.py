@@ -4,12 +4,14 @@ A body without a temperature of its own has the field of the body that carries i
 (the pivot ``centre`` if there is one, else the origin) and expands freely about it; structures carry the mounts of
 what stands on them. Mirrors and prisms deform by a finite-element solution for a unit gradient along each axis, held
 at three points; the solution is linear, so that one factorisation serves all temperatures. Mirrors on a frame of the
-same material are one free body with it, whose exact deformation is known. Glass changes its index by dn/dT.
+same material are one free body with it, whose exact deformation is known. A lens is held at its middle and deforms as
+a free body (``scenes.models.lens_heat``). Glass changes its index by dn/dT.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +22,7 @@ from optics.geometry.pose import Pose, triple
 from optics.geometry.solid import Solid, solid_mesh
 from optics.geometry.surface import Surface
 from optics.geometry.tree import ORIGIN, Body, Motion, State, compose
-from optics.materials.glass import glass
+from optics.materials.glass import WarmGlass, glass
 from optics.materials.material import Material, TemperatureRange, material
 from optics.numerics.physical_error import PhysicalError
 from optics.thermal.deformation import Displaced, FaceChange, Formula, face_change
@@ -28,6 +30,7 @@ from optics.thermal.elastic_mesh import mirror_mesh, polyhedron_mesh
 from optics.thermal.heat import Temperature, carried_motion
 from optics.thermal.thermo_elastic import ElasticBody, Kinematic, free_linear_field
 from scenes.models.instrument_model import Instrument
+from scenes.models.lens_heat import Lens, lenses_of
 from scenes.models.meshes import THICKNESS, behind
 from scenes.specs.instrument import BASE
 
@@ -76,7 +79,11 @@ class ThermalModel:
             f"{BASE}/{name}/{mirror}": (name, mirror)
             for name, model in instrument.cameras.items()
             for mirror in model.mirrors
+            if model.spec.mirrors[mirror].light is None
         }
+        every = (lens for name, model in instrument.cameras.items() for lens in lenses_of(name, model, self._bodies))
+        self.lenses: dict[str, Lens] = {lens.path: lens for lens in every}
+        self._lens_of = {face: lens for lens in self.lenses.values() for face in lens.faces}
         self._carried: dict[str, list[Body]] = {path: [] for path in self._bodies}
         for body in instrument.assembly.tree.bodies:
             if body.parent:
@@ -85,13 +92,19 @@ class ThermalModel:
         self._extents: dict[str, np.ndarray] = {}
 
     @cached_property
-    def materials(self) -> Mapping[str, Material]:
-        """Body path -> what it is made of, for all bodies but the faces of solids."""
+    def materials(self) -> Mapping[str, Material | WarmGlass]:
+        """Body path -> what it is made of, for all bodies but the faces of solids and lenses of which nothing says what
+        heat does to them.
+        """
         named = self.instrument.spec.materials
-        out: dict[str, Material] = {}
+        out: dict[str, Material | WarmGlass] = {}
         for path in self._bodies:
             parts = path.split("/")
             if self._owner(path) not in (None, path):
+                continue
+            if path in self.lenses:
+                if (own := self.lenses[path].glass) is not None:
+                    out[path] = own
                 continue
             if path in self.solids:
                 name = self.solids[path].material
@@ -105,7 +118,11 @@ class ThermalModel:
         return out
 
     def _owner(self, path: str) -> str | None:
-        """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are."""
+        """The solid that a body belongs to, itself or a parent: the outermost, whose pieces the others are; of a lens's
+        face the first face, which stands for the lens.
+        """
+        if path in self._lens_of:
+            return self._lens_of[path].path
         return next((p for p in reversed(list(_upward(path))) if p in self.solids), None)
 
     def _pieces(self, path: str) -> list[Solid]:
@@ -120,6 +137,9 @@ class ThermalModel:
                 out[path] = temperatures[path]
             elif body.parent in out:
                 out[path] = out[body.parent].seen_from(body.pose)
+        for lens in self.lenses.values():
+            if lens.path in out:
+                out.update({face: out[lens.path].seen_from(pose) for face, pose in lens.faces.items()})
         return out
 
     def check(self, temperatures: Mapping[str, Temperature]) -> None:
@@ -129,15 +149,20 @@ class ThermalModel:
             TemperatureError: names the body.
         """
         for path, field in self.fields(temperatures).items():
-            origin = next(p for p in _upward(path) if p in temperatures)
             if self._owner(path) not in (None, path):
                 continue
+            origin = next(p for p in _upward(path) if p in temperatures)
             if not self.coldest(path, field) > 0.0:
                 raise TemperatureError(
                     f"{path} would be at {self.coldest(path, field):.4g} K, which is not above absolute zero",
                     origin,
                     f"changes from the instrument's {self.reference:.6g} K that stay above 0 K everywhere on the body",
                 )
+            if path in self.lenses and self.lenses[path].unknown and field != Temperature():
+                remedy = (
+                    "what a catalogue of glasses says of it in the camera's file, or `temperature: 0 K` of this lens"
+                )
+                raise TemperatureError(f"{path}: {self.lenses[path].unknown}", origin, remedy)
             self._check_known(path, field, origin)
             if path in self.solids and self.solids[path].transparent:
                 try:
@@ -146,8 +171,10 @@ class ThermalModel:
                     raise TemperatureError(f"{path}: {error}", origin, "a glass with known dn/dT") from error
 
     def _check_known(self, path: str, field: Temperature, origin: str) -> None:
+        if field == Temperature():
+            return
         coldest, hottest, known = self.coldest(path, field), self.hottest(path, field), self.known(path)
-        if field != Temperature() and not known.holds(coldest, hottest):
+        if not known.holds(coldest, hottest):
             reached = coldest if coldest < known.coldest else hottest
             raise TemperatureError(
                 f"{path} would be at {reached:.6g} K, where the expansion of {self.materials[path].name} is not known",
@@ -185,6 +212,9 @@ class ThermalModel:
                 points = np.concatenate([own.apply(self._placed.pose(name).apply(mesh)) for name, mesh in meshes])
             elif path in self.mirrors:
                 points = self._mirror_outline(path)
+            elif path in self.lenses:
+                faces = self.lenses[path].faces
+                points = np.concatenate([pose.apply(self._mirror_outline(face)) for face, pose in faces.items()])
             else:
                 points = np.zeros((1, 3))
             self._extents[path] = np.asarray(points, np.float64)
@@ -212,6 +242,8 @@ class ThermalModel:
 
     def _warmed(self, path: str, field: Temperature, progress: Callable[[str], None]) -> State:
         """What a body's field does to the body itself, to its faces and to what it carries."""
+        if path in self.lenses:
+            return self._warmed_lens(self.lenses[path], field, progress)
         body, stuff = self._bodies[path], self.materials[path]
         pivot = _mount(body)
         about = np.array(body.pivots[pivot])
@@ -230,6 +262,13 @@ class ThermalModel:
             bending = {face: _superposed(units, gradient) for face, units in self._response(path, progress).items()}
             return compose(bending, out, self._bodies)
         for child in self._carried[path]:
+            if child.path in self._lens_of:
+                if child.path in self.lenses:
+                    lens = self.lenses[child.path]
+                    out.update(
+                        lens.carried(*carried_motion(stuff.expansion, gradient, lens.mount - about), own.stretch)
+                    )
+                continue
             mount = np.array(child.pivots[_mount(child)])
             turn, move = carried_motion(stuff.expansion, gradient, child.pose.apply(mount) - about)
             inward = child.pose.rotation.T
@@ -238,6 +277,18 @@ class ThermalModel:
             if np.any(turn) or np.any(shift):
                 out[child.path] = Motion(rotate=triple(inward @ turn), shift=triple(shift), pivot=_mount(child))
         return out
+
+    def _warmed_lens(self, lens: Lens, field: Temperature, progress: Callable[[str], None]) -> State:
+        """What a lens's field does to its faces and to its index."""
+        assert lens.glass is not None
+        here, gradient = self.reference + field.change, np.array(field.gradient)
+        out: State = lens.grown(lens.glass.expansion * field.at(lens.middle))
+        index = lens.glass.change(self.reference, here), triple(lens.glass.slope(here) * gradient)
+        out = {**out, lens.path: replace(out[lens.path], index=index[0], index_gradient=index[1])}
+        if not np.any(gradient) or lens.glass.expansion == 0.0:
+            return out
+        bending = {face: _superposed(units, gradient) for face, units in self._response(lens.path, progress).items()}
+        return compose(bending, out, self._bodies)
 
     def _index(self, path: str, field: Temperature) -> tuple[float, tuple[float, float, float]]:
         """Change of index at a solid's origin, and its gradient, 1/m."""
@@ -279,8 +330,9 @@ class ThermalModel:
     def faces_of(self, path: str) -> Mapping[str, tuple[Aperture, Pose]]:
         """Body of an optical face -> its aperture and its nominal place in the frame of a mirror or a solid."""
         if path in self.mirrors:
-            camera, name = self.mirrors[path]
-            return {path: (self.instrument.cameras[camera].apertures[name], Pose())}
+            return {path: (self._aperture(path), Pose())}
+        if path in self.lenses:
+            return {face: (self._aperture(face), pose) for face, pose in self.lenses[path].faces.items()}
         return {
             element.body: (element.aperture, self._placed.pose(path).inverse() @ self._placed.pose(element.body))
             for element in self.instrument.assembly.elements.values()
@@ -311,7 +363,7 @@ class ThermalModel:
             radius = 0.25 * float(min(high[:2] - low[:2]))
             support = np.array([[x + radius * c, y + radius * s, back] for c, s in _THREE])
             mesh = mirror_mesh(surface, aperture, thickness, side, cells)
-            return ElasticBody(mesh, self.materials[path]), Kinematic(support)
+            return ElasticBody(mesh, self._elastic_material(path)), Kinematic(support)
         if path not in self.solids or len(self._pieces(path)) > 1:
             return None
         corners = solid_mesh(self.solids[path], self._placed).mesh.vertices
@@ -321,7 +373,12 @@ class ThermalModel:
         a, b = np.argsort(half)[:0:-1][:2]
         arms = np.array([0.5 * half[a] * np.eye(3)[a] * c + 0.5 * half[b] * np.eye(3)[b] * s for c, s in _THREE])
         support = middle + _within(corners, middle, arms) * arms
-        return ElasticBody(polyhedron_mesh(corners, spacing), self.materials[path]), Kinematic(support)
+        return ElasticBody(polyhedron_mesh(corners, spacing), self._elastic_material(path)), Kinematic(support)
+
+    def _elastic_material(self, path: str) -> Material:
+        stuff = self.materials[path]
+        assert isinstance(stuff, Material)
+        return stuff
 
     def unit_displacements(self, path: str) -> Sequence[Displaced]:
         """Displacements of the material of a mirror or a solid, in its frame, by a gradient of 1 K/m along x, y and z
@@ -339,6 +396,8 @@ class ThermalModel:
     def _free(self, path: str, axis: int) -> Formula:
         """A body that nothing holds, in a gradient of 1 K/m: it stays and does not turn where its mount is."""
         about = self._bodies[path].pivots[_mount(self._bodies[path])]
+        if path in self.lenses:
+            about = triple(self.lenses[path].middle)
         return Formula(free_linear_field(self.materials[path].expansion, 0.0, np.eye(3)[axis], about))
 
     def changes(self, path: str, displaced: Displaced, terms: int = TERMS) -> dict[str, FaceChange]:
@@ -354,8 +413,13 @@ class ThermalModel:
             for face, (aperture, pose) in self.faces_of(path).items()
         }
 
+    def _aperture(self, path: str) -> Aperture:
+        """Clear aperture of a mirror or a face of a lens."""
+        _, camera, name = path.split("/")
+        return self.instrument.cameras[camera].apertures[name]
+
     def _mirror_outline(self, path: str) -> np.ndarray:
-        camera, name = self.mirrors[path]
+        _, camera, name = path.split("/")
         model = self.instrument.cameras[camera]
         xy = model.apertures[name].outline()
         return np.column_stack([xy, model.surfaces[name].sag(xy[:, 0], xy[:, 1])])

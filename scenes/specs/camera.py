@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from optics.geometry.sag_terms import SagTerm
+from optics.materials.glass import WarmGlass
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS
 from scenes.specs import instrument as instruments
@@ -480,6 +481,20 @@ class CameraSpec(TitledSpec):
         if mirror.enters_glass and colour != self.wavelength:
             raise ValueError(f"{name}: its index is known at the design wavelength alone; name its glass")
         return mirror.index
+
+    def warm_glass(self, name: str) -> WarmGlass:
+        """What heat does to the glass behind a face where light enters a lens, at the design wavelength.
+
+        Raises:
+            ValueError: nothing says it.
+        """
+        mirror = self.mirrors[name]
+        if mirror.glass is None:
+            raise ValueError(
+                f"the index of {name} alone says nothing of heat; name its glass, with `expansion` and `thermal` where "
+                "no catalogue has them"
+            )
+        return mirror.glass.warm(self.wavelength, self.medium or "vacuum")
 
     @property
     def light(self) -> SpectrumSpec | None:

@@ -54,7 +54,7 @@ class CameraUnderTestSpec(Spec):
     @model_validator(mode="after")
     def _cold(self) -> "CameraUnderTestSpec":
         for path, what in self.as_built.items():
-            if "temperature" in what.uses():
+            if "temperature" in what.needs():
                 problem, within = "temperatures are not modelled in the laboratory", ("as_built", path, "temperature")
                 raise Problem(problem, "temperature", "rotate, shift, scale or figure", within=within)
         return self

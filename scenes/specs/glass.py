@@ -7,12 +7,18 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from optics.materials.dispersion import FORMULAS, CatalogueGlass
-from optics.materials.glass import GLASSES, air_index, glass
+from optics.materials.glass import GLASSES, SCHOTT_RANGE, ThermalDispersion, WarmGlass, air_index, glass
+from optics.materials.material import MATERIALS, TemperatureRange
+from optics.numerics.physical_error import UnphysicalError
 from scenes.specs.spectrum import WavelengthRange
 from scenes.yaml.errors import Problem, unknown
+from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Number, Spec, Text, Whole, short_for
+from scenes.yaml.units import EXPANSION
 
 Medium = Literal["vacuum", "air"]
+CATALOGUE_RANGE = TemperatureRange.celsius(-30.0, 70.0, "AGF catalogues state the mean expansion of that range")
+"""Where an expansion of a camera's file may be used."""
 
 
 class LensGlassSpec(Spec):
@@ -23,12 +29,18 @@ class LensGlassSpec(Spec):
         formula: number of the dispersion formula as AGF catalogues have it (1 Schott, 2 Sellmeier 1, ...).
         coefficients: of it, for micrometres, in the catalogue's order; for Sellmeier's B1, C1, B2, C2, B3, C3.
         range: wavelengths between which it holds, metres.
+        expansion: linear, 1/K, mean of -30..70 C as the ED line of AGF catalogues has it; that of the twin's material
+            of the same name when left out, else unknown, and the lens is not warmed.
+        thermal: Schott's constants D0, D1, D2, E0, E1 and Lambda_TK of dn/dT, in the units of data sheets, as the TD
+            line of AGF catalogues has them; those of the catalogue when left out, else unknown.
     """
 
     name: Text
     formula: Annotated[Whole, Field(ge=1, le=max(FORMULAS))] | None = None
     coefficients: Annotated[tuple[Number, ...], Field(min_length=1, max_length=12)] | None = None
     range: WavelengthRange | None = None
+    expansion: Annotated[float, Quantity(EXPANSION, largest="1000 ppm/K")] | None = None
+    thermal: Annotated[tuple[Number, ...], Field(min_length=6, max_length=6)] | None = None
 
     @model_validator(mode="after")
     def _is_known(self) -> LensGlassSpec:
@@ -46,7 +58,8 @@ class LensGlassSpec(Spec):
     def _short(self, handler: SerializerFunctionWrapHandler) -> Any:
         """A glass of the catalogue is written as its name."""
         full = handler(self)
-        return full if self.formula is not None else self.name
+        plain = all(getattr(self, key) is None for key in type(self).model_fields if key != "name")
+        return self.name if plain else full
 
     def index(self, wavelength: float, medium: Medium) -> float:
         """Refractive index at 20 C.
@@ -63,6 +76,42 @@ class LensGlassSpec(Spec):
             return own.index(wavelength) if medium == "air" else own.vacuum_index(wavelength)
         n = CatalogueGlass(self.name, self.formula, self._filled(self.coefficients), *self.range)(wavelength)
         return n if medium == "air" else n * air_index(wavelength)
+
+    def warm(self, wavelength: float, medium: Medium) -> WarmGlass:
+        """What heat does to the glass in light of a wavelength, metres.
+
+        Args:
+            wavelength: metres.
+            medium: as of ``index``. What the lens stands in is not warmed.
+
+        Raises:
+            ValueError: neither the catalogue nor the file says how it expands, or how its index changes.
+        """
+        own = None if self.formula is not None else glass(self.name)
+        stuff = None if own is None else MATERIALS.get(own.name)
+        if self.expansion is None and stuff is None:
+            raise UnphysicalError(
+                f"nothing says how {self.name} expands; its glass has to say `expansion: 8.2 ppm/K`, the first number "
+                "of ED in its AGF catalogue"
+            )
+        thermal = own.thermal if own is not None else None
+        if self.thermal is not None:
+            d0, d1, d2, e0, e1, lambda_tk = self.thermal
+            thermal = ThermalDispersion(d0, d1, d2, e0, e1, lambda_tk)
+        if thermal is None:
+            raise UnphysicalError(
+                f"nothing says how the index of {self.name} changes with temperature; its glass has to say `thermal: "
+                "[D0, D1, D2, E0, E1, Lambda_TK]`, the first six numbers of TD in its AGF catalogue"
+            )
+        if self.expansion is not None:
+            expansion, stated = self.expansion, CATALOGUE_RANGE
+        else:
+            assert stuff is not None
+            expansion, stated = stuff.expansion, stuff.known
+        low, high = max(stated.coldest, SCHOTT_RANGE.coldest), min(stated.hottest, SCHOTT_RANGE.hottest)
+        source = stated.source if (low, high) == (stated.coldest, stated.hottest) else SCHOTT_RANGE.source
+        known = TemperatureRange(low, high, source)
+        return WarmGlass(self.name, expansion, known, self.index(wavelength, medium), wavelength, thermal)
 
     @staticmethod
     def _filled(coefficients: tuple[float, ...]) -> tuple[float, ...]:

@@ -81,7 +81,8 @@ class PlainPerturbationSpec(Spec):
         radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
         conic: change of the conic constant, a pure number.
         index: change of the refractive index of the lens that begins at this face, a pure number.
-        temperature: uniform change as `2 K`, or with a gradient.
+        temperature: uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that
+            carries it, also where the change is `0 K`; None for what it inherits.
     """
 
     rotate: Rotation = NO_MOTION
@@ -92,18 +93,31 @@ class PlainPerturbationSpec(Spec):
     radius: RadiusChange | None = None
     conic: ConicChange | None = None
     index: IndexChange | None = None
-    temperature: job_tables.PlainTemperature = job_tables.TemperatureSpec()
+    temperature: job_tables.PlainTemperature | None = None
+
+    @property
+    def heat(self) -> job_tables.TemperatureSpec:
+        """Its own temperature; no change where none is given."""
+        return job_tables.TemperatureSpec() if self.temperature is None else self.temperature
 
     def uses(self) -> tuple[str, ...]:
-        """Which of ACTIONS do something."""
+        """Which of ACTIONS do something; a temperature that is given does, since no change is another one than that of
+        a warmed carrier.
+        """
         done = {
             "rotate": any(self.rotate),
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
             **{name: bool(getattr(self, name)) for name in ("scale", "radius", "conic", "index")},
-            "temperature": self.temperature.warms,
+            "temperature": self.temperature is not None,
         }
         return tuple(name for name, does in done.items() if does)
+
+    def needs(self) -> tuple[str, ...]:
+        """Which of these a node has to allow: all but a temperature that is no change, which a node without heat may
+        have as well.
+        """
+        return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
 
     def motion(self) -> Motion:
         """All of it but the temperature, as a state has it."""
@@ -133,12 +147,18 @@ class PerturbationSpec(PlainPerturbationSpec):
         radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
         conic: change of the conic constant, a pure number.
         index: change of the refractive index of the lens that begins at this face, a pure number.
-        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes.
+        temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the
+            body inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
         deformation: the table of displaced nodes, or a mesh; None for none.
     """
 
-    temperature: job_tables.TableTemperature = job_tables.TableTemperatureSpec()
+    temperature: job_tables.TableTemperature | None = None
     deformation: job_tables.Deformation | None = None
+
+    @property
+    def heat(self) -> job_tables.TableTemperatureSpec:
+        """Its own temperature; no change where none is given."""
+        return job_tables.TableTemperatureSpec() if self.temperature is None else self.temperature
 
     @classmethod
     def of(cls, perturb: Mapping[str, PlainPerturbationSpec]) -> "FrozenMap[str, PerturbationSpec]":
@@ -148,7 +168,9 @@ class PerturbationSpec(PlainPerturbationSpec):
                 path: cls.model_construct(
                     **{
                         **dict(what),
-                        "temperature": job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
+                        "temperature": None
+                        if what.temperature is None
+                        else job_tables.TableTemperatureSpec.model_construct(**dict(what.temperature)),
                     }
                 )
                 for path, what in perturb.items()
@@ -308,7 +330,7 @@ class JobSpec(Spec):
 
     def fields(self, time: int | None = None) -> dict[str, Temperature]:
         """Node path -> change of its temperature, of the perturbation and of the course at time number ``time``."""
-        out = {path: what.temperature.linear for path, what in self.perturb.items() if "temperature" in what.uses()}
+        out = {path: what.heat.linear for path, what in self.perturb.items() if what.temperature is not None}
         if self.course is not None and time is not None:
             for path, added in self.course.fields(time).items():
                 out[path] = out.get(path, Temperature()) + added
@@ -339,8 +361,8 @@ def with_tables(job: JobSpec) -> JobSpec:
         update: dict[str, Any] = {}
         if what.deformation is not None:
             update["deformation"] = job_tables.checked(job, ("perturb", path, "deformation"), what.deformation)
-        if what.temperature.table is not None:
-            update["temperature"] = job_tables.checked(job, ("perturb", path, "temperature"), what.temperature)
+        if what.heat.table is not None:
+            update["temperature"] = job_tables.checked(job, ("perturb", path, "temperature"), what.heat)
         if update:
             changed[path] = what.model_copy(update=update)
     whole: dict[str, Any] = {"perturb": FrozenMap({**job.perturb, **changed})} if changed else {}
@@ -358,10 +380,12 @@ class NodeInfo:
     Attributes:
         pivots: names of its pivots.
         allows: which of ACTIONS.
+        cold: why it has no temperature, where that is not plain.
     """
 
     pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
     allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
+    cold: str = ""
 
     @property
     def known_pivots(self) -> tuple[str, ...]:
@@ -452,7 +476,7 @@ def perturbation_issues(
     if path not in nodes:
         return [_no_such_node(owner, nodes, path, key)]
     info, issues = nodes[path], []
-    for action in what.uses():
+    for action in what.needs():
         # nodes are displaced where a surface has a figure
         if ("figure" if action == "deformation" else action) not in info.allows:
             issues.append(_not_allowed(owner, info, action, (*key, action)))
@@ -468,4 +492,5 @@ def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: Ke
 
 def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
     allowed = names_text(sorted(info.allows)) or "nothing"
-    return owner.issue(f"this node does not allow {action}", key, allowed=allowed)
+    why = f": {info.cold}" if action == "temperature" and info.cold else ""
+    return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)

@@ -28,7 +28,8 @@ HEAT_KEYS = ("table", "frame", "values", "unit", "field", "sha256")
 
 
 class TemperatureSpec(Spec):
-    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r.
+    """A change of a body's temperature, and of all it carries that has none of its own: change + gradient . r. It
+    stands in place of what the body would inherit, and no change does, too.
 
     Attributes:
         change: at the body's origin, kelvin.

@@ -57,7 +57,7 @@ def instrument_path(job: JobSpec) -> Path:
     Raises:
         InputError: there is none, said with the line of the job's file.
     """
-    return find_named(_folder_of_instrument(job.instrument), job.instrument, job, ("instrument",))
+    return find_named(_folder_of_instrument(job.instrument), job.instrument, job, ("instrument",), (CAMERAS,))
 
 
 def _folder_of_instrument(reference: str | Path) -> str:
@@ -81,7 +81,7 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
     Raises:
         InputError: as `load_job`.
     """
-    path, text = _read_named(_folder_of_instrument(name_or_path), name_or_path)
+    path, text = _read_named(_folder_of_instrument(name_or_path), name_or_path, (CAMERAS,))
     if isinstance(text.data, dict) and "mirrors" in text.data:
         camera = validate(CameraSpec, text)
         own = path.stem if path.parent == _folder(CAMERAS) else path.name
@@ -217,32 +217,51 @@ def load_named(model: type[SpecType], folder: str, name_or_path: str | Path) -> 
     return validate(model, _read_named(folder, name_or_path)[1])
 
 
-def _read_named(folder: str, name_or_path: str | Path) -> tuple[Path, YamlFile]:
-    """The file that a reference leads to, and what it says; arguments and errors as `load_named`."""
+def _read_named(folder: str, name_or_path: str | Path, others: tuple[str, ...] = ()) -> tuple[Path, YamlFile]:
+    """The file that a reference leads to, and what it says; arguments as of `find_named`, errors as `load_named`."""
     path = place_of(folder, name_or_path, Path())
     if path is None:
-        raise InputError(_no_such_name(folder, str(name_or_path)).at(""))
+        raise InputError(_no_such_name(str(name_or_path), folder, *others).at(""))
     return path, read_yaml(path)
 
 
-def _names_and_paths(folder: str) -> str:
-    names = (*library_names(folder), *([NONE] if folder == DISTURBANCES else []))
-    return f"{names_text(names)}, or the path of a .yaml file"
+def _names(folders: tuple[str, ...]) -> list[str]:
+    """All names in folders of the library, those of the first folder first."""
+    return list(dict.fromkeys(name for folder in folders for name in library_names(folder)))
 
 
-def _no_such_name(folder: str, name: str) -> Problem:
-    return unknown(f"no such name in {folder}", name, library_names(folder), allowed=_names_and_paths(folder))
+def _names_and_paths(folders: tuple[str, ...]) -> str:
+    first, *rest = (names_text((*library_names(f), *([NONE] if f == DISTURBANCES else []))) for f in folders)
+    others = "".join(f"; {f}: {names}" for f, names in zip(folders[1:], rest, strict=True))
+    return f"{first}{others}, or the path of a .yaml file"
 
 
-def find_named(folder: str, reference: str, owner: Spec, key: KeyPath) -> Path:
-    """The file that a specification refers to, or an InputError at the line of the reference."""
+def _no_such_name(name: str, *folders: str) -> Problem:
+    problem = f"no such name in {' or '.join(folders)}"
+    return unknown(problem, name, _names(folders), allowed=_names_and_paths(folders))
+
+
+def find_named(folder: str, reference: str, owner: Spec, key: KeyPath, others: tuple[str, ...] = ()) -> Path:
+    """The file that a specification refers to.
+
+    Args:
+        folder: of the library, for a name.
+        reference: a name there, or a path from the folder of the specification's file.
+        owner: the specification.
+        key: where it refers to it.
+        others: folders whose names may be meant by a name that is unknown, since they may stand here as well.
+
+    Raises:
+        InputError: there is no such file; with the line of the reference and the nearest name.
+    """
     file = owner.source.file
     path = place_of(folder, reference, Path(file).parent if file else Path())
+    folders = (folder, *others)
     if path is None:
-        raise owner.error(_no_such_name(folder, reference), key)
+        raise owner.error(_no_such_name(reference, *folders), key)
     if not is_file(path):
-        meant = nearest(path.stem, library_names(folder))
-        raise owner.error(unusable(path), key, allowed=_names_and_paths(folder), suggestion=meant)
+        meant = nearest(path.stem, _names(folders))
+        raise owner.error(unusable(path), key, allowed=_names_and_paths(folders), suggestion=meant)
     return path
 
 

@@ -78,8 +78,9 @@ PER_LENGTH3 = Kind("an inverse length cubed", "1/m^3", ("1/m^3", "1/mm^3"), "1e-
 PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"), "1e-3 1/m^5")
 PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
 TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
+EXPANSION = Kind("a thermal expansion", "1/K", ("ppm/K", "1/K"), "7.1 ppm/K", ("ppm/K", "1/K"))
 KINDS = (
-    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, MASS, TEMPERATURE, TEMPERATURE_GRADIENT),
+    *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, MASS, TEMPERATURE, TEMPERATURE_GRADIENT, EXPANSION),
     *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
 )
 
@@ -120,6 +121,8 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "mK": (Decimal("1e-3"), "K"),
     "K/m": (Decimal(1), "K/m"),
     "mK/m": (Decimal("1e-3"), "K/m"),
+    "1/K": (Decimal(1), "1/K"),
+    "ppm/K": (Decimal("1e-6"), "1/K"),
     "1/m": (Decimal(1), "1/m"),
     "1/mm": (Decimal(1000), "1/m"),
     "1/m^2": (Decimal(1), "1/m**2"),

@@ -132,6 +132,13 @@ NODE = "  base/forward/M2: "
         ),
         ("perturb: {}", 1, ["'instrument' is missing"]),
         ("instrument: gf7_pear", 1, ["instrument: no such name in instruments", "did you mean 'gf7_pair'?"]),
+        # a camera is an instrument, by its name as well
+        (
+            "instrument: ritchey_cretien",
+            1,
+            ["no such name in instruments or cameras", "did you mean 'ritchey_chretien'?"],
+        ),
+        ("instrument: {camera: korsh}", 1, ["cameras: cassegrain, ", "did you mean 'korsch'?"]),
         ("\ninstrument: own/camera.yaml", 2, ["instrument: no such file", "own/camera.yaml"]),
         ("instrument: 3", 1, ["instrument: not text"]),
         ("instrument: gf7_pair\nperturbe: {}", 2, ["perturbe: unknown key", "did you mean 'perturb'?"]),

@@ -412,6 +412,32 @@ def test_temperatures_in_yaml_read_back_bit_for_bit(tmp_path) -> None:
     assert resolve(tmp_path / "config.yaml") == resolved
 
 
+@pytest.mark.parametrize("own", ["0 K", "{change: 0 K}", "{gradient: [0 K/m, 0 K/m, 0 K/m]}"])
+def test_no_change_is_a_temperature_of_its_own(own: str, one_material, tmp_path) -> None:
+    """A mirror that its warmed camera carries stays as large as it was, and only its mount is carried along."""
+    nodes = "  base/forward: {temperature: 2 K}\n  base/forward/M1: "
+    held = checked_nodes(
+        load_job(written(tmp_path, HEAD + nodes + f"{{temperature: {own}}}\n")), one_material.instrument.nodes
+    )
+    fields = held.fields()
+    assert one_material.fields(fields)["base/forward/M1"] == Temperature()
+    state = one_material.state(fields)
+    assert state["base/forward"].stretch != 0.0
+    assert "base/forward/M1" not in state or state["base/forward/M1"].stretch == 0.0
+    # it is what a change that is nearly none comes to, and not what a body comes to of which nothing is said
+    barely = one_material.state({**fields, "base/forward/M1": Temperature(1e-9)})
+    silent = one_material.state(load_job(written(tmp_path, HEAD + nodes + "{shift: [0 um, 0 um, 0 um]}\n")).fields())
+    sizes = [
+        one_material.instrument.assembly.tree.place([s]).size("base/forward/M1")[0] for s in (state, barely, silent)
+    ]
+    assert sizes[0] == pytest.approx(sizes[1], abs=1e-14)
+    assert abs(sizes[0] - sizes[2]) > 1e-8
+    # a run's config.yaml says so as well
+    resolved = resolve_job(held)
+    (tmp_path / "config.yaml").write_text(resolved.to_yaml(), "utf-8")
+    assert resolve(tmp_path / "config.yaml").job.fields() == fields
+
+
 @pytest.mark.parametrize(
     ("node", "words"),
     [

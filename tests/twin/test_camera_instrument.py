@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import twin
+from optics.geometry.tree import Motion
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, NodeInfo, checked_nodes
@@ -27,6 +28,7 @@ from twin.live.messages import AskedState
 from twin.main_job.render_job import render_job
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.monitor.image_quality import QUALITY, image_quality
+from twin.monitor.truth import trace_truth
 from twin.render import app as render_app
 from twin.study.runs.base_job import Run
 from twin.study.runs.render_base import RenderBase
@@ -191,14 +193,15 @@ def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     assert second["ground"] == pytest.approx(first["ground"], rel=1e-7)
 
 
-def test_a_camera_with_lenses_is_moved_and_not_warmed(backend) -> None:
+def test_a_camera_with_lenses_of_an_unknown_glass_is_moved_and_not_warmed(backend) -> None:
     """In its colours: every wavelength by its own rays, about one place."""
     camera = colour_camera("achromat")
     spec = InstrumentSpec.of_camera("achromat", "achromat")
     built = build_instrument(spec, {"achromat": camera}, backend)
     warmed = {path for path, info in built.nodes.items() if "temperature" in info.allows}
     root = "base/achromat"
-    assert not warmed & {"base", root, *(f"{root}/{name}" for name in camera.mirrors)}
+    assert not warmed & {"base", root, *(f"{root}/{name}" for name in camera.mirrors if name != "L1")}
+    assert f"{root}/L1" in warmed  # of the lens of N-BK7 all is known
     assert all({"shift", "rotate"} <= built.nodes[f"{root}/{name}"].allows for name in camera.mirrors)
     seen = CameraOptics.alone(camera, backend)
     wavelengths, weights = camera.spectrum.rule(5)
@@ -222,7 +225,8 @@ def test_names_of_cameras_are_none_of_instruments(name: str) -> None:
 @pytest.mark.parametrize(
     ("says", "problem"),
     [
-        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}}, "a course"),
+        ({"course": {"times": ["0 s", "1 s"], "motion": {"M2": {"shift": ["0 0 0 um", "0 0 1 um"]}}}},
+         "a course.*python -m twin.study"),
         ({"render": {"stray": True}}, "stray light"),
         ({"disturbances": {"file": "launch"}}, "sigmas on disturbances"),
     ],
@@ -342,3 +346,16 @@ def test_the_commands(tmp_path) -> None:
     assert again.exit_code == 0, again.stderr
     seen = json.loads((tmp_path / "again/optics.json").read_text("utf-8"))
     assert seen["perturbed"]["d_f_um"] == pytest.approx(told["perturbed"]["d_f_um"], rel=1e-9)
+
+
+def test_a_camera_that_images_upright_has_no_full_turn(backend) -> None:
+    """Its roll is half a turn, which rounding calls by either sign; a turn of its focal plane is told as it is."""
+    spec = InstrumentSpec.of_camera("korsch", "korsch")
+    built = build_instrument(spec, {"korsch": load_camera("korsch")}, backend)
+    small = 1e-5
+    states = [{"base/korsch/M2": Motion(shift=(0.0, 0.0, z))} for z in np.linspace(-6e-6, 6e-6, 25)]
+    turned = [{"base/korsch/focal_plane": Motion(rotate=(0.0, 0.0, sign * small))} for sign in (-1.0, 1.0)]
+    roll = trace_truth(built, backend, [*states, *turned]).vector("korsch")[:, 2]
+    assert np.all(np.abs(roll[:25]) < 1e-9)
+    np.testing.assert_allclose(np.abs(roll[25:]), small, rtol=0.1)
+    assert roll[25] == pytest.approx(-roll[26], rel=1e-3)

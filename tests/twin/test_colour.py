@@ -11,11 +11,11 @@ from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.resolved import resolve_camera
 from scenes.specs.spectrum import SpectrumSpec
 from tests.scenes.lens.colour_cameras import colour_camera
-from twin.camera import colour
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_report import camera_report
 from twin.camera.camera_run import CAMERA, MTF_FIELDS, camera_data, run_camera
 from twin.camera.colour import axial_colour, judge_colours, lateral_colour, spectral_mtfs, spectral_psfs
+from twin.targets import band_light
 
 FIELDS = [(0.0, 0.0), (1.0, 1.0)]
 
@@ -102,7 +102,7 @@ def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) 
     frequency = np.array([0.0, 30e3, 70e3])
     (mtf,) = spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
     (fine,) = achromat.mtfs([(0.0, 0.0)], frequency, *light.rule(24))
-    assert 0.0 < mtf.error <= colour.WORST_CHANGE
+    assert 0.0 < mtf.error <= band_light.WORST_CHANGE
     np.testing.assert_allclose(mtf.values, fine.values, atol=mtf.error)
     # a trapezoidal rule comes to the same mean
     wavelengths = np.linspace(500e-9, 640e-9, 36)
@@ -110,8 +110,8 @@ def test_rules_of_more_wavelengths_until_nothing_changes(achromat, monkeypatch) 
     weights[[0, -1]] = 0.5
     (even,) = achromat.mtfs([(0.0, 0.0)], frequency, wavelengths, weights)
     np.testing.assert_allclose(even.values, fine.values, atol=5e-4)
-    monkeypatch.setattr(colour, "LARGEST_RULE", 9)
-    monkeypatch.setattr(colour, "WORST_CHANGE", 1e-9)
+    monkeypatch.setattr(band_light, "LARGEST_RULE", 9)
+    monkeypatch.setattr(band_light, "WORST_CHANGE", 1e-9)
     with pytest.raises(UnphysicalError, match="still changes by"):
         spectral_mtfs(achromat, [(0.0, 0.0)], light, frequency)
 

@@ -71,3 +71,10 @@ def test_a_first_afternoon(files, tmp_path: Path, name: str, runs: int) -> None:
     assert study.sizes["run"] == runs
     assert not study.failed.any()
     assert float(study[f"{camera.name}_d_f"].std()) > 0.0
+    for key in ("d_alpha", "d_beta", "d_gamma", "d_f", "wfe", "defocus", "mtf_line", "mtf_track"):
+        assert np.all(np.isfinite(study[f"{camera.name}_{key}"]))
+    # a despace neither turns nor rolls a camera; one that is not symmetric about its axis looks elsewhere by a little
+    assert float(np.abs(study[f"{camera.name}_d_gamma"]).max()) < 1e-3
+    for key in ("mtf_line", "mtf_track"):
+        assert float(study[f"{camera.name}_{key}"].min()) >= 0.0
+        assert float(study[f"{camera.name}_{key}"].max()) <= 1.0

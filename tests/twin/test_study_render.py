@@ -119,7 +119,10 @@ def test_jobs_made_quickly_are_those_that_the_schema_reads(study) -> None:
     tree = study.setup.tree
     tree = {
         **tree,
-        "job": {**tree["job"], "perturb": {"base/forward/M2": PerturbationSpec(figure={"Z5": "1 nm"}).plain()}},
+        "job": {
+            **tree["job"],
+            "perturb": {"base/forward/M2": PerturbationSpec(figure={"Z5": "1 nm"}, temperature="0 K").plain()},
+        },
     }
     start = ("job", "perturb", "base/forward/M2")
     values = (

@@ -28,6 +28,7 @@ from scenes.specs.load import load_detector
 from tests.tiers import quick
 from twin.monitor.image_quality import image_quality
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.targets.band_light import BandPupils
 from twin.targets.target_images import ALONG, DIRECTIONS, PLACES, TRACK, BarDesign, TargetCamera, TargetLostError, View
 from twin.targets.target_measurement import CURVE, on_axis, read_bars, read_edge
 from twin.targets.target_path import LocalMap, TargetPath
@@ -61,8 +62,9 @@ def identity() -> LocalMap:
 
 @pytest.fixture(scope="module")
 def perfect() -> View:
-    pupil = circular_pupil(F_NUMBER)
-    return View(line_ccd(), pupil, identity(), np.zeros(2), 1000, np.array([2.3e-6, -1.1e-6]), REGION)
+    ccd = line_ccd()
+    pupil = BandPupils.alike(circular_pupil(F_NUMBER), ccd.band)
+    return View(ccd, pupil, identity(), np.zeros(2), 1000, np.array([2.3e-6, -1.1e-6]), REGION)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
 from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
-from twin.camera.first_order_data import FIRST_ORDER
+from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
 from twin.camera.layout_plot import layout_figure
 from twin.run.artefact import Artefact, CameraFile, Cell, SvgFigure, Table, fixed, plain
 from twin.run.report import Report, Section, answer
@@ -60,11 +60,13 @@ def _figure(name: str, title: str, caption: str, draw: Callable[..., Figure], *d
 def _first_order_text(run: CameraRun) -> str:
     n, d = FIRST_ORDER(run.first_order), run.distortion
     blocked = ", ".join(f"{body} {100 * share:.1f}%" for body, share in n["obscuration"].items())
+    unstated = unstated_shadows(run.optics.model, run.first_order.obscuration)
     return (
         f"f {n['focal_length_m']:.4g} m, F/{n['f_number']:.3g}, field {n['field_deg'][0]:.3g} by "
         f"{n['field_deg'][1]:.3g} deg; principal distance along the line {d.line_distance:.6g} m, "
         f"distortion at most {1e6 * d.line_largest:.3g} µm there; "
         + (f"its own parts stand in the beam: {blocked}." if blocked else "nothing of its own stands in the beam.")
+        + (f" {unstated[0].upper()}{unstated[1:]}." if unstated else "")
     )
 
 

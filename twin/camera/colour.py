@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 
 from optics.numerics.backend import Backend
-from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pupil_stack import SHADOW_NODES, PupilFunction
@@ -30,12 +29,10 @@ from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf
 from twin.run.quantity import Quantity, Record
+from twin.targets.band_light import wavelengths_enough
 
-WORST_CHANGE = 5e-4
-"""Largest change of an MTF by a rule of more wavelengths at which it is taken as it is."""
-
-FIRST_RULE, LARGEST_RULE = 5, 65
-"""Wavelengths of the first rule; those of the last, beyond which there is no MTF over this light."""
+FIRST_RULE = 5
+"""Wavelengths of the first rule."""
 
 CURVE_POINTS = 21
 """Wavelengths of curves over the light, odd."""
@@ -200,21 +197,17 @@ def spectral_mtfs(
     if frequency is None:
         # to the cut-off of the shortest wavelength, whatever the rule
         frequency = optics.at(spectrum.ends[0]).mtfs(fields)[0].frequency
-    count = FIRST_RULE
-    before = optics.mtfs(fields, frequency, *spectrum.rule(count))
-    if spectrum.lines or len(before[0].wavelengths) == 1:
-        return before
-    while count < LARGEST_RULE:
-        count = 2 * count - 1
-        after = optics.mtfs(fields, frequency, *spectrum.rule(count))
-        changes = [float(np.max(np.abs(b.values - a.values))) for a, b in zip(before, after, strict=True)]
-        if max(changes) <= WORST_CHANGE:
-            return tuple(replace(mtf, error=change) for mtf, change in zip(after, changes, strict=True))
-        before = after
-    raise UnphysicalError(
-        f"the MTF over {1e9 * spectrum.ends[0]:.6g} to {1e9 * spectrum.ends[1]:.6g} nm still changes by "
-        f"{max(changes):.2g} with {count} wavelengths (at most {WORST_CHANGE:g}): colours stand too far apart"
-    )
+    done: list[tuple[Mtf, ...]] = []
+
+    def values(count: int) -> np.ndarray:
+        done.append(optics.mtfs(fields, frequency, *spectrum.rule(count)))
+        return np.array([mtf.values for mtf in done[-1]])
+
+    if wavelengths_enough(spectrum, FIRST_RULE, values) == FIRST_RULE:
+        return optics.mtfs(fields, frequency, *spectrum.rule(FIRST_RULE))
+    before, after = done[-2:]
+    changes = [float(np.max(np.abs(b.values - a.values))) for a, b in zip(before, after, strict=True)]
+    return tuple(replace(mtf, error=change) for mtf, change in zip(after, changes, strict=True))
 
 
 def spectral_psfs(

@@ -143,6 +143,26 @@ def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
     return InTheWay(FrozenMap({body: share for body, share in shares.items() if share > 0.0}), FrozenMap(holes))
 
 
+LEAST_SHARE = 0.005
+"""Share of a beam from which on a shadow that no edge states is told: bodies are drawn with margins."""
+
+
+def unstated_shadows(model: CameraModel, in_the_way: InTheWay) -> str:
+    """What of a camera stands in its beam while its file states no shadow at all, and what that means; empty if nothing
+    does. A file that states one is taken at its word: the outlines of bodies are squares about their clear apertures.
+    """
+    if any(edge.blocks for edges in model.edges.values() for edge in edges):
+        return ""
+    told = ", ".join(f"{body} {100.0 * s:.1f}%" for body, s in in_the_way.shares.items() if s >= LEAST_SHARE)
+    if not told:
+        return ""
+    return (
+        f"its own parts stand in its beam ({told}) and its file does not say so: wavefront errors, MTF and images are "
+        "those of a pupil without that shadow; a plane before them with `light: passes` and `edges: [{blocks: circle, "
+        "radius: ...}]` states it"
+    )
+
+
 def _holes(
     model: CameraModel,
     bare: Assembly,

@@ -72,7 +72,7 @@ class CameraPictures:
         for when, one in enumerate(({}, state)):
             place = bench.views(one)[PLACE]
             imager = place.edge(DIRECTIONS[0], settings.angle)
-            photons = place.ccd.white_photons(settings.white) * place.pupil.light * place.edge_image(imager)
+            photons = place.ccd.white_photons(settings.white) * place.light.light * place.edge_image(imager)
             taken = place.ccd.expose(photons, place.column, pattern, frames, stream(seed, 4, when))
             mean = np.asarray(taken.mean(axis=0))
             shots.append((mean, read_edge(place, DIRECTIONS[0], imager.optics.normal, mean, frames)))

@@ -189,11 +189,13 @@ def perturbation(
 
 
 def _kept(what: Mapping[str, Any]) -> dict[str, Any]:
-    """What has no knob: tables of nodes and of temperatures, radii, conic constants and indices."""
+    """What has no knob: tables of nodes and of temperatures, that a body has a temperature of its own, radii, conic
+    constants and indices.
+    """
     turned = {kind.key for kind in KINDS.values()}
     out = {key: value for key, value in what.items() if key not in (*turned, "pivot")}
     heat = what.get("temperature")
-    if isinstance(heat, Mapping) and "table" in heat:
+    if isinstance(heat, Mapping):
         out["temperature"] = {key: value for key, value in heat.items() if key not in ("change", "gradient")}
     return out
 

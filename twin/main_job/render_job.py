@@ -13,12 +13,13 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
 from scenes.models.camera_sharpness import blur_warnings
-from scenes.models.obstruction import find_obstructions
+from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
 from scenes.specs.instrument import PRISM_180, prism_of
 from scenes.specs.job import checked_nodes
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
+from twin.camera.first_order_data import obscuration, unstated_shadows
 from twin.main_job.job_tables import deformation_warnings
 from twin.main_job.render_results import JobRun, RenderRun, StrayPair
 from twin.monitor.crosstalk import crosstalk
@@ -174,13 +175,14 @@ def render_job(
             *coarse_warnings(resolved),
             *_blurred(experiment, focus),
             *_warnings(experiment, nominal, photons[0], before, after[0]),
+            *moved_into_beams(experiment.instrument, backend, state),
             *deformation_warnings(deformed, [p for p in deformed if stray is not None and p in of_glass]),
             *(text for path, body in experiment.heated(resolved.job).items() for text in body.warnings(path)),
             *(series.warnings if series is not None else ()),
             *(_in_the_way(stray) if stray is not None else ()),
             *(stray.measured.warnings() if stray is not None and stray.measured is not None else ()),
             *(ghost_warnings(experiment, stray.before) if stray is not None else ()),
-            *_image_warnings(resolved, targets, quality),
+            *_image_warnings(experiment, resolved, targets, quality),
         ),
         series=series,
         stray=stray,
@@ -206,6 +208,12 @@ def require_one_state(resolved: ResolvedJob) -> None:
     ):
         if asked:
             allowed = "without it: the job's one state, with image quality and targets; or an instrument with a monitor"
+            if key == ("course",):
+                allowed = (
+                    "a study, which works out every row of a table as a state, with image quality: factors such as "
+                    "`M2_z: {motion: M2 shift z, table: {file: course.csv, column: M2_z}}` and design: {kind: grid}, "
+                    "by python -m twin.study; or an instrument with a monitor"
+                )
             raise job.error(f"{what}, and {resolved.instrument.name} has none", key, allowed=allowed)
 
 
@@ -245,7 +253,7 @@ def _without_monitor(
             *blur_warnings(resolved, backend),
             *deformation_warnings(experiment.deformed(job), []),
             *(text for path, body in experiment.heated(job).items() for text in body.warnings(path)),
-            *_image_warnings(resolved, targets, quality),
+            *_image_warnings(experiment, resolved, targets, quality),
         ),
         targets=targets,
         quality=quality,
@@ -273,15 +281,18 @@ def _images(
     return targets, quality
 
 
-def _image_warnings(resolved: ResolvedJob, targets: TargetRun | None, quality: ImageQuality | None) -> tuple[str, ...]:
+def _image_warnings(
+    experiment: MonitorExperiment, resolved: ResolvedJob, targets: TargetRun | None, quality: ImageQuality | None
+) -> tuple[str, ...]:
+    if targets is None and quality is None:
+        return ()
+    models = {model.spec.name: model for model in experiment.instrument.cameras.values()}
+    shadows = {name: unstated_shadows(model, obscuration(model, experiment.backend)) for name, model in models.items()}
     return (
+        *(f"camera {name}: {text}" for name, text in shadows.items() if text),
         *(targets.warnings if targets is not None else ()),
         *(quality.warnings if quality is not None else ()),
-        *(
-            (_FREE_PUPILS,)
-            if not resolved.job.render.obstructed and (quality is not None or targets is not None)
-            else ()
-        ),
+        *((_FREE_PUPILS,) if not resolved.job.render.obstructed else ()),
     )
 
 

@@ -149,7 +149,7 @@ def done_table(run: JobRun) -> Table:
     rows: list[list[Cell]] = []
     for path in dict.fromkeys((*motions, *fields)):
         motion, given = motions.get(path, Motion()), job.perturb.get(path)
-        warm = given is not None and given.temperature.table is not None
+        warm = given is not None and given.heat.table is not None
         parts = [_motion_text(motion)]
         if path in fields and not (warm and fields[path] == Temperature()):
             parts.append(_heat_text(fields[path]))

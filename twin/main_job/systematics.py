@@ -131,7 +131,7 @@ def _uncovered(run: RenderRun, camera: str, table: CameraCrosstalk) -> tuple[str
             continue
         if path not in bodies and (any(motion.rotate) or any(motion.shift) or motion.scale):
             out.append(path)
-        if given[path].temperature.table is not None:
+        if given[path].heat.table is not None:
             continue
         covered = {m.axis for m in table.motions if m.body == path and m.kind == "figure"}
         missing = [f"Z{j}" for j, amplitude in motion.figure.items() if amplitude and j not in covered]

@@ -172,7 +172,7 @@ class MonitorExperiment:
         """
         out = {}
         for path, what in job.perturb.items():
-            spec = what.temperature
+            spec = what.heat
             if spec.table is not None:
                 # change and gradient beside the table are not its own
                 key = path, spec.model_copy(update={"change": 0.0, "gradient": NO_MOTION})

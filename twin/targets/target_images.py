@@ -12,7 +12,7 @@ recorded follows the image by whole pixels, so that the image lies on the pixels
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -29,9 +29,10 @@ from optics.targets.target_image import EdgeProfile, target_image
 from optics.targets.target_shapes import Target, bar_group, slanted_edge
 from optics.waves.diffraction import Grid
 from optics.waves.pupil_stack import PupilFunction
-from optics.waves.transfer import TransferTable, polychromatic_transfer
+from scenes.models.camera_model import lenses
 from scenes.specs.camera import BandSpec
 from twin.sensors.line_ccd import LineCcd, band_wavelengths
+from twin.targets.band_light import BandPupils, wavelengths_enough
 from twin.targets.target_path import LocalMap, TargetPath
 
 ALONG, TRACK = "along", "track"
@@ -67,27 +68,35 @@ class EdgeOptics:
     """Optical transfer function along one direction at one site, over defocus.
 
     Attributes:
-        pupil: of the site.
+        light: pupils of the site in the band's light.
         band: whose light it is.
         normal: direction of the frequencies in the image, unit, (2,).
         cutoff: cycles/m, of the shortest wavelength.
         table: spline over defocus of the samples at ``frequencies``, complex as (real, imaginary).
     """
 
-    pupil: PupilFunction
+    light: BandPupils
     band: BandSpec
     normal: np.ndarray
     cutoff: float
     table: BSpline
 
     @classmethod
-    def build(cls, pupil: PupilFunction, band: BandSpec, normal: np.ndarray, reach: float = TABLE_REACH) -> EdgeOptics:
-        """Work the table out for defocus up to +-reach, metres."""
-        cutoff = float(pupil.cutoff(normal[None], band.spectrum.ends[0])[0])
+    def build(
+        cls, light: PupilFunction | BandPupils, band: BandSpec, normal: np.ndarray, reach: float = TABLE_REACH
+    ) -> EdgeOptics:
+        """Work the table out for defocus up to +-reach, metres. One pupil alone serves all of the band's light."""
+        light = BandPupils.alike(light, band) if isinstance(light, PupilFunction) else light
+        cutoff = float(light.shortest.cutoff(normal[None], band.spectrum.ends[0])[0])
         steps = max(int(np.ceil(reach / DEFOCUS_STEP)), 3)
         defocus = np.linspace(-reach, reach, 2 * steps + 1)
-        samples = _samples(pupil, band, normal, cutoff, defocus)
-        return cls(pupil, band, normal, cutoff, make_interp_spline(defocus, samples, k=5))
+        samples = _samples(light, normal, cutoff, defocus)
+        return cls(light, band, normal, cutoff, make_interp_spline(defocus, samples, k=5))
+
+    @property
+    def pupil(self) -> PupilFunction:
+        """Of the site; of the shortest wavelength where each has its own."""
+        return self.light.shortest
 
     @property
     def frequencies(self) -> np.ndarray:
@@ -99,17 +108,15 @@ class EdgeOptics:
         if abs(defocus) <= self.table.t[-1]:
             samples = self.table(defocus)
         else:
-            samples = _samples(self.pupil, self.band, self.normal, self.cutoff, np.array([defocus]))[0]
+            samples = _samples(self.light, self.normal, self.cutoff, np.array([defocus]))[0]
         parts = make_interp_spline(self.frequencies, samples, k=5)(np.minimum(frequency, self.cutoff))
         return np.where(frequency < self.cutoff, parts[..., 0] + 1j * parts[..., 1], 0.0)
 
 
-def _samples(
-    pupil: PupilFunction, band: BandSpec, normal: np.ndarray, cutoff: float, defocus: np.ndarray
-) -> np.ndarray:
+def _samples(light: BandPupils, normal: np.ndarray, cutoff: float, defocus: np.ndarray) -> np.ndarray:
     """Real and imaginary part at evenly spaced frequencies, (Z, FREQUENCIES, 2)."""
     frequency = np.linspace(0.0, cutoff, FREQUENCIES)[:, None] * normal
-    values = polychromatic_transfer(pupil, frequency, *band_wavelengths(band), defocus)
+    values = light.transfer(frequency, defocus)
     return np.stack([values.real, values.imag], axis=-1)
 
 
@@ -192,7 +199,7 @@ class View:
 
     Attributes:
         ccd: the line CCD.
-        pupil: of the image.
+        light: pupils of the image in the band's light.
         local: mapping from target coordinates (metres on the nominal image scale) to the image, about the chief ray.
         shift: of the chief ray's place on the focal plane against the nominal state, (along, across), metres.
         column: first column of the window on the line.
@@ -201,7 +208,7 @@ class View:
     """
 
     ccd: LineCcd
-    pupil: PupilFunction
+    light: BandPupils
     local: LocalMap
     shift: np.ndarray
     column: int
@@ -213,16 +220,20 @@ class View:
         """Band of the line CCD."""
         return self.ccd.band
 
+    @property
+    def pupil(self) -> PupilFunction:
+        """Of the image; of the shortest wavelength where each has its own."""
+        return self.light.shortest
+
     def transfer(self, frequency: np.ndarray) -> np.ndarray:
         """Transfer function of the traced pupil and the detector at frequencies (M, 2), cycles/m, complex (M,)."""
-        wavelengths, weights = band_wavelengths(self.band)
-        optics = polychromatic_transfer(self.pupil, frequency, wavelengths, weights, np.zeros(1))[0]
+        optics = self.light.transfer(frequency, np.zeros(1))[0]
         return np.asarray(optics * self.ccd.transfer(frequency[:, 0], frequency[:, 1]))
 
     def edge(self, direction: str, angle: float) -> EdgeImager:
         """Images of the knife edge that measures in a direction and is turned by ``angle``, radians."""
         normal = knife_edge(direction, angle).mapped(self.local).normal
-        optics = EdgeOptics.build(self.pupil, self.band, normal, _FOCUS)
+        optics = EdgeOptics.build(self.light, self.band, normal, _FOCUS)
         return EdgeImager(optics, self.ccd, self.region)
 
     def edge_image(self, imager: EdgeImager) -> np.ndarray:
@@ -240,8 +251,8 @@ class View:
         return np.asarray(self._table(fx, fy) * self.ccd.transfer(fx, fy))
 
     @cached_property
-    def _table(self) -> TransferTable:
-        return TransferTable.build(self.pupil, *band_wavelengths(self.band))
+    def _table(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        return self.light.table()
 
     @cached_property
     def _cutoff(self) -> float:
@@ -335,14 +346,37 @@ class TargetCamera:
         """
         try:
             hits = self.path.places(state, self.directions)
-            pupils = self.path.pupils(state, self.directions, hits)
+            lights = self._lights(state, hits)
             reach = self.region * self.ccd.band.pitch
             maps = [self.path.local_map(state, direction, reach) for direction in self.directions]
         except (AimError, BeamMissedError, ValueError) as error:
             raise TargetLostError(f"the line CCD of camera {self.path.name}: {error}") from error
-        return {name: self._view(name, hits[i], self.places[i], pupils[i], maps[i]) for i, name in enumerate(PLACES)}
+        return {name: self._view(name, hits[i], self.places[i], lights[i], maps[i]) for i, name in enumerate(PLACES)}
 
-    def _view(self, name: str, hit: np.ndarray, nominal: np.ndarray, pupil: PupilFunction, local: LocalMap) -> View:
+    def _lights(self, state: State, hits: np.ndarray, count: int | None = None) -> list[BandPupils]:
+        """Pupils of every place in the band's light; of lenses at each wavelength of the rule of ``count``, or of as
+        many as the MTF takes.
+        """
+        band = self.ccd.band
+        if not lenses(self.path.model.spec):
+            return [BandPupils.alike(one, band) for one in self.path.pupils(state, self.directions, hits)]
+        wavelengths, weights = band.spectrum.rule(self._wavelengths if count is None else count)
+        every = [self.path.pupils(state, self.directions, hits, wavelength=float(colour)) for colour in wavelengths]
+        return [BandPupils(own, wavelengths, weights) for own in zip(*every, strict=True)]
+
+    @cached_property
+    def _wavelengths(self) -> int:
+        """How many the MTF of the camera as designed takes; of a moved one they serve as well."""
+        hits = self.path.places({}, self.directions)
+
+        def at_nyquist(count: int) -> np.ndarray:
+            frequency = self.ccd.band.nyquist * np.eye(2)
+            lights = self._lights({}, hits, count)
+            return np.abs([light.transfer(frequency, np.zeros(1))[0] for light in lights])
+
+        return wavelengths_enough(self.ccd.band.spectrum, len(band_wavelengths(self.ccd.band)[0]), at_nyquist)
+
+    def _view(self, name: str, hit: np.ndarray, nominal: np.ndarray, light: BandPupils, local: LocalMap) -> View:
         band, shift = self.ccd.band, hit - nominal
         half = 0.5 * (self.region - 1)
         middle = hit[0] / band.pitch + 0.5 * (band.pixels - 1)
@@ -355,4 +389,4 @@ class TargetCamera:
         # rows are counted from the nominal image, columns from the line's first pixel
         rows = round(float(shift[1]) / band.pitch)
         offset = np.array([(middle - column - half) * band.pitch, shift[1] - rows * band.pitch])
-        return View(self.ccd, pupil, local, shift, column, offset, self.region)
+        return View(self.ccd, light, local, shift, column, offset, self.region)

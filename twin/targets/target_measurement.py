@@ -16,7 +16,6 @@ from analysis.mtf.slanted_edge import EdgeMtf, measure_edge
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.targets.target_shapes import TARGETS
-from scenes.models.camera_model import lenses
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import imaging_shadows
 from scenes.specs.instrument import BASE
@@ -303,14 +302,6 @@ def check_targets(resolved: ResolvedJob) -> None:
     for key, mounted in resolved.instrument.cameras.items():
         name = _band(resolved, key)
         camera = resolved.cameras[mounted.camera]
-        first, last = camera.bands[name].spectrum.ends
-        if lenses(camera) and first < last:
-            raise job.error(
-                f"images of targets are rendered with the rays of one wavelength, and {mounted.camera!r} has lenses",
-                ("render", "images"),
-                found=f"light of {1e9 * first:.6g} to {1e9 * last:.6g} nm in band {name}",
-                allowed="image quality, whose MTF is over all wavelengths, or a band of one wavelength",
-            )
         pixels = camera.bands[name].pixels
         if usable_pixels(pixels, settings.region) <= 0.0:
             raise job.error(
@@ -407,7 +398,7 @@ class _Shooter:
         bars: dict[str, BarReading] = {}
 
         def expose(name: str, share: np.ndarray) -> np.ndarray:
-            photons = view.ccd.white_photons(self.settings.white) * view.pupil.light * share
+            photons = view.ccd.white_photons(self.settings.white) * view.light.light * share
             frames[name] = view.ccd.expose(photons, view.column, self.pattern, self.count, seed.spawn(1)[0])
             return np.asarray(frames[name].mean(axis=0))
 
@@ -427,7 +418,7 @@ class _Shooter:
         for name in self.images:
             if name in TARGETS:
                 expose(name, view.image(TARGETS[name](view.band.pitch, view.region)))
-        return TargetShots(frames, view.column, edges, bars, 1.0 - view.pupil.light)
+        return TargetShots(frames, view.column, edges, bars, 1.0 - view.light.light)
 
 
 def on_axis(view: View, direction: str) -> float:

@@ -168,7 +168,7 @@ def _require_turns(test: OrbitAngleSpec, lines: tuple[str, ...]) -> None:
     """
     _require_lines(test, test.perturb, lines)
     for name, change in test.perturb.items():
-        for action in change.uses():
+        for action in change.needs():
             if action != "rotate":
                 allowed = "a rotation, or an instrument of traced cameras instead of a payload"
                 raise test.error(

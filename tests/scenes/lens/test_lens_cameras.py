@@ -158,10 +158,15 @@ def test_glasses_come_along_with_their_dispersion(tmp_path: Path, backend) -> No
     assert "N-BK7" in SINGLET
     path.write_text(SINGLET.replace("N-BK7", "F2"), "utf-8")
     numbers = "1.34533359 0.00997743871 0.209073176 0.0470450767 0.937357162 111.886764"
-    agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\nLD 0.32 2.5\n", "utf-8")
+    heat = "ED 8.2 9.2 3.6 0 0\nTD 1.51e-6 1.56e-8 -2.78e-11 9.34e-7 1.04e-9 0.25 20"
+    agf.write_text(f"NM F2 2 0 1.62 36.37\nCD {numbers} 0 0 0 0\n{heat}\nLD 0.32 2.5\n", "utf-8")
     made = camera_of(read_zemax(path, read_catalogues([agf])), "singlet", backend, Width(pupil=1e-4)).camera
     again = validate(CameraSpec, parse_yaml(made.file_text("")))
     assert again == made
+    assert again.mirrors["L1"].glass.expansion == pytest.approx(8.2e-6, rel=1e-15)
+    n = again.index_behind("L1")
+    slope = (n * n - 1.0) / (2.0 * n) * (1.51e-6 + 9.34e-7 / ((again.wavelength * 1e6) ** 2 - 0.25**2))
+    assert again.warm_glass("L1").slope(293.15) == pytest.approx(slope, rel=1e-12)
     # Schott's data sheet
     for wavelength, index in ((486.1327e-9, 1.63208), (587.5618e-9, 1.62004), (656.2725e-9, 1.61503)):
         assert again.index_behind("L1", wavelength) == pytest.approx(index, abs=1e-5)

@@ -28,7 +28,7 @@ from twin.monitor.monitor_derivative import hit_slopes
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.motions import ElementaryMotion
 from twin.monitor.truth import ACROSS, LINE_POINTS, line_in_world
-from twin.study.runs.render_base import monitor_results
+from twin.study.runs.render_base import monitor_results, true_results
 
 CAP = {"shift": 1e-3, "rotate": 3e-4, "scale": 1e-3, "figure": 1e-6}
 """Largest steps of differences, SI: they move the beam on the mirrors by a few millimetres at most."""
@@ -73,13 +73,17 @@ def _rest(motion: Motion) -> Motion:
 SPOT_REACH, SIGHT_REACH = 1.0, 1e-4
 """Steps of the derivative of the formulas, px and 1: so small that what is left of them after Richardson's
 extrapolation, to the fifth power, is below rounding, and so large that rounding is below 1e-11."""
+SIGHT_SHARE = 5e-3
+"""Largest step of directions as a share of half the field along a line, over which a principal distance is taken: its
+fourth power is left of the derivative of that."""
 
 
 @dataclass(frozen=True, eq=False)
 class Chain:
     """One instrument and the formulas that its job applies to what is traced.
 
-    Spots are means of rays, which are the energy centroids of the images.
+    Spots are means of rays, which are the energy centroids of the images. An instrument without a monitor has none, and
+    lines of sight alone.
 
     Attributes:
         resolved: the job.
@@ -91,6 +95,8 @@ class Chain:
 
     def spots(self, states: Sequence[State]) -> np.ndarray:
         """Positions (S, C, 2), row and column, px from the first pixel's centre. Raises AimError, BeamMissedError."""
+        if not self.experiment.monitored:
+            return np.zeros((len(states), 0, 2))
         path = self.experiment.path.coarse
         mean = np.einsum("n,bnk->bk", path.nodes.share, path.rays(states).position[..., 1::-1]) / path.pitch
         middle = 0.5 * (np.array(path.shape) - 1.0)
@@ -101,20 +107,31 @@ class Chain:
         return np.swapaxes(self.experiment.sight.trace(states), 0, 1)
 
     @cached_property
+    def reach(self) -> float:
+        """Step of directions of lines of sight for the formulas, radians; a narrow field takes a small one."""
+        ends = self.experiment.sight.nominal[:, 0, [0, -1]]
+        half = 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1)
+        return float(min(SIGHT_REACH, SIGHT_SHARE * np.min(half)))
+
+    @cached_property
     def nominal(self) -> np.ndarray:
         """Spots of the unperturbed instrument, (1, C, 2)."""
         return self.spots([{}])
 
     def outcome(self, state: State, spots: np.ndarray, sight: np.ndarray) -> dict[str, Any]:
-        """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3)."""
+        """``truth`` and ``recovered`` of one state with spots (C, 2) and directions (cameras, points, 3); ``truth``
+        alone where there is no monitor.
+        """
+        truth = self.experiment.sight.told_by(sight[:, None])
+        exposures = self.resolved.frames, self.resolved.job.render.seed
+        if not self.experiment.monitored:
+            return true_results(self.resolved, self.experiment, state, *exposures, truth)
         start, end = self.nominal, spots[None]
         cameras = self.experiment.cameras
         joint = np.zeros((1, 2 * end.shape[1], 2 * end.shape[1]))
         found = estimates(start, end, joint, cameras, self.experiment.disturbances, self.experiment.ground)
         none = np.zeros_like(end)
         recovery = Recovery(start, end, none, none, joint, found.parameters, found.angle, found.ground)
-        truth = self.experiment.sight.told_by(sight[:, None])
-        exposures = self.resolved.frames, self.resolved.job.render.seed
         return monitor_results(self.resolved, self.experiment, state, *exposures, truth, recovery)
 
     def moved(
@@ -123,7 +140,7 @@ class Chain:
         """Four outcomes about a state along derivatives of its spots (C, 2) and directions (cameras, points, 3), for
         ``extrapolated``, and the step; ``at``: the state's own spots and directions.
         """
-        largest = max(np.abs(spots).max() / SPOT_REACH, np.abs(sight).max() / SIGHT_REACH)
+        largest = max(np.abs(spots).max(initial=0.0) / SPOT_REACH, np.abs(sight).max() / self.reach)
         step = 1.0 / float(largest) if largest > 0.0 else 1.0
         place, line = at
         return [

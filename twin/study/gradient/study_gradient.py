@@ -126,6 +126,8 @@ def _in_base(setup: StudySetup, name: str, factor: FactorSpec, unit: str) -> flo
 
 MOVE = 2.0
 """By how many pixels the step of a motion moves a spot; the CCDs have room for some ten."""
+TURN = 1e-4
+"""By how many radians it turns a line of sight, where there are no spots: some ten pixels, too."""
 PART = 0.5
 """Step of other factors, in their spreads."""
 QUALITY_PART = 0.1
@@ -314,9 +316,8 @@ class _Traced:
         """AD and differences of all factors."""
         chain = Chain(self.maker.base, MonitorExperiment(self.maker.base, self.backend))
         try:
-            checked_nodes(self.maker.base.job, chain.experiment.instrument.nodes)
-            about = chain.experiment.state(self.maker.base.job)
-            chain.spots([about])
+            about = _state(chain, self.maker.base)
+            (chain.spots if chain.experiment.monitored else chain.sight)([about])
         except (AimError, BeamMissedError) as error:
             raise InputErrorText(f"the base cannot be differentiated, it loses its light: {error}") from error
         except InputError as error:
@@ -361,7 +362,7 @@ class _Traced:
         return np.array([[self.asked[i].value(one, self.setup) for i in rows] for one in outcomes])
 
     def _state(self, chain: Chain, factor: GradientFactor, change: float) -> State:
-        return chain.experiment.state(self._job(factor, change).job)
+        return _state(chain, self._job(factor, change))
 
     def _job(self, factor: GradientFactor, change: float) -> ResolvedJob:
         try:
@@ -377,7 +378,10 @@ class _Traced:
         sight: np.ndarray = np.zeros((*chain.experiment.sight.nominal[:, 0].shape, 0))
         if motions:
             experiment = chain.experiment
-            spots = spot_gradient(experiment.path.coarse, motions, about)
+            if experiment.monitored:
+                spots = spot_gradient(experiment.path.coarse, motions, about)
+            else:
+                spots = np.zeros((*chain.nominal.shape[1:], len(motions)))
             sight = np.moveaxis(sight_gradient(experiment.instrument, self.backend, motions, about), 1, -1)
         at = chain.spots([about])[0], chain.sight([about])[0]
         sizes = {}
@@ -391,7 +395,8 @@ class _Traced:
             table.scale[self.exact, k] = np.abs(terms).max(axis=1)
             limits = [CAP[motion.kind] / abs(slope) for motion, slope in slopes.items()]
             if slopes:
-                sizes[k] = float(min([MOVE / max(np.abs(moved).max(), 1e-300), *limits]))
+                size = np.abs(moved).max() / MOVE if chain.experiment.monitored else np.abs(turned).max() / TURN
+                sizes[k] = float(min([1.0 / max(size, 1e-300), *limits]))
         self.advance(AD_PART, 1, 1)
         return sizes
 
@@ -415,13 +420,18 @@ class _Traced:
         return self._numbers(outcomes, rows)
 
     def _outcomes(self, chain: Chain, jobs: Sequence[ResolvedJob], rows: Sequence[int]) -> list[dict[str, Any]]:
-        states = [chain.experiment.state(job.job) for job in jobs]
+        states = [_state(chain, job) for job in jobs]
         spots, sight = chain.spots(states), chain.sight(states)
         out = [chain.outcome(state, spots[s], sight[s]) for s, state in enumerate(states)]
         if rows is self.quality:
             found = quality_dicts(chain.experiment.instrument, self.backend, states, jobs[0].job.render.obstructed)
             out = [{**one, "quality": quality} for one, quality in zip(out, found, strict=True)]
         return out
+
+
+def _state(chain: Chain, resolved: ResolvedJob) -> State:
+    """What a job makes of an instrument; it may call bodies by their short names. Raises InputError."""
+    return chain.experiment.state(checked_nodes(resolved.job, chain.experiment.instrument.nodes))
 
 
 def _whole(

@@ -76,6 +76,16 @@ def monitor_results(
     return {"truth": run.truth_dict(), "recovered": run.recovered_dict()}
 
 
+def true_results(
+    resolved: ResolvedJob, experiment: MonitorExperiment, state: State, frames: int, seed: int, truth: Truth
+) -> dict[str, Any]:
+    """``truth`` of an instrument without a monitor: contents of truth.json; arguments as of `monitor_results`."""
+    run = JobRun(
+        resolved=resolved, experiment=experiment, state=state, frames=frames, seed=seed, truth=truth, warnings=()
+    )
+    return {"truth": run.truth_dict()}
+
+
 @dataclass(frozen=True, eq=False)
 class MonitorRun:
     """One run.
@@ -140,17 +150,7 @@ def _traced_together(experiment: MonitorExperiment, runs: Sequence[MonitorRun]) 
             return [Failure(one_line(error))]
         return [found for run in runs for found in _traced_together(experiment, [run])]
     return [
-        {
-            "truth": JobRun(
-                resolved=run.resolved,
-                experiment=experiment,
-                state=run.state,
-                frames=run.frames,
-                seed=run.seed,
-                truth=truth.at(slice(k, k + 1)),
-                warnings=(),
-            ).truth_dict()
-        }
+        true_results(run.resolved, experiment, run.state, run.frames, run.seed, truth.at(slice(k, k + 1)))
         for k, run in enumerate(runs)
     ]
 
@@ -398,7 +398,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "pivot": what.pivot,
         "figure": dict(what.figure),
         **{name: getattr(what, name) for name in ("scale", "radius", "conic", "index")},
-        "temperature": {**dict(heat), "gradient": list(heat.gradient)},
+        "temperature": None if heat is None else {**dict(heat), "gradient": list(heat.gradient)},
         "deformation": what.deformation,
     }
 
@@ -410,7 +410,7 @@ def _copy(parts: Mapping[str, Any]) -> dict[str, Any]:
         "rotate": list(parts["rotate"]),
         "shift": list(parts["shift"]),
         "figure": dict(parts["figure"]),
-        "temperature": {**heat, "gradient": list(heat["gradient"])},
+        "temperature": None if heat is None else {**heat, "gradient": list(heat["gradient"])},
     }
 
 
@@ -429,7 +429,9 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         pivot=parts["pivot"],
         figure=FrozenMap(parts["figure"]),
         **{name: parts[name] for name in ("scale", "radius", "conic", "index")},
-        temperature=TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
+        temperature=None
+        if heat is None
+        else TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),
         deformation=parts["deformation"],
     )
 
