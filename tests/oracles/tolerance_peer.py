@@ -65,9 +65,22 @@ class StopNodes:
         weighted = self._level * self.share[:, None]
         self._fit = np.linalg.solve(self._level.T @ weighted, weighted.T)
 
-    def squares(self, place: np.ndarray, heading: np.ndarray, path: np.ndarray, wavelength: float) -> np.ndarray:
-        """Mean squares (F,), waves^2, of beams (F, 1 + N, 3) and paths (F, 1 + N) at the image; lengths in one unit."""
-        eikonal = path - np.sum(heading * (place - place[:, :1]), axis=-1)
+    def squares(
+        self, place: np.ndarray, heading: np.ndarray, path: np.ndarray, wavelength: float, pupil: float = np.inf
+    ) -> np.ndarray:
+        """Mean squares (F,), waves^2, of beams at the image.
+
+        Args:
+            place: (F, 1 + N, 3), in any unit of length; heading: likewise, unit vectors.
+            path: optical paths to there, (F, 1 + N).
+            wavelength: in that unit.
+            pupil: distance of the exit pupil before the image, the radius of the spheres on which waves are compared.
+        """
+        offset = place - place[:, :1]
+        back = np.sum(heading * offset, axis=-1)
+        if np.isfinite(pupil):
+            back = back + np.sqrt(pupil**2 + back**2 - np.sum(offset**2, axis=-1)) - pupil
+        eikonal = path - back
         waves = (eikonal[:, 1:] - eikonal[:, :1]) / wavelength
         rest = waves - waves @ self._fit.T @ self._level.T
         return np.asarray(rest**2 @ self.share)
