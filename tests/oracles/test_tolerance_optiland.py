@@ -230,8 +230,8 @@ def test_cameras_are_distributed_as_optilands_and_come_faster(
     """As many as optiland makes in about a minute; and the processor time of each, without and with its own wavefronts.
 
     Measured on a busy machine of two cores, processor time of a camera: twin 2.4 ms; optiland 52 ms where an operand of
-    ours traces all fields at once, 22 times as much; 1600 ms where each field is an operand of its own wavefront, as its
-    users have it, 660 times as much. Of the one a quarter is asked for, of the other a seventh.
+    ours traces all fields at once, 22 times as much; 1600 ms where each field is an operand of its own wavefront, as
+    its users have it, 660 times as much. Of the one a quarter is asked for, of the other a seventh.
     """
     draw_samples(setup, bench, backend, 200, 3, Workforce())  # kernels are compiled
     start = time.process_time()

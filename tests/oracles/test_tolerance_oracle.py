@@ -21,8 +21,8 @@ UNIFORM, NORMAL = "uniform", "normal"
 CLOSE = 0.01
 """Share of a change of the wavefront error, and of its spread over cameras, to which the two are to agree."""
 NOTHING = 1e-6
-"""Waves. What the twin's focus leaves, which ends where a step would change less than 1e-5. Every change that is compared is
-a hundred times that."""
+"""Waves. What the twin's focus leaves, which ends where a step would change less than 1e-5; it is a
+hundredth of the least change that is compared."""
 
 
 def _budget() -> dict[str, tuple[Error, str, float, str]]:
