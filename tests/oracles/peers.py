@@ -77,8 +77,10 @@ def batoid_rays(position: np.ndarray, direction: np.ndarray, wavelength: float =
     return batoid.RayVector(*columns, np.zeros(n), np.full(n, wavelength))
 
 
-def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
-    """The camera as an ``optiland.optic.Optic`` in the prescription frame, in metres."""
+def optiland_camera(model: CameraModel, apertures: bool = False, unit: float = 1.0) -> Any:
+    """The camera as an ``optiland.optic.Optic`` in the prescription frame, in metres, or in a unit of as many metres;
+    what optiland tells in waves is meant for millimetres.
+    """
     from optiland.optic import Optic
     from optiland.physical_apertures import RadialAperture, RectangularAperture
 
@@ -88,21 +90,25 @@ def optiland_camera(model: CameraModel, apertures: bool = False) -> Any:
         edge = model.apertures[name]
         clear = None
         if apertures:
-            clear = RadialAperture(edge.radius) if isinstance(edge, Circle) else RectangularAperture(*edge.bounds)
+            bounds = [side / unit for side in edge.bounds]
+            clear = RadialAperture(edge.radius / unit) if isinstance(edge, Circle) else RectangularAperture(*bounds)
         shape: dict[str, Any] = {"surface_type": "standard"}
         if surface.even:
-            shape = {"surface_type": "even_asphere", "coefficients": [0.0, *surface.even]}
+            shape = {
+                "surface_type": "even_asphere",
+                "coefficients": [0.0, *(a * unit ** (2 * n + 3) for n, a in enumerate(surface.even))],
+            }
         optic.surfaces.add(
             index=i,
-            z=float(model.vertex(name)[2]),
-            radius=1.0 / surface.curvature,
+            z=float(model.vertex(name)[2]) / unit,
+            radius=1.0 / surface.curvature / unit,
             conic=surface.conic,
             material="mirror",
             is_stop=name == model.spec.stop,
             aperture=clear,
             **shape,
         )
-    optic.surfaces.add(index=len(model.surfaces) + 1, z=model.spec.image.z)
+    optic.surfaces.add(index=len(model.surfaces) + 1, z=model.spec.image.z / unit)
     optic.wavelengths.add(0.65, is_primary=True)
     return optic
 

@@ -1,0 +1,146 @@
+"""Tolerances of an off-axis camera against a brute force of our own with batoid, with a focus that is refound."""
+
+import numpy as np
+import pytest
+from scipy.stats import ks_2samp, truncnorm
+
+from optics.numerics.backend import Backend
+from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from twin.tolerance.merit_models import Sensitivities, sensitivities
+from twin.tolerance.samples import Samples, Workforce, draw_samples
+from twin.tolerance.tolerance_bench import ToleranceBench
+
+pytest.importorskip("batoid", reason="batoid not installed (extra `oracles`)")
+
+from tests.oracles.tolerance_peer import BatoidCamera, Error
+
+pytestmark = pytest.mark.oracle
+
+ARCSEC = np.pi / 648_000
+UNIFORM, NORMAL = "uniform", "normal"
+CLOSE = 0.01
+"""Share of a change of the wavefront error, and of its spread over cameras, to which the two are to agree."""
+NOTHING = 1e-6
+"""Waves. What the twin's focus leaves, which ends where a step would change less than 1e-5; it is a
+hundredth of the least change that is compared."""
+
+
+def _budget() -> dict[str, tuple[Error, str, float, str]]:
+    """Name -> error in the oracle's words, limit in the file's, limit in SI, law."""
+    out: dict[str, tuple[Error, str, float, str]] = {}
+    for mirror in ("M1", "M2", "M3"):
+        for axis in "xyz":
+            out[f"{mirror}_{axis}"] = (mirror, "shift", axis), "20 um", 20e-6, NORMAL
+        for axis in "xy":
+            out[f"{mirror}_tilt_{axis}"] = (mirror, "rotate", axis), "5 arcsec", 5.0 * ARCSEC, UNIFORM
+        out[f"{mirror}_radius"] = (mirror, "radius", ""), "30 ppm", 30e-6, NORMAL
+    out["M1_conic"] = ("M1", "conic", ""), "1.0e-4", 1e-4, NORMAL
+    out["M2_conic"] = ("M2", "conic", ""), "5.0e-3", 5e-3, NORMAL
+    out["M3_conic"] = ("M3", "conic", ""), "1.0e-4", 1e-4, UNIFORM
+    out["M3_turn"] = ("M3", "rotate about centre", "y"), "20 arcsec", 20.0 * ARCSEC, UNIFORM
+    out["M1_coma"] = ("M1", "figure", "Z7"), "10 nm", 10e-9, NORMAL
+    out["M3_trefoil"] = ("M3", "figure", "Z9"), "10 nm", 10e-9, NORMAL
+    return out
+
+
+BUDGET = _budget()
+ERRORS = [error for error, _, _, _ in BUDGET.values()]
+LIMITS = np.array([limit for _, _, limit, _ in BUDGET.values()])
+
+
+def motion(error: Error) -> str:
+    """In the words of a file."""
+    body, kind, axis = error
+    verb, *about = kind.split(" ", 1)
+    return " ".join(part for part in (body, verb, axis, *about) if part)
+
+
+@pytest.fixture(scope="module")
+def setup(tmp_path_factory) -> ToleranceSetup:
+    lines = [
+        f"  {name}: {{motion: {motion(e)}, limit: {told}, law: {law}}}" for name, (e, told, _, law) in BUDGET.items()
+    ]
+    path = tmp_path_factory.mktemp("tolerance") / "budget.yaml"
+    path.write_text(
+        "\n".join(
+            [
+                "instrument: gf7",
+                "tolerances:",
+                *lines,
+                "compensators: {focus: {motion: focal_plane shift z, range: 5 mm}}",
+                "merits: {wavefront: {kind: wavefront, at_most: 0.0714}}",
+                "",
+            ]
+        ),
+        "utf-8",
+    )
+    return resolve_tolerance(path)
+
+
+@pytest.fixture(scope="module")
+def bench(setup: ToleranceSetup, backend: Backend) -> ToleranceBench:
+    return ToleranceBench(setup, backend)
+
+
+@pytest.fixture(scope="module")
+def alone(bench: ToleranceBench) -> Sensitivities:
+    return sensitivities(bench)
+
+
+@pytest.fixture(scope="module")
+def peer(bench: ToleranceBench) -> BatoidCamera:
+    return BatoidCamera(bench.optics.model, bench.fields)
+
+
+@pytest.mark.second
+def test_each_tolerance_changes_the_wavefront_as_in_batoid(bench, alone, peer) -> None:
+    """At both limits; the worst of nine fields, and all nine, and the focus that is found."""
+    assert list(bench.entries) == list(BUDGET)
+    assert len(BUDGET) == 24
+    np.testing.assert_allclose(bench.sizes, LIMITS, rtol=1e-12)
+    nominal = peer.tried({})
+    assert alone.nominal[0] == pytest.approx(nominal.worst, abs=NOTHING)
+    ends = np.concatenate([-np.diag(LIMITS), np.diag(LIMITS)])
+    found = peer.tried_all(ERRORS, ends)
+    theirs = np.array([one.worst for one in found]).reshape(2, -1).T - nominal.worst
+    ours = alone.values[:, :, 0] - alone.nominal[0]
+    assert np.abs(theirs).min() > 100.0 * NOTHING
+    np.testing.assert_array_less(np.abs(ours - theirs), CLOSE * np.abs(theirs) + NOTHING)
+    # field by field, where the worst of all hides nothing
+    fields = np.sqrt(bench.try_out(ends).parts)
+    change = np.sqrt([one.squares for one in found]) - np.sqrt(nominal.squares)
+    np.testing.assert_array_less(np.abs(fields - np.sqrt(nominal.squares) - change), CLOSE * np.abs(change) + NOTHING)
+    moves = np.array([one.focus for one in found]).reshape(2, -1).T
+    # a thousandth of the depth of focus, wavelength times the square of the f-number
+    np.testing.assert_allclose(alone.moves[:, :, 0], moves, rtol=0, atol=1e-3 * 650e-9 * 9.2**2)
+    assert np.abs(moves).max() > 200e-6
+
+
+@pytest.fixture(scope="module")
+def drawn(setup: ToleranceSetup, bench: ToleranceBench, backend: Backend) -> Samples:
+    return draw_samples(setup, bench, backend, 1000, 4, Workforce())
+
+
+@pytest.mark.second
+def test_cameras_are_as_in_batoid_one_by_one(drawn: Samples, peer: BatoidCamera) -> None:
+    """The first 100 of them, to a share of their spread."""
+    assert not any(drawn.problems)
+    ours, spread = drawn.values[:, 0], float(np.std(drawn.values[:, 0]))
+    same = np.array([one.worst for one in peer.tried_all(ERRORS, drawn.x[:100] * LIMITS)])
+    assert spread > 0.01
+    np.testing.assert_allclose(ours[:100], same, rtol=0, atol=CLOSE * spread)
+
+
+@pytest.mark.slow
+def test_cameras_are_distributed_as_those_that_the_oracle_draws(drawn: Samples, peer: BatoidCamera) -> None:
+    """1000 of each, with the oracle's own random numbers; the laws are said anew."""
+    rng = np.random.default_rng(20)
+    size = len(drawn.x)
+    columns = [
+        rng.uniform(-1.0, 1.0, size)
+        if law == UNIFORM
+        else truncnorm.rvs(-2.0, 2.0, scale=0.5, size=size, random_state=rng)
+        for _, _, _, law in BUDGET.values()
+    ]
+    own = np.array([one.worst for one in peer.tried_all(ERRORS, np.stack(columns, axis=-1) * LIMITS)])
+    assert ks_2samp(drawn.values[:, 0], own).pvalue > 1e-3
