@@ -110,7 +110,7 @@ def test_affine_change_without_noise(texture, templates):
 @pytest.mark.parametrize(
     ("sharp", "largest"), quick(1, [((0.45, 0.45), 0.006), ((0.1, 0.4), 0.008), ((0.1, 0.1), 0.008)])
 )
-@pytest.mark.parametrize("sharpness", quick(1, [True, False]))
+@pytest.mark.parametrize("sharpness", quick(0, [True, False]))
 def test_other_radiometry_and_sharpness(texture, clean, sharp, largest, sharpness):
     """An MTF of 0.25 at the limit in the image against others in the template, gain 0.7: with the terms for sharpness
     still the spline's error; without them chance correlations of slopes and bends, below 0.02 px.

@@ -213,6 +213,7 @@ CUT = {"HSC/HSC_no_obsc.yaml": (750e-9, 8.2, 0.75), "LSST/LSST_r.yaml": (622e-9,
 """File -> wavelength and pupil, metres, and the field's radius, degrees."""
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["LSST/LSST_r.yaml", pytest.param("HSC/HSC_no_obsc.yaml", marks=pytest.mark.slow)])
 def test_wavefront_errors_of_cut_pupils_as_batoid_has_them(backend, name: str) -> None:
     """Rms without piston and tilt over the light that comes through, on the axis, between and in the field's corner."""

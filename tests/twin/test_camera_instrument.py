@@ -146,6 +146,7 @@ def test_a_tilted_secondary_turns_the_line_of_sight(backend) -> None:
     assert abs(found["d_beta_arcsec"]) < 1e-6
 
 
+@pytest.mark.second
 def test_quality_is_that_of_the_camera_looked_at(run: JobRun, backend) -> None:
     """Two ways to the same numbers: image quality of an instrument, and a camera at fields, times the pixel."""
     assert run.quality is not None
@@ -171,6 +172,7 @@ def test_errors_are_those_of_wavefronts(backend) -> None:
         np.testing.assert_allclose(optics.errors(fields)[:, 0], expected, rtol=within, atol=1e-6)
 
 
+@pytest.mark.second
 def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     spec = load_instrument("gf7_pair")
     sites = {
@@ -268,6 +270,7 @@ def test_a_script(backend) -> None:
     assert shot.before.sizes["channel"] == 0
 
 
+@pytest.mark.second
 def test_runs_of_a_study(backend, run: JobRun) -> None:
     """States together are what each is by itself; a light that is lost costs its own run alone."""
     base = RenderBase()
@@ -282,6 +285,7 @@ def test_runs_of_a_study(backend, run: JobRun) -> None:
     assert "recovered" not in first
 
 
+@pytest.mark.second
 def test_the_live_page_has_what_the_job_has(run: JobRun) -> None:
     bench = LiveBench(twin.load(RC))
     hello = bench.greeting()

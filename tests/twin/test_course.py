@@ -74,9 +74,9 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def prepared(folder, backend) -> MonitorExperiment:
-    """The experiment of the run, from its own config.yaml."""
-    return MonitorExperiment(resolve(folder / "config.yaml"), backend)
+def prepared(experiment) -> MonitorExperiment:
+    """The experiment of the run."""
+    return experiment("gf7_pair")
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +97,7 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
     assert [moment(t) for t in job.course.times] == ["0 min", "12 min", "30 min"]
 
 
+@pytest.mark.second
 def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) -> None:
     """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
     experiment, states = prepared, []
@@ -136,6 +137,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
     np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
 
 
+@pytest.mark.second
 def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
     """The first time knows its own measurement alone, which is the posterior; the last knows all, filtered or smoothed.
     The prisms' half kelvin of this job is seven times what `orbit` states; chi-square says so."""
@@ -182,6 +184,7 @@ def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     assert "model" in told["ground"]
 
 
+@pytest.mark.second
 def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
     recovered = json.loads((folder / "recovered.json").read_text())
     truth = json.loads((folder / "truth.json").read_text())
@@ -236,6 +239,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
 # --- the run folder ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_run_folder_holds_the_course(folder, found) -> None:
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
     assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
@@ -271,6 +275,7 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
         assert words in report
 
 
+@pytest.mark.second
 def test_config_holds_the_course(folder) -> None:
     again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
     assert again == first

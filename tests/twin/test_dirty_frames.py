@@ -149,6 +149,7 @@ def test_other_centroids_are_corrected_as_well(bench, centroid):
             assert spot.cost != 0.0
 
 
+@pytest.mark.second
 def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
     job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})

@@ -84,6 +84,7 @@ def test_images_are_those_of_the_general_renderer():
     assert np.max(images) > 0.9
 
 
+@pytest.mark.second
 def test_pixel_sampling_moves_no_centroid():
     """Noise-free spots, shifted by a pixel in steps: the pinhole is wide enough for pixels of 7 um."""
     b = bench()

@@ -95,6 +95,7 @@ def test_one_material_evenly_heated_keeps_its_angles(silica, tmp_path) -> None:
         assert np.max(np.abs(change.d_f)) < 1e-11
 
 
+@pytest.mark.second
 def test_a_table_of_displaced_nodes_of_the_same_mirror_is_added(silica, tmp_path) -> None:
     points = lattice(silica.thermal, M1, (9, 8, 4))
     write(tmp_path / "heat.csv", points, quadratic(points))

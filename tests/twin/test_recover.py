@@ -90,6 +90,7 @@ def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, back
     assert found.last.recovered_dict() == run.recovered_dict()
 
 
+@pytest.mark.second
 def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     """Parts of the CCD with their offsets, fewer frames after, three times of which the middle one is the state before:
     shifts agree with those of the whole frames within what the left out rings and frames say.
