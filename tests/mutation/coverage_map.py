@@ -92,11 +92,13 @@ def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path
         words = ["-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
         warm = free.get()
         try:
-            warm.run(root, words, target.with_suffix(".told"), more=more)
+            ended = warm.run(root, words, target.with_suffix(".told"), more=more)
         finally:
             free.put(warm)
         done = target.exists() and target.with_suffix(".json").exists()
-        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}", err=True)
+        # tests that fail without any fault find none
+        fails = f"; some of its tests fail, see {target.with_suffix('.told')}" if ended == 1 else ""
+        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}{fails}", err=True)
         return done
 
     with ExitStack() as stack, ThreadPoolExecutor(workers) as pool:

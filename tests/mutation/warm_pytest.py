@@ -17,10 +17,8 @@ from pathlib import Path
 
 PACKAGES = (
     "cv2",
-    "drjit",
     "hypothesis",
     "matplotlib.pyplot",
-    "mitsuba",
     "numpy",
     "pint",
     "pydantic",
@@ -35,7 +33,8 @@ PACKAGES = (
     "tifffile",
     "typer",
 )
-"""Loaded before the fork; none of them starts a thread, which would be lost in it."""
+"""Loaded before the fork; none of them starts a thread, which would be lost in it. Not Dr.Jit, which has to be told its
+LLVM first: that is code of the project, into which faults are put."""
 _WAITING = 3600.0
 """Seconds after which a run that waits for ever, without computing, is given up."""
 

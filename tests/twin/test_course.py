@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from typer.testing import CliRunner
 
 import twin.render as command
 from analysis.units import ARCSEC
@@ -23,12 +23,14 @@ from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
+from tests.twin.commands import files, invoke
 from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 
+run = partial(invoke, command.app)
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = "base/forward/monitor/left/prism_180"
 JOB = f"""instrument: gf7_pair
@@ -48,13 +50,6 @@ render: {{frames: 2, seed: 7}}
 FILES = {"course.json", "course.nc"} | {
     f"images/{c}_{s}_course.tiff" for c in ("forward", "backward") for s in ("left", "right")
 }
-
-
-def run(*arguments: object):
-    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
 
 
 def written(folder: Path, text: str = JOB) -> Path:
@@ -241,8 +236,7 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
 
 @pytest.mark.second
 def test_the_run_folder_holds_the_course(folder, found) -> None:
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
+    assert files(folder) >= FILES | {"recovered.json", "report.html", "manifest.json"}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest["sha256"]) >= FILES
     with tifffile.TiffFile(folder / "images/forward_left_course.tiff") as file:
