@@ -153,6 +153,7 @@ def test_depth_of_an_overlap(bare, tmp_path) -> None:
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
+@pytest.mark.second
 def test_what_is_told_takes_bodies_apart(bare, tmp_path) -> None:
     """A message says how far and along which axis the body that its key moves goes; moved so, it is free."""
     for change, _, _ in OVERLAPS:

@@ -251,6 +251,7 @@ def test_half_a_monitor_is_refused() -> None:
 # --- where users meet it ---------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_script(backend) -> None:
     camera = twin.load_camera(RC)
     assert camera.perturbed(DESPACE).state == camera.perturbed({"M2": {"shift": "0 0 20 um"}}).state
