@@ -268,6 +268,7 @@ def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> No
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.second
 def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
     """The way back lies beside the way out, by which the prisms have to be wider than the face."""
     assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 57 mm")), backend)

@@ -163,6 +163,7 @@ def test_quality_is_that_of_the_camera_looked_at(run: JobRun, backend) -> None:
         np.testing.assert_allclose(values[:, 0], values[:, -1], atol=1e-6)
 
 
+@pytest.mark.second
 def test_errors_are_those_of_wavefronts(backend) -> None:
     """At the focal plane and beside it, for a free pupil and for one that edges cut."""
     for name, within in (("gf7", 1e-9), (RC, 2e-3)):
@@ -193,6 +194,7 @@ def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     assert second["ground"] == pytest.approx(first["ground"], rel=1e-7)
 
 
+@pytest.mark.second
 def test_a_camera_with_lenses_is_moved_and_not_warmed(backend) -> None:
     """In its colours: every wavelength by its own rays, about one place."""
     camera = colour_camera("achromat")

@@ -116,6 +116,7 @@ def test_line_follows_the_turn_and_the_middle_is_zero():
     assert abs(slope) == pytest.approx(1e-4 * 5.672, rel=0.01)
 
 
+@pytest.mark.second
 def test_spots_are_found_where_the_chief_rays_go():
     """Centroids, less the design's offset, against chief rays: noise and what the window cuts off."""
     r = run()

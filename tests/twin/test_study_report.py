@@ -41,6 +41,7 @@ def page(folder, study, values, failed=None) -> str:
     return words
 
 
+@pytest.mark.second
 def test_grid_of_two_numbers(tmp_path) -> None:
     study = study_of(
         "{a: {key: [job, a], values: [30 mm, 40 mm, 50 mm]}, b: {key: [job, b], range: [10 um, 80 um], count: 8}}",
