@@ -15,7 +15,8 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.specs.job import JobSpec
 from scenes.specs.load import load_camera, load_instrument
-from scenes.specs.resolved import resolve_job
+from scenes.specs.resolved import ResolvedJob, resolve_job
+from twin.monitor import monitor_experiment
 from twin.monitor.monitor_experiment import MonitorExperiment
 
 # Properties are tried on the same examples every time, on every machine. Kernels compile with the first of them.
@@ -62,6 +63,55 @@ def no_heartbeat() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("twin.run.cli.TICK_SECONDS", 3600.0)
         yield
+
+
+class Calibrated:
+    """The experiments of this process. A new one on an equal instrument starts with what is computed for the others, as
+    those do that a script makes from each other; one of unequal disturbances computes what rests on them itself.
+
+    Attributes:
+        on: whether experiments are kept and taken. What is computed under a test's monkeypatch is its own.
+    """
+
+    def __init__(self) -> None:
+        self.on = True
+        self._build = MonitorExperiment.__init__
+        self._kept: list[MonitorExperiment] = []
+
+    def init(self, new: MonitorExperiment, resolved: ResolvedJob, backend: Backend, free_beams: bool = True) -> None:
+        like = (
+            [one for one in self._kept if free_beams and _of_one_instrument(one, resolved, backend)] if self.on else []
+        )
+        same = [one for one in like if one.resolved.disturbances == resolved.disturbances]
+        if like:
+            vars(new).update(vars(same[0] if same else like[0].stating(resolved)))
+            vars(new).update(resolved=resolved, _deformed={}, _heated={}, _patterns={})
+            if new.monitored:
+                monitor_experiment.require_memory(resolved, new.size(), new.detector)
+        else:
+            self._build(new, resolved, backend, free_beams)
+        if self.on and free_beams:
+            self._kept = [new, *(one for one in self._kept if one not in same)]
+
+
+def _of_one_instrument(one: MonitorExperiment, resolved: ResolvedJob, backend: Backend) -> bool:
+    return one.backend == backend and all(
+        getattr(one.resolved, name) == getattr(resolved, name) for name in ("instrument", "cameras", "detector")
+    )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def calibrated() -> Iterator[Calibrated]:
+    """Most of a small job is the calibration of its instrument: each worker does it once."""
+    found = Calibrated()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(MonitorExperiment, "__init__", lambda *arguments, **options: found.init(*arguments, **options))
+        yield found
+
+
+@pytest.fixture(autouse=True)
+def calibrated_unpatched(request, calibrated: Calibrated) -> None:
+    calibrated.on = "monkeypatch" not in request.fixturenames
 
 
 @pytest.fixture(scope="session")

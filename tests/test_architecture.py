@@ -85,6 +85,7 @@ def source_files() -> list[Path]:
     return sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 
 
+@cache
 def imported_modules(path: Path) -> set[str]:
     """Names of everything a file imports, at any depth, also by importlib with a literal name; of what is imported from
     a module, the module's and the one that it would have as a module of its own.

@@ -831,6 +831,7 @@ def spot_places(experiment: MonitorExperiment, states: list[State]) -> np.ndarra
 
 
 @extends(REFLECTORS)
+@pytest.mark.second
 def test_a_reflector(backend: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Plane mirrors in place of both prisms: named by a file, seen in the images of the monitor, followed by the path
     tracer, deformed by heat.
@@ -992,6 +993,7 @@ def test_an_unknown_name_is_told_as_one_of_a_fixed_list_is(model: Any, text: str
 
 
 @extends("twin.run.data_files.TABLE_FORMATS")
+@pytest.mark.second
 def test_an_output_format_of_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Names and units of the columns alone: chosen by its name, written for every table and listed."""
     text = "; ".join

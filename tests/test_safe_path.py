@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from docs.site.command_pages import commands, programs
+from tests.tiers import quick
 from tests.twin.live_page import running
 from twin.run.console import COMPLETE, PROGRAMS
 
@@ -114,7 +115,9 @@ def test_the_console_command_lists_without_importing_what_it_lists(tmp_path):
     assert not {"numpy", "pydantic", "rich", "optics", "scenes", *(module for module, _ in PROGRAMS.values())} & found
 
 
-@pytest.mark.parametrize(("typed", "offered"), [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pitc", {"--pitch"})])
+@pytest.mark.parametrize(
+    ("typed", "offered"), quick(1, [("or", {"orbit"}), ("lab f", {"focus"}), ("mtf --pitc", {"--pitch"})])
+)
 def test_shells_are_offered_programs_subcommands_and_options(tmp_path, monkeypatch, typed, offered):
     words = ["camtwin", *typed.split(" ")]
     for name, value in ((COMPLETE, "complete_bash"), ("COMP_WORDS", " ".join(words)), ("COMP_CWORD", len(words) - 1)):

@@ -220,6 +220,7 @@ def test_fields_are_kept_of_every_golden_run() -> None:
     assert {path.stem for path in fields_file("x").parent.glob("*.json")} <= names
 
 
+@pytest.mark.second
 def test_every_file_of_every_command_is_described(folders: dict[str, str]) -> None:
     for command, jobs in golden_commands().items():
         page = next(text for text in folders.values() if text.startswith(f"# Files of `{command}`"))
@@ -234,6 +235,7 @@ def test_every_file_of_every_command_is_described(folders: dict[str, str]) -> No
                 assert all(f"`{tag}`" in page for tag in told.get("tags", ()))
 
 
+@pytest.mark.second
 def test_every_field_of_every_file_stands_in_the_reference(folders: dict[str, str]) -> None:
     """By its own name, below the mappings that hold it; names of one sort of thing may be more than are shown."""
     for command, jobs in golden_commands().items():

@@ -21,6 +21,7 @@ def scene(seed, count, wrong, sigma=0.05, height=False):
     return place, found, level, bad, shift
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize(("count", "degree"), [(60, 2), (400, 2), (400, 3)])
 def test_forty_per_cent_wrong(seed, count, degree):

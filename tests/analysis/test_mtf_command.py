@@ -8,6 +8,7 @@ import resource
 import subprocess
 import sys
 import zlib
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -15,9 +16,9 @@ import numpy as np
 import pytest
 import tifffile
 from scipy.special import ndtr
-from typer.testing import CliRunner
 
 from analysis.mtf.__main__ import app
+from tests.twin.commands import invoke
 
 ROI = "10,20,64,64"
 BLUR = 0.7
@@ -37,11 +38,7 @@ def gaussian_mtf(f):
     return math.exp(-2 * (math.pi * f * BLUR) ** 2)
 
 
-def run(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments], terminal_width=200)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+run = partial(invoke, app, terminal_width=200)
 
 
 def run_json(*arguments):

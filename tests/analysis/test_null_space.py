@@ -160,6 +160,7 @@ def test_unknowns_of_another_order_are_adjusted_to_the_same_values():
         assert second.sigma[name] == pytest.approx(sigma, rel=1e-6)
 
 
+@pytest.mark.second
 def test_sigmas_contain_what_keeps_its_start_values():
     """40 passes over three points with start values off by 0.1 mm of image motion in every unknown. Two-sided false
     alarm 1e-4 for all unknowns together, open combinations within, and for what the data determine alone."""

@@ -71,6 +71,7 @@ def test_correlation_is_found_at_its_own_lag():
         assert value == pytest.approx({(1, 1): 2 / 3, (2, 2): 1 / 3}.get(lag, 0.0), abs=0.04), lag
 
 
+@pytest.mark.second
 def test_covariance_of_places_is_that_of_fits_to_correlated_noise():
     """One design and 6000 draws of noise, correlated along either diagonal. The fit takes more out of noise that
     resembles the texture than out of white noise, which alone is given back: the variances come out 15% too small.

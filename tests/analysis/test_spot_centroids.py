@@ -125,7 +125,7 @@ def test_scatter_agrees_with_stated_sigma(name, template, places, before):
     assert not agrees(found.position - places, found.temporal_covariance)
 
 
-@pytest.fixture(scope="module", params=[0.0, 1.3, 12.0])
+@pytest.fixture(scope="module", params=quick(1, [1.3, 0.0, 12.0]))
 def moved(request, places, fixed):
     """How far the spots moved, and what the same pixels then record."""
     step = np.array([request.param, -0.5 * request.param])

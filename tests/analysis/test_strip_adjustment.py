@@ -62,6 +62,7 @@ def test_sigmas_are_right():
     assert 5e-4 < stats.chi2.sf(*fit) < 1 - 5e-4
 
 
+@pytest.mark.second
 def test_corrections_take_the_errors_out_of_other_rays():
     """Ties from half of the points, the others intersected from corrected rays: both keep the same slow errors.
 

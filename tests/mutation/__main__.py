@@ -13,16 +13,17 @@ from typing import Annotated, Any
 import typer
 
 from scenes.yaml.yaml_file import read_yaml
-from tests.mutation.campaign import Verdict, read_verdicts, run_campaign
-from tests.mutation.coverage_map import measure, read_map
+from tests.mutation.campaign import Mode, Verdict, read_verdicts, run_campaign
+from tests.mutation.coverage_map import belongs, measure, read_map
 from tests.mutation.mutants import Mutant, mutants_below
 
 HELP = """Put small faults into the source, one at a time, and see whether a test finds each.
 
 A seeded sample of all possible faults is drawn from the physics and the estimators. The tests that run a fault's lines
-run in rounds, quick ones first, until a round kills the fault; all killers in that round are recorded. What survives
-is either a gap in the tests or changes nothing that can be seen; the second kind stands in equivalent.yaml with its
-reason. An interrupted campaign goes on where it was.
+run in rounds, quick ones first, until a round kills the fault; all killers in that round are recorded. With --first
+they end at the first killer, and tests of --without run only where no other test kills the fault: the cheapest way to
+the scores with and without them. What survives is either a gap in the tests or changes nothing that can be seen; the
+second kind stands in equivalent.yaml with its reason. An interrupted campaign goes on where it was.
 
 Examples:
 
@@ -30,6 +31,7 @@ Examples:
   python -m tests.mutation --out runs/mutation --only optics --count 40  some of them\n
   python -m tests.mutation --out runs/mutation --again                   survivors once more, after new tests\n
   python -m tests.mutation --out runs/mutation --every                   every killer of each fault\n
+  python -m tests.mutation --out runs/mutation --first --without @moved  score with and without the tests of a file\n
   python -m tests.mutation --out runs/mutation --without tests/twin/test_live_runs.py    the score without these tests\n
 
 Exit code: 0 at least 90 % of the faults that are not equivalent were found, 1 fewer, 2 bad input.
@@ -67,9 +69,7 @@ def without(verdict: Verdict, tests: Collection[str]) -> Verdict:
 
     A killer that has no name, as time that runs out, stays.
     """
-    left = tuple(
-        name for name in verdict.killers if not {name, name.split("[")[0], name.split("::")[0]}.intersection(tests)
-    )
+    left = tuple(name for name in verdict.killers if not belongs(name, tests))
     return replace(verdict, killers=left, fate="survived" if verdict.killers and not left else verdict.fate)
 
 
@@ -116,8 +116,15 @@ def main(
     every: Annotated[
         bool, typer.Option("--every", help="Run all tests that meet a fault, so that every killer is recorded.")
     ] = False,
+    first: Annotated[
+        bool, typer.Option("--first", help="Stop at the first killer; tests of --without come last.")
+    ] = False,
     leave: Annotated[
-        str | None, typer.Option("--without", help="Tests, with commas between them, whose kills do not count.")
+        str | None,
+        typer.Option(
+            "--without",
+            help="Tests, with commas between them, whose kills do not count; @FILE has one to a line.",
+        ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON on stdout.")] = False,
 ) -> None:
@@ -128,6 +135,17 @@ def main(
     if missing:
         typer.echo(f"error: no such file or folder: {', '.join(missing)}; run this in the project's folder", err=True)
         raise typer.Exit(2)
+    if every and first:
+        typer.echo("error: --every runs all tests and --first ends at a killer; give one of them", err=True)
+        raise typer.Exit(2)
+    left_out: list[str] = []
+    if leave and leave.startswith("@"):
+        if not Path(leave[1:]).is_file():
+            typer.echo(f"error: --without: no such file: {leave[1:]}", err=True)
+            raise typer.Exit(2)
+        left_out = Path(leave[1:]).read_text().splitlines()
+    elif leave:
+        left_out = leave.split(",")
     chosen = drawn(mutants_below(root, places), count, seed)
     folder, results = out / "coverage", out / "results.jsonl"
     out.mkdir(parents=True, exist_ok=True)
@@ -139,9 +157,9 @@ def main(
     if todo:
         files = [file for name in TESTS for file in sorted((root / "tests" / name).glob("test_*.py"))]
         measure(root, files, COVERED, folder, workers)
-        run_campaign(root, todo, read_map(folder, root), results, workers, 1 if quick else 3, every)
+        mode: Mode = "every" if every else "first" if first else "round"
+        run_campaign(root, todo, read_map(folder, root), results, workers, 1 if quick else 3, mode, left_out)
     verdicts = read_verdicts(results)
-    left_out = leave.split(",") if leave else []
     found = summary([without(verdicts[one.key], left_out) for one in chosen], equivalents())
     (out / "summary.json").write_text(json.dumps(found, indent=2) + "\n")
     if as_json:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import queue
-import resource
 import shutil
 import signal
 import subprocess
@@ -13,12 +11,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
@@ -26,8 +23,11 @@ import typer
 
 from tests.mutation.coverage_map import CoverageMap
 from tests.mutation.mutants import Mutant
+from tests.mutation.warm_pytest import WarmPytest
 
 Fate = Literal["killed", "survived", "uncovered"]
+Mode = Literal["round", "first", "every"]
+"""When a mutant's tests end: after the round that killed it, at the first test that fails, or never."""
 STAGES = ((25.0, 3), (60.0, 10_000), (120.0, 10_000))
 """For each round of tests its seconds at the most (without any fault) and how many cases of one test function.
 
@@ -38,8 +38,6 @@ _STARTING = 60
 """Processor seconds that starting pytest and compiling kernels may take, beside ten times what the tests take.
 
 Not time on the clock, for a busy machine must not make a mutant look as if it hung."""
-_WAITING = 3600.0
-"""Seconds after which a mutant that waits for ever, without computing, is given up."""
 
 
 @dataclass(frozen=True)
@@ -85,24 +83,25 @@ def run_campaign(
     results: Path,
     workers: int,
     most: int = 3,
-    every: bool = False,
+    mode: Mode = "round",
+    last: Collection[str] = (),
     say: bool = True,
 ) -> None:
     """Try every mutant, in ``most`` rounds of tests, and add a line to the results as soon as its fate is known.
 
-    With ``every``, a mutant that a round has killed goes through the later rounds, too, for the rest of its killers.
+    Tests of ``last`` (files, functions or single cases) have rounds of their own after all others.
     """
-    with _copies(root, workers) as copies, ThreadPoolExecutor(workers) as pool:
-        free: queue.SimpleQueue[Path] = queue.SimpleQueue()
+    with _copies(root, workers) as copies, ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
+        free: queue.SimpleQueue[tuple[Path, WarmPytest]] = queue.SimpleQueue()
         for copy in copies:
-            free.put(copy)
+            free.put((copy, stack.enter_context(WarmPytest())))
 
         def work(mutant: Mutant) -> Verdict:
-            copy = free.get()
+            copy, warm = free.get()
             try:
-                return try_mutant(copy, mutant, known, most, every)
+                return try_mutant(warm, copy, mutant, known, most, mode, last)
             finally:
-                free.put(copy)
+                free.put((copy, warm))
 
         started, done = time.monotonic(), 0
         with results.open("a") as stream:
@@ -118,11 +117,18 @@ def run_campaign(
                     typer.echo(text, err=True)
 
 
-def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3, every: bool = False) -> Verdict:
+def try_mutant(
+    warm: WarmPytest,
+    copy: Path,
+    mutant: Mutant,
+    known: CoverageMap,
+    most: int = 3,
+    mode: Mode = "round",
+    last: Collection[str] = (),
+) -> Verdict:
     """Put a fault into a copy of the tree, run the tests that meet it, quick ones first, and take it out again."""
     started = time.monotonic()
-    covering = known.covering(mutant.path, mutant.line)
-    if not covering:
+    if not known.covering(mutant.path, mutant.line):
         return Verdict(mutant, "uncovered", (), 0, 0.0)
     file = copy / mutant.path
     source = file.read_bytes()
@@ -130,10 +136,10 @@ def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3, ev
     count = 0
     killers: list[str] = []
     try:
-        for tests in islice(rounds(covering, known), most):
+        for tests in chain(*(islice(rounds(part, mutant), most) for part in known.parts(last))):
             count += len(tests)
-            killers += _killers(copy, tests, sum(known.seconds[name] for name in tests))
-            if killers and not every:
+            killers += _killers(warm, copy, tests, sum(known.seconds[name] for name in tests), mode == "first")
+            if killers and mode != "every":
                 break
     finally:
         file.write_bytes(source)
@@ -141,8 +147,9 @@ def try_mutant(copy: Path, mutant: Mutant, known: CoverageMap, most: int = 3, ev
     return Verdict(mutant, fate, tuple(killers), count, time.monotonic() - started)
 
 
-def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
+def rounds(known: CoverageMap, mutant: Mutant) -> Iterator[list[str]]:
     """Tests of each round, which run together."""
+    covering = known.covering(mutant.path, mutant.line)
     files = {name.split("::")[0] for name in covering}
     whole = sorted(
         (name for name in known.seconds if name.split("::")[0] in files), key=lambda name: known.seconds[name]
@@ -166,46 +173,20 @@ def rounds(covering: list[str], known: CoverageMap) -> Iterator[list[str]]:
             yield tests
 
 
-def _killers(copy: Path, tests: list[str], seconds: float) -> list[str]:
-    """Those of the tests that fail."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "--tb=no",
-        "-rfE",
-        "-m",
-        "",
-    ]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+def _killers(warm: WarmPytest, copy: Path, tests: list[str], seconds: float, first: bool) -> list[str]:
+    """Those of the tests that fail, or the first of them."""
+    words = ["-q", "-n", "0", "-p", "no:cacheprovider", "--tb=no", "-rfE", "-m", "", *(["-x"] if first else [])]
     limit = _STARTING + int(10.0 * seconds)
+    told, arguments = copy / ".told", copy / ".arguments"
     # Arguments in a file: there can be thousands.
-    with tempfile.NamedTemporaryFile("w", suffix=".args", dir=copy) as arguments:
-        arguments.write("\n".join(tests))
-        arguments.flush()
-        try:
-            ended = subprocess.run(
-                [*command, f"@{arguments.name}"],
-                cwd=copy,
-                env=environment,
-                capture_output=True,
-                text=True,
-                timeout=_WAITING,
-                preexec_fn=partial(resource.setrlimit, resource.RLIMIT_CPU, (limit, limit + 5)),
-            )
-        except subprocess.TimeoutExpired:
-            return ["time"]
-    if ended.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+    arguments.write_text("\n".join(tests))
+    ended = warm.run(copy, [*words, f"@{arguments}"], told, limit)
+    if ended in (-signal.SIGXCPU, -signal.SIGKILL):
         return ["time"]
-    if ended.returncode == 0:
+    if ended == 0:
         return []
-    failed = [line for line in ended.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    return [line.split(" ", 1)[1].split(" - ")[0] for line in failed] or [f"exit {ended.returncode}"]
+    failed = [line for line in told.read_text().splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return [line.split(" ", 1)[1].split(" - ")[0] for line in failed] or [f"exit {ended}"]
 
 
 @contextmanager

@@ -6,15 +6,22 @@ Each file of tests has a process of its own, so that none profits from another's
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+import queue
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import coverage
 import typer
+
+from tests.mutation.warm_pytest import WarmPytest
+
+
+def belongs(name: str, tests: Collection[str]) -> bool:
+    """Whether a test is among some files, functions or single cases."""
+    return not {name, name.split("[")[0], name.split("::")[0]}.isdisjoint(tests)
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,12 @@ class CoverageMap:
         if "" in names:
             names = {name for found in by_line.values() for name in found}
         return sorted(names & self.seconds.keys(), key=lambda name: (self.seconds[name], name))
+
+    def parts(self, last: Collection[str]) -> tuple[CoverageMap, CoverageMap]:
+        """The map of all tests but some, and that of these."""
+        late = {name: seconds for name, seconds in self.seconds.items() if belongs(name, last)}
+        rest = {name: seconds for name, seconds in self.seconds.items() if name not in late}
+        return replace(self, seconds=rest), replace(self, seconds=late)
 
 
 def read_map(folder: Path, root: Path) -> CoverageMap:
@@ -66,22 +79,30 @@ def measure(root: Path, files: list[Path], places: tuple[str, ...], folder: Path
         The files for which nothing could be measured.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    free: queue.SimpleQueue[WarmPytest] = queue.SimpleQueue()
 
     def run(file: Path) -> bool:
         target = folder / (file.relative_to(root).as_posix().replace("/", "__") + ".coverage")
         if target.exists() and target.with_suffix(".json").exists():
             return True
-        environment = os.environ | {
+        more = {
             "TWIN_COVERED": ",".join(str(root / place) for place in places),
             "TWIN_COVERAGE_FILE": str(target),
-            "OPENBLAS_NUM_THREADS": "1",
         }
-        command = [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
-        subprocess.run(command, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        words = ["-q", "-n", "0", "-p", "tests.mutation.coverage_plugin", str(file)]
+        warm = free.get()
+        try:
+            ended = warm.run(root, words, target.with_suffix(".told"), more=more)
+        finally:
+            free.put(warm)
         done = target.exists() and target.with_suffix(".json").exists()
-        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}", err=True)
+        # tests that fail without any fault find none
+        fails = f"; some of its tests fail, see {target.with_suffix('.told')}" if ended == 1 else ""
+        typer.echo(f"{'coverage of' if done else 'NO coverage of'} {file.relative_to(root)}{fails}", err=True)
         return done
 
-    with ThreadPoolExecutor(workers) as pool:
+    with ExitStack() as stack, ThreadPoolExecutor(workers) as pool:
+        for _ in range(workers):
+            free.put(stack.enter_context(WarmPytest()))
         done = list(pool.map(run, files))
     return [file for file, good in zip(files, done, strict=True) if not good]

@@ -58,6 +58,9 @@ def test_what_runs_at_import_is_met_by_all_tests_of_the_file():
     known = CoverageMap({"toy.py": {2: ["", "b"], 7: ["a", "c"]}}, {"a": 2.0, "b": 1.0, "c": 0.5})
     assert known.covering("toy.py", (2, 2)) == ["c", "b", "a"]
     assert known.covering("toy.py", (7, 7)) == ["c", "a"]
+    rest, late = known.parts(["c"])
+    assert rest.covering("toy.py", (2, 2)) == ["b", "a"]
+    assert late.covering("toy.py", (2, 2)) == ["c"]
 
 
 def test_keys_differ_and_do_not_move_with_other_code():
@@ -80,6 +83,9 @@ def test_a_place_that_is_not_there_is_told(tmp_path):
     result = CliRunner().invoke(app, ["--out", str(tmp_path), "--only", "optics/lens.py"])
     assert result.exit_code == 2
     assert "optics/lens.py" in result.stderr
+    result = CliRunner().invoke(app, ["--out", str(tmp_path), "--without", f"@{tmp_path}/moved"])
+    assert result.exit_code == 2
+    assert f"{tmp_path}/moved" in result.stderr
 
 
 @pytest.mark.slow
@@ -98,6 +104,13 @@ def test_a_campaign_tells_the_found_from_the_survivors(tmp_path: Path):
         ("-x", "(x)"): "uncovered",
     }
     chosen = [one for one in mutants_below(root, ("toy.py",)) if (one.before, one.after) in wanted]
+    # At the first failure, and the quickest of the two that fail after the other.
+    quickest = min(("half", "two"), key=lambda name: known.seconds[f"tests/test_toy.py::test_{name}"])
+    last = [f"tests/test_toy.py::test_{quickest}"]
+    run_campaign(root, chosen, known, tmp_path / "first.jsonl", 2, mode="first", last=last, say=False)
+    one_each = read_verdicts(tmp_path / "first.jsonl").values()
+    assert [len(one.killers) for one in one_each if one.fate == "killed"] == [1]
+    assert all(without(one, last) == one for one in one_each)
     run_campaign(root, chosen, known, tmp_path / "results.jsonl", 2, say=False)
     found = read_verdicts(tmp_path / "results.jsonl")
     assert {(one.mutant.before, one.mutant.after): one.fate for one in found.values()} == wanted

@@ -104,6 +104,7 @@ def test_forward_mode_for_the_shape(backend, bare, rays, mirror: int, name: str)
     np.testing.assert_allclose(exact_path, (sides[0][2][0] - sides[1][2][0]) / (2 * h), rtol=1e-6, atol=1e-8)
 
 
+@pytest.mark.second
 def test_reverse_mode_is_the_transpose_of_forward_mode(backend, bare, rays) -> None:
     """d(sum w . out)/d(parameters) of all four elements in one backward sweep."""
     systems = assemble(bare, ["imaging"], [BASE])

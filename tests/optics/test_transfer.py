@@ -18,6 +18,7 @@ from optics.waves.pupil_stack import PupilFunction, PupilStack, circular_pupil, 
 from optics.waves.transfer import TransferTable, polychromatic_transfer
 from scenes.models.camera_model import IMAGE
 from tests.optics.test_imaging import PERTURBED, WAVELENGTH, Camera
+from tests.tiers import quick
 
 F_NUMBER = 9.2
 NODES = quadrature.disk(12, 48)
@@ -281,7 +282,7 @@ def test_polychromatic_mean(traced: PupilFunction) -> None:
     assert got.shape == (2, 30)
 
 
-@pytest.mark.parametrize(("band", "dz"), [(BAND, 0.0), (BAND, -1e-3), (BAND[:1], 3e-4)])
+@pytest.mark.parametrize(("band", "dz"), quick(1, [(BAND, 0.0), (BAND, -1e-3), (BAND[:1], 3e-4)]))
 def test_table(traced: PupilFunction, band: np.ndarray, dz: float) -> None:
     weights = np.linspace(1.0, 2.0, len(band))
     table = TransferTable.build(traced, band, weights, dz)

@@ -86,8 +86,8 @@ def test_inertial_frames_against_orekit(orekit: Path, epoch: str, frame: str) ->
         np.testing.assert_allclose(rate, np.array(found.getVelocity().toArray()), rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("epoch", quick(1, EPOCHS))
-@pytest.mark.parametrize("frame", quick(1, ["GCRS", "TEME"]))
+@pytest.mark.parametrize("epoch", EPOCHS)
+@pytest.mark.parametrize("frame", quick(0, ["GCRS", "TEME"]))
 def test_inertial_frames_against_astropy(epoch: str, frame: str) -> None:
     """astropy leaves the celestial pole's offsets out, and joins days by straight lines; at midnight both tables are
     the same. 1 um is rounding; TEME's sidereal time takes 1e-5 m more.

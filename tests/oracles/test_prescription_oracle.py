@@ -34,6 +34,7 @@ from tests.oracles.prescription_peers import (
     ours,
     read_alike,
 )
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 
 pytestmark = pytest.mark.oracle
@@ -57,7 +58,7 @@ zemax/tests/HoO-V2C18Ex03.zmx zemax/tests/HoO-V2C18Ex66.zmx zemax/tests/HoO-V2C1
 zemax/tests/US08011793-1.zmx zemax/tests/US08427765-1.ZMX zemax/tests/zmax_55278.zmx
 """.split()
 """Files of ray-optics against optiland."""
-SHIPPED = ("one_mirror_up_45deg", "simple_fold_mirror_up", "complicated_fold_mirrors_setup_v2", "lens1", "lens2")
+SHIPPED = ("one_mirror_up_45deg", "simple_fold_mirror_up", "lens1", "lens2", "complicated_fold_mirrors_setup_v2")
 """Files of optiland, which stand beside this one, against optiland."""
 REFUSED = {
     "codev/tests/CODV_65988.seq": (32, "a diffractive surface is not known here"),
@@ -108,7 +109,7 @@ def test_as_optiland_traces_samples_of_ray_optics(backend, name: str) -> None:
     held(backend, package("rayoptics") / name, Optiland)
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", quick(4, SHIPPED))
 def test_as_optiland_traces_its_samples(backend, name: str) -> None:
     package("optiland")
     held(backend, HERE / f"{name}.zmx", Optiland)
@@ -213,6 +214,7 @@ CUT = {"HSC/HSC_no_obsc.yaml": (750e-9, 8.2, 0.75), "LSST/LSST_r.yaml": (622e-9,
 """File -> wavelength and pupil, metres, and the field's radius, degrees."""
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("name", ["LSST/LSST_r.yaml", pytest.param("HSC/HSC_no_obsc.yaml", marks=pytest.mark.slow)])
 def test_wavefront_errors_of_cut_pupils_as_batoid_has_them(backend, name: str) -> None:
     """Rms without piston and tilt over the light that comes through, on the axis, between and in the field's corner."""

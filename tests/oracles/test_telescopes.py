@@ -204,6 +204,7 @@ def test_a_spider_as_poppy_has_it(backend) -> None:
     assert 0.5 < theirs[0] < theirs[1] < theirs[2] < 0.97
 
 
+@pytest.mark.second
 def test_annular_terms_of_lsst_as_batoids(backend) -> None:
     """Gram and Schmidt's over the light of a ring are Mahajan's; batoid fits 512 x 512 rays: to 1 %."""
     optics = batoids_telescope(backend, *LSST)
@@ -220,6 +221,7 @@ def test_annular_terms_of_lsst_as_batoids(backend) -> None:
     assert abs(wave.coefficients[3]) > 6.0 * wave.rms
 
 
+@pytest.mark.second
 def test_despace_of_lsst_in_annular_defocus(backend) -> None:
     """0.0153 um of annular Z4 for each um of M2 along the axis, as batoid has it."""
     optics = batoids_telescope(backend, *LSST)

@@ -67,6 +67,7 @@ def test_kinds_of_files(table) -> None:
     assert {form_of(case.target) for case in table.values()} >= {"yaml", "json", "table", "image", "text"}
 
 
+@pytest.mark.second
 def test_mutants_are_the_same_every_time(table) -> None:
     for name in ("lab-turntable", "check-geojson", "table-course", "frames-b", "lens-codev-wide", "mtf-fits"):
         case = table[name]

@@ -121,6 +121,7 @@ NAMED = [
 ]
 
 
+@pytest.mark.second
 @pytest.mark.parametrize(("file", "key", "change"), quick(1, NAMED), ids=[key for _, key, _ in NAMED])
 def test_named_edits(file, key, change, tmp_path, backend) -> None:
     """Spots lie on the middle of their CCDs, and the central prism is a closed body of the volume that its facets give

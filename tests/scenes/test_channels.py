@@ -151,7 +151,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(
-    ("changes", "key", "words"), quick(8, REFUSED), ids=[f"{k}-{i}" for i, (_, k, _) in enumerate(REFUSED)]
+    ("changes", "key", "words"), quick(5, REFUSED), ids=[f"{k}-{i}" for i, (_, k, _) in enumerate(REFUSED)]
 )
 def test_what_cannot_stand_is_told_at_its_line(changes, key, words, backend, tmp_path) -> None:
     """At the channel's own key where the file says it there; the line is that of the key, or of what holds it."""

@@ -153,6 +153,7 @@ def test_depth_of_an_overlap(bare, tmp_path) -> None:
 MOVE = re.compile(r"move it by ([+-])([xyz]) ([0-9.e+]+) mm of the base")
 
 
+@pytest.mark.second
 def test_what_is_told_takes_bodies_apart(bare, tmp_path) -> None:
     """A message says how far and along which axis the body that its key moves goes; moved so, it is free."""
     for change, _, _ in OVERLAPS:
@@ -267,6 +268,7 @@ def test_what_cannot_be_built_is_bad_input(changes, line, words, tmp_path) -> No
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.second
 def test_a_wide_beam_that_only_just_passes(backend, tmp_path) -> None:
     """The way back lies beside the way out, by which the prisms have to be wider than the face."""
     assert built(changed(tmp_path, ("aperture: 50 mm", "aperture: 57 mm")), backend)

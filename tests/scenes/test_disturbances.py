@@ -391,6 +391,7 @@ def test_what_a_job_says_wrong(tmp_path, case) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.second
 def test_what_another_instrument_does_not_have_is_told_once_for_each_pattern(tmp_path) -> None:
     """Cameras of other names: the file is of another instrument, while those of the library are of any camera."""
     instrument = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text("utf-8")

@@ -28,6 +28,7 @@ def built(backend, other: CameraSpec) -> Instrument:
     return build_instrument(spec, {"gf7": GF7, "other": other}, backend)
 
 
+@pytest.mark.second
 def test_terms_that_one_camera_lacks_are_zero(backend) -> None:
     """The forward camera, which has no A8, sees what it sees beside its like."""
     terms = dict(GF7.mirrors["M3"].aspheric)

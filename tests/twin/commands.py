@@ -8,9 +8,9 @@ from typer import Typer
 from typer.testing import CliRunner
 
 
-def invoke(app: Typer, *arguments: object):
+def invoke(app: Typer, *arguments: object, **options: object):
     """A command: exit_code, stdout, stderr. An exception that is no exit is raised."""
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], **options)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result

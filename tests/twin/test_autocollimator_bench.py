@@ -58,6 +58,7 @@ def scatter_agrees(squares: float, freedom: int) -> bool:
     return bool(low < squares < high)
 
 
+@pytest.mark.second
 def test_ideal_images_satisfy_the_relations(reader: Reader, backend: Backend) -> None:
     p = SETUP.spec.programme
     series = [

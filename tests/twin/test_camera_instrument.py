@@ -148,6 +148,7 @@ def test_a_tilted_secondary_turns_the_line_of_sight(backend) -> None:
     assert abs(found["d_beta_arcsec"]) < 1e-6
 
 
+@pytest.mark.second
 def test_quality_is_that_of_the_camera_looked_at(run: JobRun, backend) -> None:
     """Two ways to the same numbers: image quality of an instrument, and a camera at fields, times the pixel."""
     assert run.quality is not None
@@ -164,6 +165,7 @@ def test_quality_is_that_of_the_camera_looked_at(run: JobRun, backend) -> None:
         np.testing.assert_allclose(values[:, 0], values[:, -1], atol=1e-6)
 
 
+@pytest.mark.second
 def test_errors_are_those_of_wavefronts(backend) -> None:
     """At the focal plane and beside it, for a free pupil and for one that edges cut."""
     for name, within in (("gf7", 1e-9), (RC, 2e-3)):
@@ -173,6 +175,7 @@ def test_errors_are_those_of_wavefronts(backend) -> None:
         np.testing.assert_allclose(optics.errors(fields)[:, 0], expected, rtol=within, atol=1e-6)
 
 
+@pytest.mark.second
 def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     spec = load_instrument("gf7_pair")
     sites = {
@@ -193,6 +196,7 @@ def test_a_pair_has_the_same_truth_without_its_monitor(backend) -> None:
     assert second["ground"] == pytest.approx(first["ground"], rel=1e-7)
 
 
+@pytest.mark.second
 def test_a_camera_with_lenses_of_an_unknown_glass_is_moved_and_not_warmed(backend) -> None:
     """In its colours: every wavelength by its own rays, about one place."""
     camera = colour_camera("achromat")
@@ -253,6 +257,7 @@ def test_half_a_monitor_is_refused() -> None:
 # --- where users meet it ---------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_a_script(backend) -> None:
     camera = twin.load_camera(RC)
     assert camera.perturbed(DESPACE).state == camera.perturbed({"M2": {"shift": "0 0 20 um"}}).state
@@ -272,6 +277,7 @@ def test_a_script(backend) -> None:
     assert shot.before.sizes["channel"] == 0
 
 
+@pytest.mark.second
 def test_runs_of_a_study(backend, run: JobRun) -> None:
     """States together are what each is by itself; a light that is lost costs its own run alone."""
     base = RenderBase()
@@ -286,6 +292,7 @@ def test_runs_of_a_study(backend, run: JobRun) -> None:
     assert "recovered" not in first
 
 
+@pytest.mark.second
 def test_the_live_page_has_what_the_job_has(run: JobRun) -> None:
     bench = LiveBench(twin.load(RC))
     hello = bench.greeting()

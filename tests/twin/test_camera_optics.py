@@ -96,6 +96,7 @@ def test_the_same_as_image_quality_says_in_an_instrument(backend, gf7_pair, obst
         assert mtf[k] * factor == pytest.approx(wanted, abs=2e-4)
 
 
+@pytest.mark.second
 def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
     """Wavefront, map over the field and through focus are of the same light, a tenth of which prisms take."""
     view = CameraOptics.within(gf7_pair, "forward", backend)

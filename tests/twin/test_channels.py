@@ -222,6 +222,7 @@ def test_frames_keep_what_glass_turns(backend, tmp_path) -> None:
 # --- path tracer, pictures --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("layout", quick(1, ["two", "hollow"]))
 def test_the_path_tracers_nominal_light_is_the_traced_light(layout, request, backend) -> None:
     """For every channel, with a reflector turned: places on the CCD and path lengths."""

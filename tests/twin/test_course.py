@@ -6,13 +6,13 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 import xarray as xr
-from typer.testing import CliRunner
 
 import twin.render as command
 from analysis.units import ARCSEC
@@ -23,12 +23,14 @@ from scenes.specs.load import load_job
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
 from tests.tiers import quick
+from tests.twin.commands import files, invoke
 from twin.main_job.monitor_reading import stated
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector
 from twin.monitor.time_series import run_series, series_states
 from twin.monitor.truth import trace_truth
 
+run = partial(invoke, command.app)
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = "base/forward/monitor/left/prism_180"
 JOB = f"""instrument: gf7_pair
@@ -50,13 +52,6 @@ FILES = {"course.json", "course.nc"} | {
 }
 
 
-def run(*arguments: object):
-    result = CliRunner().invoke(command.app, [str(argument) for argument in arguments])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
-
-
 def written(folder: Path, text: str = JOB) -> Path:
     path = folder / "job.yaml"
     path.write_text(text, "utf-8")
@@ -74,9 +69,9 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def prepared(folder, backend) -> MonitorExperiment:
-    """The experiment of the run, from its own config.yaml."""
-    return MonitorExperiment(resolve(folder / "config.yaml"), backend)
+def prepared(experiment) -> MonitorExperiment:
+    """The experiment of the run."""
+    return experiment("gf7_pair")
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +92,7 @@ def test_temperatures_of_a_time_add_to_the_perturbation(tmp_path) -> None:
     assert [moment(t) for t in job.course.times] == ["0 min", "12 min", "30 min"]
 
 
+@pytest.mark.second
 def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) -> None:
     """Truth, images and readings, bit for bit, from jobs that each describe the state of one time."""
     experiment, states = prepared, []
@@ -136,6 +132,7 @@ def test_a_course_is_its_states_one_by_one(folder, found, prepared, tmp_path) ->
     np.testing.assert_allclose(true, truth.ground_error(experiment.ground), atol=1e-9)
 
 
+@pytest.mark.second
 def test_filter_and_smoother_stand_beside_the_readings(found, tmp_path) -> None:
     """The first time knows its own measurement alone, which is the posterior; the last knows all, filtered or smoothed.
     The prisms' half kelvin of this job is seven times what `orbit` states; chi-square says so."""
@@ -182,6 +179,7 @@ def test_without_disturbances_nothing_is_smoothed(tmp_path, backend) -> None:
     assert "model" in told["ground"]
 
 
+@pytest.mark.second
 def test_the_time_in_detail_is_what_the_rest_of_the_run_shows(folder, found) -> None:
     recovered = json.loads((folder / "recovered.json").read_text())
     truth = json.loads((folder / "truth.json").read_text())
@@ -236,9 +234,9 @@ def test_the_series_does_not_depend_on_its_pieces(folder, prepared, monkeypatch)
 # --- the run folder ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.second
 def test_the_run_folder_holds_the_course(folder, found) -> None:
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    assert files >= FILES | {"recovered.json", "report.html", "manifest.json"}
+    assert files(folder) >= FILES | {"recovered.json", "report.html", "manifest.json"}
     manifest = json.loads((folder / "manifest.json").read_text())
     assert set(manifest["sha256"]) >= FILES
     with tifffile.TiffFile(folder / "images/forward_left_course.tiff") as file:
@@ -271,6 +269,7 @@ def test_the_run_folder_holds_the_course(folder, found) -> None:
         assert words in report
 
 
+@pytest.mark.second
 def test_config_holds_the_course(folder) -> None:
     again, first = resolve(folder / "config.yaml"), resolve(folder.parent / "job.yaml")
     assert again == first

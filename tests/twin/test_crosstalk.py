@@ -6,13 +6,14 @@ import pytest
 from analysis.monitor.monitoring import PARAMETERS, PER_SI
 from analysis.monitor.recovery import measure_spots
 from analysis.units import ARCSEC
+from tests.tiers import quick
 from twin.monitor.crosstalk import crosstalk
 from twin.monitor.truth import trace_truth
 
 PIXEL_NOISE = (1e-3) ** 2 * np.eye(8)  # px^2, weighs all coordinates alike
 
 
-@pytest.fixture(scope="module", params=["gf7_pair", "monitor_pair"])
+@pytest.fixture(scope="module", params=quick(1, ["gf7_pair", "monitor_pair"]))
 def table(request, experiment):
     setup = experiment(request.param)
     return setup, crosstalk(setup, PIXEL_NOISE)

@@ -91,6 +91,7 @@ def test_without_the_corrections_dirt_does_harm(bench):
         assert square > chi2.isf(1e-6, 2)
 
 
+@pytest.mark.second
 def test_clean_frames_are_not_touched(bench):
     found, told = squares(bench, (), range(2000, 2010))
     assert found.sum() < chi2.isf(1e-4, 20)
@@ -149,6 +150,7 @@ def test_other_centroids_are_corrected_as_well(bench, centroid):
             assert spot.cost != 0.0
 
 
+@pytest.mark.second
 def test_perturbed_instruments_are_not_taken_for_dirt(experiment):
     """Spots of instruments that are as far from nominal as launch leaves them have another shape, and are clean."""
     job = JobSpec.model_validate({"instrument": "gf7_pair", "disturbances": "launch"})
@@ -235,6 +237,7 @@ def test_frames_of_another_noise_than_stated_are_told(bench):
         assert noise_ratio(dirty.after, noise) is None
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("learnt", quick(1, [True, False]))
 def test_four_times_the_noise_is_noise(bench, learnt):
     """It was refused as frames that are unlike each other, or was told as a spot of another shape: defocus. No frame,

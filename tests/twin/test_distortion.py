@@ -84,6 +84,7 @@ def test_images_are_those_of_the_general_renderer():
     assert np.max(images) > 0.9
 
 
+@pytest.mark.second
 def test_pixel_sampling_moves_no_centroid():
     """Noise-free spots, shifted by a pixel in steps: the pinhole is wide enough for pixels of 7 um."""
     b = bench()
@@ -115,6 +116,7 @@ def test_line_follows_the_turn_and_the_middle_is_zero():
     assert abs(slope) == pytest.approx(1e-4 * 5.672, rel=0.01)
 
 
+@pytest.mark.second
 def test_spots_are_found_where_the_chief_rays_go():
     """Centroids, less the design's offset, against chief rays: noise and what the window cuts off."""
     r = run()

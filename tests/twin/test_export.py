@@ -189,6 +189,7 @@ def test_the_lines_of_a_mirror_camera() -> None:
         assert np.abs(there - np.stack([at, pixel], axis=-1)).max() < 0.01
 
 
+@pytest.mark.second
 def test_command(tmp_path: Path) -> None:
     path = write(tmp_path, ("lines: [forward, nadir, backward]", "lines: [forward, nadir]"))
     assert run("simulate", path, "--out", tmp_path / "run", "--seed", 5, "--quiet").exit_code == 0

@@ -95,6 +95,7 @@ def test_one_material_evenly_heated_keeps_its_angles(silica, tmp_path) -> None:
         assert np.max(np.abs(change.d_f)) < 1e-11
 
 
+@pytest.mark.second
 def test_a_table_of_displaced_nodes_of_the_same_mirror_is_added(silica, tmp_path) -> None:
     points = lattice(silica.thermal, M1, (9, 8, 4))
     write(tmp_path / "heat.csv", points, quadratic(points))
@@ -118,6 +119,7 @@ def test_a_table_of_displaced_nodes_of_the_same_mirror_is_added(silica, tmp_path
     np.testing.assert_allclose(both.grid.sag(u, v), sag, rtol=0, atol=0.02 * np.max(np.abs(heat.grid.values)))
 
 
+@pytest.mark.second
 def test_in_a_course_the_table_stays_and_the_course_is_added(silica, tmp_path) -> None:
     points = lattice(silica.thermal, M1, (7, 7, 3))
     write(tmp_path / "heat.csv", points, 0.5 + points @ np.array([0.2, 0.0, 0.1]))

@@ -52,6 +52,7 @@ def asked() -> ImagePointsSpec:
     return points
 
 
+@pytest.mark.second
 def test_map_points_are_where_the_sensor_has_them(flown: Simulation, control: MatchedPoints) -> None:
     """0.2 px: another season's light on a 5 m pixel; the predicted places are 10 to 35 px off. None of some 60 accepted
     may be wrong: 3 px are twenty sigmas."""
@@ -69,6 +70,7 @@ def test_map_points_are_where_the_sensor_has_them(flown: Simulation, control: Ma
     assert share == pytest.approx(0.25, abs=0.05)
 
 
+@pytest.mark.second
 def test_true_ground_is_the_map_less_its_errors(flown: Simulation, control: MatchedPoints) -> None:
     """Plan: 0.6 and -0.4 m and five times 0.5 m; height: five times 2 m, and slopes of 0.5 under 3 m."""
     east, north, height = flown.patch.frame.local(true_ground(flown.patch, control))

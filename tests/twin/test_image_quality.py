@@ -254,6 +254,7 @@ def test_a_line_that_moves_in_its_focal_plane(gf7_pair, backend) -> None:
     np.testing.assert_allclose(found.mtf_along_line[1], found.mtf_along_line[2], atol=1e-9)
 
 
+@pytest.mark.second
 def test_too_rough_a_wavefront_has_no_mtf_but_an_error(gf7_pair, backend) -> None:
     rough = {f"{ROOT}/M1": Motion(figure={60: 1e-6})}
     found = image_quality(gf7_pair, backend, [rough, {}]).cameras[CAMERA]

@@ -299,6 +299,7 @@ def test_bad_images(stack: Path, tmp_path: Path, spoil: Callable[[Path], object]
     assert "images.csv:" in text, text
 
 
+@pytest.mark.second
 def test_images_without_an_edge_are_told_and_have_no_weight(stack: Path) -> None:
     test = resolve_focus_test(stack / "focus.yaml").test
     before = align_files(test)  # type: ignore[arg-type]

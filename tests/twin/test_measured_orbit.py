@@ -397,6 +397,7 @@ def test_two_lines_calibrate(campaign, files) -> None:
         assert abs(error) < 5.0 * two.sigma[f"{line} f"]
 
 
+@pytest.mark.second
 def test_gross_errors_are_left_out_and_named(campaign, files) -> None:
     """A tenth of the image points moved by 10 to 30 pixels; the estimates stay within 2 sigmas of the clean ones."""
     random, wrong = np.random.default_rng(3), {}

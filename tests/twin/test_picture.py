@@ -98,6 +98,7 @@ def test_the_camera_of_a_direction_holds_all_points():
     )
 
 
+@pytest.mark.second
 def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
     """First hits of rays through Mitsuba's camera against vertices through ours."""
     points = points_in_world(build_scene(gf7_pair, paths))
@@ -115,6 +116,7 @@ def test_every_body_is_where_its_mesh_is_projected_to(gf7_pair, paths, seen):
     assert checked > 50
 
 
+@pytest.mark.second
 def test_bodies_fill_their_outline(gf7_pair, paths, seen):
     """The sign of every axis and the scale: what stands in full view reaches to all sides of its projected box."""
     points = points_in_world(build_scene(gf7_pair, paths))

@@ -156,6 +156,7 @@ def test_clocks_across_a_leap_second() -> None:
     assert (known_scale("gpst"), known_scale("GLO")) == ("GPS", "UTC")
 
 
+@pytest.mark.second
 def test_iers_tables_and_their_forms(tmp_path: Path) -> None:
     """C04 and finals2000A (of astropy's package) tell the same to the errors that they state, and so does CSV."""
     data = pytest.importorskip("astropy_iers_data")

@@ -9,6 +9,7 @@ from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
 from tests.scenes.test_camera_edges import dense_mtf
+from tests.tiers import quick
 from twin.camera.camera_optics import CameraOptics
 
 FEW, MANY = 10, 200
@@ -102,7 +103,7 @@ def is_right(backend, seed: int) -> bool:
     return True
 
 
-@pytest.mark.parametrize("seed", range(FEW))
+@pytest.mark.parametrize("seed", quick(3, range(FEW)))
 def test_a_telescope_drawn_at_random(backend, seed: int) -> None:
     assert is_right(backend, seed)
 

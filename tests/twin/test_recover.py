@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -12,13 +13,13 @@ import pytest
 import tifffile
 from astropy.io import fits
 from PIL import Image
-from typer.testing import CliRunner
 
 from analysis.images.image_file import recorded
 from analysis.spots.noise import NoiseModel
 from scenes.specs.measured.monitor_frames import resolve_measurement
 from scenes.specs.resolved import resolve
 from scenes.yaml.errors import InputError
+from tests.twin.commands import invoke
 from tests.twin.study_bench import ROOT
 from twin.main_job.monitor_reading import stated
 from twin.main_job.render_job import render_job
@@ -90,6 +91,7 @@ def test_packed_fits_and_listed_files_are_the_same_measurement(run, images, back
     assert found.last.recovered_dict() == run.recovered_dict()
 
 
+@pytest.mark.second
 def test_crops_other_counts_and_a_series(run, images, backend, tmp_path):
     """Parts of the CCD with their offsets, fewer frames after, three times of which the middle one is the state before:
     shifts agree with those of the whole frames within what the left out rings and frames say.
@@ -322,11 +324,7 @@ def test_a_tiff_says_when_it_was_recorded_in_exif(tmp_path):
     assert recorded(path)[0] == datetime(2026, 3, 1, 10, 0, 7, 250000, tzinfo=UTC)
 
 
-def call(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words], terminal_width=200)
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result
+call = partial(invoke, app, terminal_width=200)
 
 
 PLAIN = "forward/left: {before: a.tif, after: b.tif}"
@@ -421,8 +419,7 @@ def test_random_changes_of_the_file_never_end_in_a_traceback(images, tmp_path):
 @pytest.mark.slow
 def test_the_closed_loop_of_both_commands(tmp_path):
     """Run folder of twin.render -> its images -> twin.recover -> the same recovered.json; and again by config.yaml."""
-    words = [str(JOB), "--out", str(tmp_path / "run"), "--quiet"]
-    assert CliRunner().invoke(render_app, words).exit_code == 0
+    assert invoke(render_app, JOB, "--out", tmp_path / "run", "--quiet").exit_code == 0
     (tmp_path / "m.yaml").write_text(HEAD + "frames: run/images\n")
     assert call(tmp_path / "m.yaml", "--out", tmp_path / "one", "--quiet").exit_code == 0
     assert call(tmp_path / "one/config.yaml", "--out", tmp_path / "two", "--quiet").exit_code == 0

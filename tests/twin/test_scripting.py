@@ -451,6 +451,7 @@ def test_a_wrong_test_is_explained(name: str, changes: dict, says: str) -> None:
         twin.perform(name, "angle", **changes)
 
 
+@pytest.mark.second
 def test_a_camera_is_in_the_state_of_its_instrument(pair: twin.InstrumentTwin) -> None:
     """A despace of M2 shows in the camera that has it and nowhere else; a look of the whole camera is none."""
     bent = pair.perturbed({"base/forward/M2": {"shift": "0 0 30 um"}, "base/backward": {"rotate": "5 5 5 arcsec"}})

@@ -68,6 +68,7 @@ def differences(
     return np.asarray((4.0 * narrow - wide) / 3.0)
 
 
+@pytest.mark.second
 def test_every_part_is_there(motions, gf7_pair) -> None:
     assert len(motions) == 7 * len(gf7_pair.assembly.tree.bodies) + 5 * 6
     assert len({(m.body, m.kind, m.axis) for m in motions}) == len(motions)
@@ -101,6 +102,7 @@ def check_differences(path, motions: Sequence[ElementaryMotion], exact: np.ndarr
     return int(np.count_nonzero(seen))
 
 
+@pytest.mark.second
 def test_it_is_what_the_spots_do(path, motions, gradient) -> None:
     """All parts of both cameras but the monitor's prisms, the central prism and the base."""
     own = [k for k, m in enumerate(motions) if not any(part in m.body for part in ("monitor", "prism/"))]
@@ -113,6 +115,7 @@ def test_it_is_what_the_spots_do_for_every_part(path, motions, gradient) -> None
     assert check_differences(path, motions, gradient) > 220
 
 
+@pytest.mark.second
 def test_what_no_spot_sees(motions, gradient) -> None:
     """Zero, and zero up to rounding by a cancellation of terms of 1e6 px/rad and 1e5 px/m."""
     size = dict(zip((m.step for m in motions), np.abs(gradient).max(axis=(0, 1)), strict=True))
@@ -172,6 +175,7 @@ def test_pieces_of_the_beam_add_up(path, motions, gradient) -> None:
     np.testing.assert_allclose(pieces, gradient[..., ::7], rtol=1e-12, atol=1e-8)
 
 
+@pytest.mark.second
 def test_another_pivot_than_the_states_is_refused(path) -> None:
     body = f"{BASE}/forward/M1"
     about = {body: Motion(rotate=(1e-6, 0.0, 0.0), pivot="centre")}

@@ -65,6 +65,7 @@ def done(tmp_path_factory):
     return folder / "run", path, json.loads(out)
 
 
+@pytest.mark.second
 def test_files(done) -> None:
     folder, _, numbers = done
     assert {"study.nc", "study.csv", "study.json", "config.yaml", "report.html", "manifest.json"} <= files(folder)
@@ -75,6 +76,7 @@ def test_files(done) -> None:
     assert {"study.nc", "study.csv", "study.json", "report.html"} <= set(manifest["sha256"])
 
 
+@pytest.mark.second
 def test_dataset(done) -> None:
     folder, path, numbers = done
     with xr.open_dataset(folder / "study.nc", engine="h5netcdf") as data:
@@ -110,6 +112,7 @@ def test_dataset(done) -> None:
     assert path.exists()
 
 
+@pytest.mark.second
 def test_a_block_that_loses_a_run_keeps_the_others(done) -> None:
     """The last run moves a mirror by 3 mm; the runs of its block are there all the same."""
     with xr.open_dataset(done[0] / "study.nc", engine="h5netcdf") as data:
@@ -133,6 +136,7 @@ def test_two_workers_and_other_chunks_give_the_same_numbers(done, workers, tmp_p
         np.testing.assert_array_equal(result.sigmas[:, 0], data["df_sigma"].values)
 
 
+@pytest.mark.second
 def test_noise_that_cannot_be_is_bad_input_and_nothing_is_lost(done, monkeypatch, tmp_path) -> None:
     """Everything is written and shown; the file is to blame, at its key."""
     folder, path, numbers = done

@@ -99,6 +99,7 @@ def test_a_lost_run_fails_alone(study, backend) -> None:
     assert isinstance(wrong, Failure)
 
 
+@pytest.mark.second
 def test_shared_noise(study, backend) -> None:
     """Runs without a seed of their own have the base's noise: two that are alike give the same numbers."""
     place = ("job", "perturb", "base/forward/M2", "shift", 2)

@@ -41,6 +41,7 @@ def page(folder, study, values, failed=None) -> str:
     return words
 
 
+@pytest.mark.second
 def test_grid_of_two_numbers(tmp_path) -> None:
     study = study_of(
         "{a: {key: [job, a], values: [30 mm, 40 mm, 50 mm]}, b: {key: [job, b], range: [10 um, 80 um], count: 8}}",
@@ -145,6 +146,7 @@ def test_a_grid_with_holes_has_no_indices(tmp_path) -> None:
     assert "runs of the grid are missing" in page(tmp_path, study, {"y": x["a"] + x["b"]}, np.arange(9) == 4)
 
 
+@pytest.mark.second
 def test_columns_of_one_table_are_one_axis(tmp_path) -> None:
     table = "table: {{file: t.csv, column: {0}, values: [{1}]}}"
     study = study_of(

@@ -242,6 +242,7 @@ def test_against_brute_force(before_gf7, backend):
         assert exact.min() < 0.05 < 0.95 < exact.max()
 
 
+@pytest.mark.second
 @pytest.mark.parametrize("direction", quick(1, DIRECTIONS))
 def test_bars(sharp, aberrated, direction):
     """The contrast of Nyquist bars without noise, against the traced pupil, sharp and aberrated."""

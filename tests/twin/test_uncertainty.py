@@ -100,6 +100,7 @@ def test_sigmas_hold_in_a_few_states():
     assert np.all(found.rms(BEST) > 20.0 * noise)
 
 
+@pytest.mark.second
 def test_what_rests_on_the_stated_numbers(monkeypatch):
     """2 nm of coma of each mirror, that nobody measured: of the height's sigma they are three quarters of the
     elasticity, and twice as large they make it 1.8 times as large. Warnings of the instrument are the run's.
@@ -243,7 +244,7 @@ def run(tmp_path, *words):
     return invoke(command.app, *words, "--out", tmp_path / "out")
 
 
-@pytest.mark.parametrize("states", quick(1, [2, 8]))
+@pytest.mark.parametrize("states", quick(0, [2, 8]))
 def test_the_command_says_what_limits(tmp_path, states):
     result = run(tmp_path, "gf7_pair", "--states", str(states), "--seed", "5")
     assert result.exit_code == 0, result.output

@@ -173,7 +173,7 @@ def test_the_common_reference_is_a_change_of_both_cameras(job) -> None:
 @pytest.mark.parametrize(
     ("figure", "words"),
     [
-        ("{Z5: 20 nm}", f"{OUTSIDE} (M1 figure Z5 (astigmatism), 20 nm)"),
+        pytest.param("{Z5: 20 nm}", f"{OUTSIDE} (M1 figure Z5 (astigmatism), 20 nm)", marks=pytest.mark.second),
         pytest.param("{Z11: 20 nm}", "does not model base/forward/M1", marks=pytest.mark.slow),
     ],
 )
@@ -331,6 +331,7 @@ def test_a_change_is_what_the_cameras_parameters_make_of_it(job) -> None:
         assert row[4 + k] != 0.0
 
 
+@pytest.mark.second
 def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
     """A line that turns 60 times as far as `launch` says; the common reference, where mirrors stand still."""
     still = "disturbances: {file: launch, without: [mirror_mounts, camera_mounts]}"
@@ -354,6 +355,7 @@ def test_motions_far_from_what_is_stated_are_found_out(job) -> None:
         assert "contradict it" in assumed(run.reading)
 
 
+@pytest.mark.second
 def test_a_body_of_which_nothing_is_stated_is_named_as_such(job) -> None:
     more = "disturbances: {file: launch, without: [mirror_mounts, mirror_figure, camera_mounts, moisture, heat]}"
     run = job("{base/forward/M1: {rotate: [3 arcsec, 0 arcsec, 0 arcsec]}}", more)
@@ -401,6 +403,7 @@ def test_a_job_that_moves_what_it_does_not_state_says_so(job) -> None:
     assert "of backward" not in warning
 
 
+@pytest.mark.second
 def test_a_job_within_its_statement_is_not_warned_of(job) -> None:
     """As little as one that moves more than is stated and is read rightly all the same."""
     for perturb in (

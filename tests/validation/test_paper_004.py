@@ -170,7 +170,7 @@ def test_only_what_is_needed_runs(monkeypatch):
 @pytest.mark.parametrize(
     ("identifier", "which", "part", "keys"),
     quick(
-        1,
+        0,
         [
             ("004.turntable.repeat", 1, ("reference",), ("gross_error",)),
             ("004.turntable.repeat", 0, ("dividing_error", "reference"), ("repeatability", "noise")),

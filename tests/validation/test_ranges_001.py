@@ -63,6 +63,7 @@ def test_larger_ccds_read_the_same_positions(bench, wide):
     assert wide.positions([{}]) == pytest.approx(bench.positions([{}]), abs=1e-4)
 
 
+@pytest.mark.second
 def test_the_edge_of_the_window_is_where_the_centroid_refuses(bench, wide):
     found = single_range(bench, wide, "d_beta", 1, 3)
     motion, unit = motion_of("forward", "d_beta", bench.geometry("forward"))

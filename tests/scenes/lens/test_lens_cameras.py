@@ -216,6 +216,7 @@ ZERNIKE = (
 )
 
 
+@pytest.mark.second
 def test_a_freeform_of_zernike_terms_goes_in_and_out(tmp_path: Path, backend) -> None:
     """As a camera's own sag, and out again with a figure error about another middle on top of it."""
     path = tmp_path / "freeform.zmx"
