@@ -38,7 +38,8 @@ from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
-from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
+from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack
+from optics.waves.pupil_terms import products, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
 from scenes.models.instrument_model import Instrument
