@@ -36,6 +36,10 @@ CUT_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
 near the rims of fast aspheres, where no polynomial of a round pupil is the best one.
 """
 
+CUT_RINGS = 20
+"""Rings of the quadrature of a pupil with cut edges: a thin ring or a crescent of light has to hold rays enough for
+polynomials."""
+
 CUT_RESIDUAL = 1e-4
 """Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may
 leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.

@@ -27,16 +27,13 @@ from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import DEGREE, PupilFunction, fit_pupils
+from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
-
-CUT_RINGS = 20
-"""Those of a camera with edges: a thin ring or a crescent of light has to hold rays enough for polynomials."""
 
 MAP_POINTS = 7
 MAP_ORDER = 4
