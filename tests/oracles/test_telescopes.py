@@ -15,6 +15,7 @@ from scipy.special import j1
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.batoid_writer import batoid_text
@@ -111,8 +112,13 @@ def test_mtf_of_lsst_as_by_an_fft_of_its_own_file(backend, field) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("field", FIELDS, ids=str)
 def test_mtf_of_hsc_as_by_an_fft_of_its_own_file(backend, field) -> None:
-    """26 edges, two pairs of vanes that do not meet; off the axis most dark rays pass the rims of lenses far outside."""
+    """26 edges, two pairs of vanes that do not meet; off the axis dark rays pass the rims of lenses far outside."""
     optics = batoids_telescope(backend, *HSC)
+    if abs(field[0] * field[1]) == 1.0:
+        # at the end of the diagonal the wavefront of the crescent of light runs on into the dark too steeply
+        with pytest.raises(UnphysicalError, match="too steep in what is dark"):
+            optics.pupils([field])
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / HSC[0]))
