@@ -18,7 +18,7 @@ from optics.geometry.polygon import area, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
-from optics.waves.pupil_stack import LOOSELY, products, to_terms
+from optics.waves.pupil_terms import products, smooth_terms, to_terms
 
 DEGREE = 10
 """Degree of the polynomials that map the stop to a surface."""
@@ -183,7 +183,7 @@ def outlines_on_stop(
         nodes: quadrature over the stop's unit disk.
         round_sides: of the polygon that stands for a round edge.
         lit: which rays no edge before the surface stops, (B, N); None for all. Where light is stopped already, nothing
-            is left to be cut, and the polynomials follow it loosely.
+            is left to be cut, and the polynomials go on smoothly.
 
     Raises:
         UnphysicalError: places that no polynomials follow, as of a surface near a focus.
@@ -205,7 +205,7 @@ def outlines_on_stop(
     terms = to_terms(nodes, DEGREE) @ places
     worst = missed(terms)
     if not worst < WORST_FIT and not np.all(lit):
-        terms = _followed_places(places, nodes, lit, known)
+        terms = smooth_terms(products(nodes.x, nodes.y, DEGREE), nodes.weight, lit, places)
         worst = missed(terms)
     if not worst < WORST_FIT:
         raise UnphysicalError(
@@ -234,14 +234,6 @@ def _idle(edge: Edge, around: np.ndarray, lit: np.ndarray) -> bool:
     if edge.blocks or (isinstance(edge.shape, Circle) and edge.shape.inner):
         return False
     return bool(np.all(edge.passes(around[..., 0], around[..., 1]), where=lit))
-
-
-def _followed_places(places: np.ndarray, nodes: PupilNodes, lit: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Coefficients of polynomials through places (B, N, 2), which follow those that are not lit, (B, N), loosely."""
-    design = products(nodes.x, nodes.y, DEGREE)
-    weight = nodes.weight * np.where(lit, 1.0, np.where(known, LOOSELY, 0.0))
-    turned = np.swapaxes(design * weight[..., None], 1, 2)
-    return np.linalg.solve(turned @ design, turned @ np.where(known[..., None], places, 0.0))
 
 
 _AROUND = 1.1

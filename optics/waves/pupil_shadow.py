@@ -24,6 +24,7 @@ from optics.geometry.polygon import (
     sides,
     widened,
 )
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import gauss
 from optics.waves.pupil_edge import PupilEdge
 
@@ -158,7 +159,7 @@ class PupilShadow:
             shared = intersect(self.pieces[at, first, :many], normal, limit)
             shared_points[some], shared_weights[some] = quadrature(shared, count)
             if not np.all(np.abs(np.sum(shared_weights[some], axis=-1) - np.abs(area(shared))) < _ROOM):
-                raise ArithmeticError("what two shadows share came out of another size than it has")
+                raise UnphysicalError("what two shadows share came out of another size than it has")
         return ShadowParts(
             pupil=np.concatenate([full_at[0], b, pair[0]]),
             step=np.concatenate([full_at[1], s, pair[1]]),
@@ -438,7 +439,7 @@ def quadrature_within(polygons: np.ndarray, radius: np.ndarray, count: int) -> t
     points, weights = from_boundary(np.stack([every.real, every.imag], axis=-1), rises, low, high, count)
     total = np.sum(weights, axis=-1)
     if not np.all((total > -_ROOM) & (total < np.abs(area(polygons)) + _ROOM)):
-        raise ArithmeticError("a part of a shadow within the pupil came out larger than the whole of it")
+        raise UnphysicalError("a part of a shadow within the pupil came out larger than the whole of it")
     return points, weights
 
 

@@ -13,28 +13,32 @@ frequencies and one focus, where code for one pupil spends its time on calls and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
-from numpy.polynomial import chebyshev
 
-from optics.numerics.physical_error import PhysicalError, UnphysicalError
+from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.numerics.threads import one_blas_thread
 from optics.waves.diffraction import PupilField
 from optics.waves.pupil_edge import PupilEdge
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, PupilShadow, in_rows
+from optics.waves.pupil_terms import FAINTLY, orders, polynomials, products, slopes, smooth_terms, to_terms
 
 DEGREE = 8
 """Degree of the polynomials. The library's gf7 leaves 1e-8 wavelengths of eikonal, nominal or perturbed; with 5 nm of
 every Zernike term to seventh order on each mirror it leaves 2e-5."""
 
-CUT_DEGREES = (DEGREE, 10, 12, 14)
-"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Outside the light, in the middle
-of an obscured beam, a polynomial wavefront may bend much more than inside.
+CUT_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
+"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Light that edges leave comes from
+near the rims of fast aspheres, where no polynomial of a round pupil is the best one.
 """
+
+CUT_RINGS = 20
+"""Rings of the quadrature of a pupil with cut edges: a thin ring or a crescent of light has to hold rays enough for
+polynomials."""
 
 CUT_RESIDUAL = 1e-4
 """Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may
@@ -51,10 +55,9 @@ LEAST_SHADOW = 2
 """Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
 function is then right to 2e-6, and to 5e-5 with shadows."""
 
-LOOSELY = 1e-2
-"""Weight of a node in a shadow, of one in the light. """
+EVENLY = 1e-2
+"""As ``FAINTLY``, of direction cosines and amplitudes, which vary so little that nothing has to be added to them."""
 
-_EDGE_SAMPLES = 32
 _AT_ONCE = 2**14
 """Points of overlaps worked on together: some arrays of 1 MB that stay in the cache."""
 _SHADOWS_AT_ONCE = 2**16
@@ -111,40 +114,53 @@ class PupilStack:
             degree: of the polynomials.
             shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for free beams.
             rim_sides: of the polygon that stands for the edge where a shadow reaches over it.
-            lit: which nodes lie outside of the shadows, (B, N); None for all. The polynomials follow the others
-                loosely: what is said of the light there is taken off again.
+            lit: which nodes lie outside of the shadows, (B, N); None for all. What the others hold, NaN too, is not
+                looked at: what the polynomials say there is taken off again, see ``smooth_terms``.
 
         Raises:
             ValueError: too few nodes for the degree.
         """
         root = np.sqrt(nodes.weight)
-        i, j = _orders(degree)
-        solve = to_terms(nodes, degree)
-        terms = np.stack([u, v], axis=1) @ solve.T
+        i, j = orders(degree)
+        cosines = np.stack([u, v], axis=1)
+        if lit is None:
+            terms = cosines @ to_terms(nodes, degree).T
+        else:
+            on_stop = products(nodes.x, nodes.y, degree)
+            terms = smooth_terms(on_stop, nodes.weight, lit, np.swapaxes(cosines, 1, 2), EVENLY).swapaxes(1, 2)
+            cosines = np.where(lit[:, None], cosines, terms @ on_stop.T)
         centre, axes, harmonics = _edges(terms, degree)
-        (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in _slopes(nodes, degree))
+        (ux, vx), (uy, vy) = (np.moveaxis(terms @ slope.T, 1, 0) for slope in slopes(nodes, degree))
         density = amplitude / (nodes.weight * np.abs(ux * vy - uy * vx))
-        place = np.linalg.solve(axes, np.stack([u, v], axis=1) - centre[..., None])
-        design = products(place[:, 0], place[:, 1], degree) * root[:, None]
-        both = np.stack([eikonal, density], axis=-1) * root[:, None]
-        counted = np.ones(1) if lit is None else np.where(lit, 1.0, LOOSELY)[..., None]
-        turned = np.swapaxes(design * counted, 1, 2)
-        solution = np.linalg.solve(turned @ design, turned @ both)
-        told, weight = (both - design @ solution) ** 2, np.sum(nodes.weight)
-        if lit is not None:
-            told, weight = told * lit[..., None], (lit @ nodes.weight)[:, None]
-        rest = np.sqrt(np.sum(told, axis=1) / weight)
+        place = np.linalg.solve(axes, cosines - centre[..., None])
+        plain = products(place[:, 0], place[:, 1], degree)
+        design = plain * root[:, None]
+        both = np.stack([eikonal, density], axis=-1)
+        if lit is None:
+            turned, weight = np.swapaxes(design, 1, 2), np.sum(nodes.weight)
+            solution = np.linalg.solve(turned @ design, turned @ (both * root[:, None]))
+        else:
+            parts = zip((both[..., :1], both[..., 1:]), (FAINTLY, EVENLY), strict=True)
+            solution = np.concatenate([smooth_terms(plain, nodes.weight, lit, *part) for part in parts], axis=-1)
+            both = np.where(lit[..., None], both, plain @ solution)
+            weight = (lit @ nodes.weight)[:, None]
+        both = both * root[:, None]
+        rest = np.sqrt(np.sum((both - design @ solution) ** 2, axis=1) / weight)
         level = i + j < 2
         plane = (design[..., level] @ solution[:, level, :1])[..., 0]
         bent = (both[..., 0] - plane) / root
         table = np.zeros((2, len(u), degree + 1, degree + 1))
         table[:, :, i, j] = np.moveaxis(solution, -1, 0)
+        mean = np.mean(density, axis=-1) if lit is None else np.mean(density, axis=-1, where=lit)
         shadow = None
         if shadows is not None and shadows.shape[1]:
-            corner = products(shadows[..., 0], shadows[..., 1], degree).reshape(len(u), -1, len(i))
+            # where no rays are followed, polynomials of high degree run away beyond the rim, and p is nearly the stop's
+            within = shadows if lit is None else shadows / np.maximum(np.hypot(*shadows.T).T, 1.0)[..., None]
+            corner = products(within[..., 0], within[..., 1], degree).reshape(len(u), -1, len(i))
             place = np.linalg.solve(axes, terms @ corner.swapaxes(1, 2) - centre[..., None])
-            shadow = PupilShadow.within(place.swapaxes(1, 2).reshape(shadows.shape), harmonics, rim_sides)
-        span, amplitude_rest = np.ptp(bent, axis=-1), rest[:, 1] / np.mean(density, axis=-1)
+            place = place.swapaxes(1, 2).reshape(shadows.shape) + (shadows - within)
+            shadow = PupilShadow.within(place, harmonics, rim_sides)
+        span, amplitude_rest = np.ptp(bent, axis=-1), rest[:, 1] / mean
         return cls(centre, axes, harmonics, table[0], table[1], span, rest[:, 0], amplitude_rest, shadow)
 
     @property
@@ -294,40 +310,6 @@ class PupilStack:
         return clear_power(self.harmonics, self.amplitude_terms)
 
 
-def _orders(degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Orders (i, j) with i + j <= degree, (K,) each."""
-    i, j = np.indices((degree + 1, degree + 1))
-    keep = i + j <= degree
-    return i[keep], j[keep]
-
-
-def _series(x: np.ndarray, degree: int) -> np.ndarray:
-    """T_0 .. T_degree of x (B, P), shape (B, degree + 1, P)."""
-    out = np.empty((len(x), degree + 1, x.shape[1]))
-    out[:, 0], twice = 1.0, 2.0 * x
-    if degree:
-        out[:, 1] = x
-    for n in range(2, degree + 1):
-        np.multiply(twice, out[:, n - 1], out=out[:, n])
-        out[:, n] -= out[:, n - 2]
-    return out
-
-
-def polynomials(tables: Iterable[np.ndarray], p: np.ndarray) -> list[np.ndarray]:
-    """Sums of T_i(x) T_j(y) at the same points.
-
-    Args:
-        tables: their coefficients, each (B, D + 1, D + 1).
-        p: points x + iy, complex (B, P).
-
-    Returns:
-        For each table the sums, (B, P).
-    """
-    tables = tuple(tables)
-    x, y = (_series(part, tables[0].shape[-1] - 1) for part in (p.real, p.imag))
-    return [np.einsum("bip,bip->bp", table @ y, x) for table in tables]
-
-
 def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarray:
     """Integral of the amplitude's square over pupils in p, no shadows in them, (B,).
 
@@ -342,58 +324,18 @@ def clear_power(harmonics: np.ndarray, amplitude_terms: np.ndarray) -> np.ndarra
     return np.asarray(np.sum(amplitude**2 * weight, axis=-1))
 
 
-def products(x: np.ndarray, y: np.ndarray, degree: int) -> np.ndarray:
-    """Products T_i(x) T_j(y) of Chebyshev's polynomials with i + j <= degree at points of any shape, (..., K).
-
-    Args:
-        x: in [-1, 1], any shape.
-        y: of the same shape.
-        degree: highest i + j.
-    """
-    tx, ty = chebyshev.chebvander(x, degree), chebyshev.chebvander(y, degree)
-    out = np.empty((*np.shape(x), (degree + 1) * (degree + 2) // 2))
-    first = 0
-    for i in range(degree + 1):  # in the order of ``_orders``
-        count = degree + 1 - i
-        np.multiply(tx[..., i : i + 1], ty[..., :count], out=out[..., first : first + count])
-        first += count
-    return out
-
-
-@lru_cache(maxsize=8)
-def to_terms(nodes: PupilNodes, degree: int) -> np.ndarray:
-    """From values at nodes of the stop to coefficients of ``products``, by least squares, (K, N).
-
-    Raises:
-        ValueError: too few nodes for the degree.
-    """
-    root = np.sqrt(nodes.weight)
-    stop = products(nodes.x, nodes.y, degree) * root[:, None]
-    if nodes.count < stop.shape[1] or np.linalg.matrix_rank(stop) < stop.shape[1]:
-        raise ValueError(f"{nodes.count} nodes do not determine polynomials of degree {degree}; trace more")
-    return np.asarray(np.linalg.pinv(stop) * root)
-
-
-def _slopes(nodes: PupilNodes, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of ``products`` along x and along y at the nodes, (N, K) each."""
-    i, j = _orders(degree)
-    derive = chebyshev.chebder(np.eye(degree + 1), axis=0)
-    tx, ty = (chebyshev.chebvander(c, degree) for c in (nodes.x, nodes.y))
-    dx, dy = tx[:, :-1] @ derive, ty[:, :-1] @ derive
-    return dx[:, i] * ty[:, j], tx[:, i] * dy[:, j]
-
-
 def _edges(terms: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (B, 2), axes (B, 2, 2) and harmonics (2H + 1, B) of the images of the unit circle by maps (B, 2, K)."""
-    angle = 2.0 * np.pi * np.arange(_EDGE_SAMPLES) / _EDGE_SAMPLES
+    samples = 4 * degree
+    angle = 2.0 * np.pi * np.arange(samples) / samples
     rim = terms @ products(np.cos(angle), np.sin(angle), degree).T
-    harmonic = np.fft.fft(rim, axis=-1) / _EDGE_SAMPLES
+    harmonic = np.fft.fft(rim, axis=-1) / samples
     centre = harmonic[..., 0].real
     # u = centre + 2 Re(h e^{ia}): the ellipse of the first harmonic
     axes = 2.0 * np.stack([harmonic[..., 1].real, -harmonic[..., 1].imag], axis=-1)
     place = np.linalg.solve(axes, rim - centre[..., None])
     order = np.arange(-degree, degree + 1)
-    harmonics = (np.fft.fft(place[:, 0] + 1j * place[:, 1], axis=-1) / _EDGE_SAMPLES)[:, order].T
+    harmonics = (np.fft.fft(place[:, 0] + 1j * place[:, 1], axis=-1) / samples)[:, order].T
     harmonics[np.abs(order) <= 1] = np.array([0.0, 0.0, 1.0])[:, None]
     return centre, axes, harmonics
 
@@ -476,27 +418,22 @@ class PupilFunction:
         return float(power * abs(np.linalg.det(self.axes)))
 
 
-class RoughWavefrontError(PhysicalError, ValueError):
-    """A wavefront that the polynomials of a pupil do not follow."""
-
-
 def fit_pupils(
     field: PupilField,
     nodes: PupilNodes,
     degree: int = DEGREE,
     shadows: np.ndarray | None = None,
     lit: np.ndarray | None = None,
-    worst_residual: float = WORST_RESIDUAL,
 ) -> tuple[PupilFunction, ...]:
     """Smooth pupils of B images.
 
     Args:
         field: traced at ``nodes`` of the stop.
         nodes: quadrature over the stop's unit disk, without a hole.
-        degree: of the polynomials for the map from the stop, the eikonal and the amplitude.
+        degree: of the polynomials for the map from the stop, the eikonal and the amplitude; with ``lit`` that of the
+            first of ``CUT_DEGREES`` that follows the light is taken.
         shadows: polygons on the stop's unit disk that do not overlap, (B, K, V, 2); None for a free beam.
-        lit: which nodes lie outside of the shadows, (B, N), as of ``PupilStack.fit``.
-        worst_residual: rms eikonal that the fit may leave in the light, wavelengths.
+        lit: which nodes lie outside of the shadows of edges, (B, N), as of ``PupilStack.fit``.
 
     Returns:
         B pupils.
@@ -505,23 +442,27 @@ def fit_pupils(
         ValueError: a node carries no light (a beam cut by another aperture than the stop is not modelled), too few
             nodes for the degree, an edge far from an ellipse, or a wavefront that the polynomials do not follow.
     """
-    dark = np.any(field.amplitude == 0.0, axis=-1)
+    stopped = ~(field.amplitude > 0.0) & (True if lit is None else lit)
+    dark = np.any(stopped, axis=-1)
     if np.any(dark):
         which = int(np.argmax(dark))
-        share = float(np.mean(field.amplitude[which] == 0.0))
+        share = float(np.mean(stopped[which]))
         raise UnphysicalError(
             f"{share:.1%} of the pupil of image {which} carries no light: a beam that another aperture than the stop "
             "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
         )
     with one_blas_thread():
-        stack = PupilStack.fit(
-            field.u, field.v, field.eikonal, field.amplitude, nodes, degree, shadows, rim_sides=RIM_SIDES, lit=lit
-        )
+        for used in (degree,) if lit is None else CUT_DEGREES:
+            stack = PupilStack.fit(
+                field.u, field.v, field.eikonal, field.amplitude, nodes, used, shadows, RIM_SIDES, lit
+            )
+            if np.all(stack.residual <= CUT_RESIDUAL * field.wavelength):
+                break
     worst = int(np.argmax(stack.residual))
-    if stack.residual[worst] > worst_residual * field.wavelength:
-        raise RoughWavefrontError(
-            f"polynomials of degree {degree} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
-            f"the wavefront of image {worst} (at most {worst_residual:g}); raise the degree, with nodes enough for it"
+    if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
+        raise UnphysicalError(
+            f"polynomials of degree {used} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
+            f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}): it is too rough for a pupil"
         )
     return tuple(
         PupilFunction(

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.numerics.quadrature import gauss
-from optics.waves.pupil_stack import PupilFunction, products
+from optics.waves.pupil_stack import PupilFunction
+from optics.waves.pupil_terms import products
 
 ACROSS, ALONG, IN_SHADOW = 24, 18, 12
 """Nodes across and along the chords of an overlap, and along each side of a shadow's box: with a wave of error at the

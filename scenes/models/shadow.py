@@ -30,7 +30,7 @@ from optics.raytrace.trace import make_rays, trace
 from optics.waves.edge_shadow import StopOutlines, nodes_in_shadows, outlines_on_stop, settled_shadows
 from optics.waves.imaging import ImagingRays
 from optics.waves.pupil_shadow import SMALLEST, separate
-from optics.waves.pupil_stack import products, to_terms
+from optics.waves.pupil_terms import products, to_terms
 from scenes.models.camera_model import CameraModel
 from scenes.models.clearance import convex_bodies
 from scenes.models.instrument_model import Instrument

@@ -19,6 +19,7 @@ from optics.waves.edge_shadow import (
 )
 from optics.waves.lit_stop import LitStop, holes
 from optics.waves.pupil_shadow import separate
+from optics.waves.pupil_terms import products, smooth_terms
 from tests.tiers import quick
 
 NODES = quadrature.disk(14)
@@ -165,3 +166,18 @@ def test_a_stop_without_its_shadows() -> None:
     ):
         assert np.isnan(holes(settled_shadows(by_sides(edges), 1)[0])[0])
     assert nodes_in_shadows(np.zeros((2, 0, 3, 2)), 4)[0].shape == (2, 0)
+
+
+def test_polynomials_follow_the_light_and_stay_near_it_in_the_dark() -> None:
+    """Rays in the dark, wild ones and those that are lost, change nothing; a crescent's wavefront is followed."""
+    nodes = quadrature.disk(20)
+    lit = (nodes.y < 0.35 + 0.1 * nodes.x) & (np.hypot(nodes.x, nodes.y) > 0.25)
+    wave = np.cos(3.0 * nodes.x + nodes.y) + 0.02 * nodes.x**12
+    design = products(nodes.x, nodes.y, 16)
+    wild = np.where(lit, wave, np.where(nodes.x > 0.0, np.nan, 1e6 * nodes.y))
+    terms, same = (smooth_terms(design, nodes.weight, lit[None], one[None, :, None]) for one in (wild, wave))
+    assert np.array_equal(terms, same)
+    told = design @ terms[0, :, 0]
+    assert np.std((told - wave)[lit]) < 1e-4
+    # and runs no farther in the dark
+    assert np.ptp(told) < 2.0 * np.ptp(wave[lit])

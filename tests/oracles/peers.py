@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from optics.geometry.aperture import Circle
 from scenes.models.camera_model import IMAGE, CameraModel
+from tests.own_trace import OwnCamera
 
 
 def batoid_camera(model: CameraModel, apertures: bool = False) -> Any:
@@ -75,6 +79,97 @@ def batoid_rays(position: np.ndarray, direction: np.ndarray, wavelength: float =
     both = (position, np.broadcast_to(direction, position.shape))
     columns = [np.ascontiguousarray(a[:, i]) for a in both for i in range(3)]
     return batoid.RayVector(*columns, np.zeros(n), np.full(n, wavelength))
+
+
+@dataclass(frozen=True, eq=False)
+class PeerRays:
+    """Rays at the image in the prescription frame: places r and directions v, (N, 3), metres, and paths t, (N,)."""
+
+    r: np.ndarray
+    v: np.ndarray
+    t: np.ndarray
+
+
+Tracer = Callable[[np.ndarray, np.ndarray, float], PeerRays]
+"""From points (N, 3) of a plane wavefront along a direction (3,) at a wavelength, metres."""
+
+
+def _by_batoid(model: CameraModel) -> Tracer:
+    peer = batoid_lenses(model)
+
+    def trace(start: np.ndarray, direction: np.ndarray, wavelength: float) -> PeerRays:
+        rays = batoid_rays(start, direction, wavelength)
+        peer.trace(rays)
+        assert not np.any(rays.vignetted | rays.failed)
+        rays.toCoordSys(type(peer.items[-1].coordSys)())
+        return PeerRays(rays.r, rays.v, rays.t)
+
+    return trace
+
+
+def _by_optiland(model: CameraModel) -> Tracer:
+    """With optiland's own glasses, by name."""
+    from optiland.materials import Material
+    from optiland.optic import Optic
+    from optiland.rays import RealRays
+
+    names = {"N-BK7": ("N-BK7", "schott"), "F2": ("F2", "schott"), "fused silica": ("SiO2", "Malitson")}
+    optic, spec = Optic(), model.spec
+    optic.surfaces.add(index=0, z=-np.inf)
+    for i, (name, surface) in enumerate(model.surfaces.items(), start=1):
+        face, shape = spec.mirrors[name], {"surface_type": "standard"}
+        if surface.even:
+            shape = {"surface_type": "even_asphere", "coefficients": [0.0, *surface.even]}
+        material = "mirror" if face.light is None else "air"
+        if face.glass is not None:
+            known, reference = names[face.glass.name]
+            material = Material(known, reference)
+        optic.surfaces.add(
+            index=i,
+            z=float(model.vertex(name)[2]),
+            radius=1.0 / surface.curvature if surface.curvature else np.inf,
+            conic=surface.conic,
+            material=material,
+            is_stop=name == spec.stop,
+            **shape,
+        )
+    optic.surfaces.add(index=len(model.surfaces) + 1, z=spec.image.z)
+    optic.wavelengths.add(1e6 * spec.wavelength, is_primary=True)
+    for surface in optic.surfaces:
+        if hasattr(surface.geometry, "tol"):
+            surface.geometry.tol = 1e-14
+
+    def trace(start: np.ndarray, direction: np.ndarray, wavelength: float) -> PeerRays:
+        n = len(start)
+        columns = [np.array(a[:, i]) for a in (start, np.broadcast_to(direction, start.shape)) for i in range(3)]
+        rays = RealRays(*columns, np.ones(n), np.full(n, 1e6 * wavelength))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numba's remarks on optiland's code
+            optic.surfaces.trace(rays, record=False)
+        place, way = np.stack([rays.x, rays.y, rays.z], axis=-1), np.stack([rays.L, rays.M, rays.N], axis=-1)
+        return PeerRays(place, way, np.asarray(rays.opd))
+
+    return trace
+
+
+def _by_numpy(model: CameraModel) -> Tracer:
+    """With the glasses of ``tests.own_trace``."""
+    own = OwnCamera(model.spec)
+
+    def trace(start: np.ndarray, direction: np.ndarray, wavelength: float) -> PeerRays:
+        rays = own.trace(start, direction, wavelength)
+        assert np.all(rays.known)
+        return PeerRays(rays.place + np.array([0.0, 0.0, model.spec.image.z]), rays.way, rays.path)
+
+    return trace
+
+
+LENSES: dict[str, Callable[[CameraModel], Tracer]] = {
+    "batoid": _by_batoid,
+    "optiland": _by_optiland,
+    "numpy": _by_numpy,
+}
+"""Programs that trace cameras with lenses at any wavelength, by name."""
 
 
 def optiland_camera(model: CameraModel, apertures: bool = False, unit: float = 1.0) -> Any:

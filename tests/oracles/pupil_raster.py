@@ -6,11 +6,13 @@ autocorrelation. Cells at an edge count with the share of them that light reache
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import chebyshev
+from scipy.ndimage import binary_dilation
 
 CELLS = 384
 """Across the pupil."""
@@ -18,7 +20,10 @@ CELLS = 384
 PARTS = 8
 """Of a side of a cell at an edge."""
 
-DEGREE = 8
+AROUND = 3
+"""Rays of the coarse raster beyond the light that its polynomials follow."""
+
+DEGREE = 10
 """Of the polynomials from direction cosines to the incoming wavefront."""
 
 
@@ -64,7 +69,7 @@ class PupilRaster:
 
 
 def raster(telescope: Any, wavelength: float, heading: np.ndarray, radius: float, cells: int = CELLS) -> PupilRaster:
-    """The pupil of a batoid telescope for one direction.
+    """The pupil of a batoid telescope for one direction, see ``raster_of``.
 
     Args:
         telescope: a ``batoid.Optic``.
@@ -90,10 +95,31 @@ def raster(telescope: Any, wavelength: float, heading: np.ndarray, radius: float
         rays.toCoordSys(telescope.itemDict[list(telescope.itemDict)[-1]].coordSys)
         return rays.r, inside * rays.v, rays.t, ~(rays.failed | rays.vignetted), ~rays.failed
 
-    axis = np.linspace(-1.0, 1.0, 65)
+    return raster_of(traced, wavelength, cells, inside, outside)
+
+
+def raster_of(
+    traced: Callable[[np.ndarray], tuple[np.ndarray, ...]],
+    wavelength: float,
+    cells: int = CELLS,
+    inside: float = 1.0,
+    outside: float = 1.0,
+) -> PupilRaster:
+    """The pupil of any tracing.
+
+    Args:
+        traced: of points (N, 2) of the incoming wavefront in units of a radius that holds all of the light: places and
+            directions times the index at the image, (N, 3), paths, and which rays come through and which are known.
+        wavelength: metres.
+        cells: across the light.
+        inside: index at the image.
+        outside: index before the first surface.
+    """
+    axis = np.linspace(-1.0, 1.0, 97)
     few = np.stack([a.ravel() for a in np.meshgrid(axis, axis)], axis=-1)
-    few = few[np.hypot(*few.T) <= 1.0]
     place, leaving, _, lit, known = traced(few)
+    # rays far beyond the rims of lenses are those of no polynomials
+    about = binary_dilation(lit.reshape(97, 97), iterations=AROUND).ravel()
     origin = np.mean(place[lit], axis=0)
     cosines = leaving[:, :2]
     low, high = (end(cosines[lit], axis=0) for end in (np.min, np.max))
@@ -105,7 +131,7 @@ def raster(telescope: Any, wavelength: float, heading: np.ndarray, radius: float
         i, j = np.indices((DEGREE + 1, DEGREE + 1))
         return np.asarray(both[..., (i + j <= DEGREE).ravel()])
 
-    near = known & np.all(np.abs(cosines - middle) < 1.0 * half, axis=-1)
+    near = known & about & np.all(np.abs(cosines - middle) < 1.0 * half, axis=-1)
     solution = np.linalg.lstsq(terms(cosines[near]), few[near], rcond=None)[0]
     step = 2.0 * half / cells
     grid = half * (2.0 * (np.arange(cells) + 0.5) / cells - 1.0)

@@ -15,6 +15,7 @@ from scipy.special import j1
 from optics.geometry.tree import Motion
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
 from scenes.lens.batoid_reader import read_batoid
 from scenes.lens.batoid_writer import batoid_text
@@ -109,13 +110,19 @@ def test_mtf_of_lsst_as_by_an_fft_of_its_own_file(backend, field) -> None:
 
 
 @pytest.mark.slow
-def test_mtf_of_hsc_on_its_axis(backend) -> None:
-    """26 edges, two pairs of vanes that do not meet; off the axis its vignetted rays have no polynomials."""
+@pytest.mark.parametrize("field", [field for field in FIELDS if field != (1.0, 0.0)], ids=str)
+def test_mtf_of_hsc_as_by_an_fft_of_its_own_file(backend, field) -> None:
+    """26 edges, two pairs of vanes that do not meet; off the axis dark rays pass the rims of lenses far outside."""
     optics = batoids_telescope(backend, *HSC)
+    if abs(field[0] * field[1]) == 1.0:
+        # at the end of the diagonal the wavefront of the crescent of light runs on into the dark too steeply
+        with pytest.raises(UnphysicalError, match="too steep in what is dark"):
+            optics.pupils([field])
+        return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         peer = batoid.Optic.fromYaml(str(Path(batoid.__file__).parent / "data" / HSC[0]))
-    as_its_raster(optics, (0.0, 0.0), its_raster(optics, peer, (0.0, 0.0), 1.02))
+    as_its_raster(optics, field, its_raster(optics, peer, field, 1.02))
 
 
 def test_a_paraboloid_is_written_as_one(backend, folder) -> None:

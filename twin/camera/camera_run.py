@@ -16,7 +16,6 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.line_of_sight import LineChange
-from optics.waves.pupil_stack import RoughWavefrontError
 from scenes.models.camera_design import with_plane
 from scenes.models.camera_sharpness import BLURRED, FIELDS, FieldBeams, FocalPlane, field_text
 from scenes.models.instrument_builder import build_instrument
@@ -236,10 +235,8 @@ def run_camera(
     advance("MTF", 0, 1)
     try:
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
-    except UnphysicalError as error:  # of a pupil that edges cut
+    except UnphysicalError as error:  # of a pupil that edges cut, or whose wavefront is too rough
         mtfs, sharp, why = (), False, f"of this pupil: {error}"
-    except RoughWavefrontError:  # a telescope that is not made for diffraction's limit: no smooth pupil, no MTF
-        mtfs, sharp = (), False
     focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
     curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
@@ -273,7 +270,7 @@ def _nyquist(optics: CameraOptics) -> np.ndarray:
     """MTF at Nyquist at MTF_FIELDS, (F, 2); empty where the pupil has none."""
     try:
         return np.array([mtf.at(optics.nyquist) for mtf in optics.mtfs(MTF_FIELDS)])
-    except (UnphysicalError, RoughWavefrontError):
+    except UnphysicalError:
         return np.empty((0, 2))
 
 

@@ -38,7 +38,8 @@ from optics.raytrace.trace import BeamMissedError
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.pupil_edge import WORST_BEND
 from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
-from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, WORST_RESIDUAL, PupilStack, products, to_terms
+from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
+from optics.waves.pupil_terms import products, smooth_terms, to_terms
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models import shadow
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
@@ -65,8 +66,8 @@ RINGS = 7
 MOST_BLUR = 10.0
 """Wavefront error beyond which a pupil that edges cut gets no MTF, waves rms."""
 
-EDGED_RINGS = 14
-"""Rings of the quadrature of a pupil that edges of surfaces cut, which takes polynomials of higher degrees."""
+CUT_MEAN_DEGREE = 14
+"""Degree of the polynomials that continue the wavefront of a beam that edges of surfaces cut."""
 
 _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
@@ -344,7 +345,7 @@ class _CameraBench:
         self.refracts = len(self.colours) > 1 and bool(lenses(spec))
         self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
         self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
-        self.nodes = quadrature.disk(EDGED_RINGS if self.model.edges else RINGS)
+        self.nodes = quadrature.disk(CUT_RINGS if self.model.edges else RINGS)
         self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
         self.assembly = instrument.assembly
 
@@ -431,22 +432,23 @@ class _CameraBench:
         origin = (size[:, None] * np.tile(self.points, (len(rays.path) // len(self.points), 1)))[:, None]
         radius = float(self.model.first_order.exit_pupil_distance[0])
         error = path_to_sphere(rays.position, rays.direction, rays.path, origin, radius)
-        mean = _Mean(self, None if shadows is None or not shadows.owners else shadows)
+        free = None
+        if self.model.edges and shadows is not None:
+            free = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        mean = _Mean(self, None if shadows is None or not shadows.owners else shadows, free)
         error = -mean.flat(error)
         focus = mean.flat(np.abs(rays.direction[..., 2]))
         defocus = mean(error * focus) / mean(focus**2)
         rest = error - defocus[:, None] * focus
         wfe, refocused = (np.sqrt(np.maximum(mean(e**2), 0.0)) / self.wavelength for e in (error, rest))
-        dark = np.mean(rays.amplitude == 0.0, axis=-1)
+        dark = np.mean((rays.amplitude == 0.0) & (True if free is None else free), axis=-1)
         mtf = np.full((2, len(dark)), np.nan)
         lost = np.zeros(len(dark))
         pieces = None if shadows is None else shadows.pieces
         lit = np.flatnonzero(dark == 0.0)
         if len(lit):
             taken = None if pieces is None else pieces[lit]
-            free = None
-            if self.model.edges and taken is not None:
-                free = ~covered(taken, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+            free = None if free is None else free[lit]
             pupils, smooth = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
             if self.model.edges:
@@ -555,10 +557,13 @@ class _CameraBench:
 class _Mean:
     """Mean over the free part of each stop, of values at the bench's nodes.
 
-    Values are continued into the shadows by their polynomials, and what they hold there is taken off.
+    Values are continued into the shadows by their polynomials, and what they hold there is taken off. Where edges of
+    surfaces cut the beams, polynomials stand for the rays in the dark, too, which may pass the rims of lenses far
+    outside.
     """
 
-    def __init__(self, bench: _CameraBench, shadows: shadow.Shadows | None) -> None:
+    def __init__(self, bench: _CameraBench, shadows: shadow.Shadows | None, free: np.ndarray | None = None) -> None:
+        self._free, self._nodes = free, bench.nodes
         self._share, self._tilts = bench.nodes.share[None], bench.tilts[None]
         self._added: np.ndarray | None = None
         if shadows is None:
@@ -569,8 +574,10 @@ class _Mean:
         self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
         own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
         self._tilts = np.concatenate([np.broadcast_to(bench.tilts, (count, *bench.tilts.shape)), own], axis=1)
-        self._to_terms = to_terms(bench.nodes, DEGREE)
-        self._added = products(points.real, points.imag, DEGREE)
+        degree = DEGREE if free is None else CUT_MEAN_DEGREE
+        self._to_terms = to_terms(bench.nodes, degree)
+        self._on_stop = products(bench.nodes.x, bench.nodes.y, degree)
+        self._added = products(points.real, points.imag, degree)
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Mean (B,) of values as ``flat`` gives them."""
@@ -580,7 +587,11 @@ class _Mean:
         """Values (B, N) less piston and tilt, (B, N + Q): also at nodes in the shadows."""
         values = values - values[:, :1]
         if self._added is not None:
-            terms = values @ self._to_terms.T
+            if self._free is None:
+                terms = values @ self._to_terms.T
+            else:
+                terms = smooth_terms(self._on_stop, self._nodes.weight, self._free, values[..., None])[..., 0]
+                values = np.where(self._free, values, terms @ self._on_stop.T)
             values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
         weighted = self._tilts * self._share[..., None]
         turned = np.swapaxes(weighted, 1, 2)

@@ -7,7 +7,6 @@ sense, so that its image is ``f / focal_length`` times its size and upright in t
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,7 +27,7 @@ from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, DEGREE, PupilFunction, RoughWavefrontError, fit_pupils
+from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
@@ -122,7 +121,7 @@ class TargetPath:
         stop = assembly.elements[f"{name}/{model.spec.stop}"].aperture
         assert isinstance(stop, Circle)
         self.stop = stop
-        self.nodes = quadrature.disk(RINGS)
+        self.nodes = quadrature.disk(CUT_RINGS if model.edges else RINGS)
         self._axes = assembly.nominal_pose(root).rotation
 
     @property
@@ -265,7 +264,8 @@ class TargetPath:
             return fit_pupils(turned, self.nodes, DEGREE, taken)
         points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
         lit = ~covered(taken, points, SMALLEST)
-        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in self._cut_pupils(turned, taken, lit))
+        cut = fit_pupils(turned, self.nodes, DEGREE, taken, lit)
+        return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in cut)
 
     def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
         """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
@@ -293,13 +293,6 @@ class TargetPath:
         others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
         seen = edge_outlines(beams, self.model, self.name, self.backend)
         return settled_shadows(seen, len(directions), others)
-
-    def _cut_pupils(self, field: PupilField, taken: np.ndarray, lit: np.ndarray) -> tuple[PupilFunction, ...]:
-        """Pupils with shadows (B, K, V, 2), by polynomials of the lowest degree that follows the lit nodes, (B, N)."""
-        for degree in CUT_DEGREES:
-            with suppress(RoughWavefrontError):
-                return fit_pupils(field, self.nodes, degree, taken, lit, CUT_RESIDUAL)
-        return fit_pupils(field, self.nodes, CUT_DEGREES[-1], taken, lit)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""

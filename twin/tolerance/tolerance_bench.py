@@ -25,7 +25,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.lit_stop import LitStop
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import RoughWavefrontError, products, to_terms
+from optics.waves.pupil_terms import RoughWavefrontError, products, to_terms
 from optics.waves.transfer import transfer
 from optics.waves.varied_pupil import VariedTransfer
 from optics.waves.wavefront import path_to_sphere
