@@ -46,7 +46,6 @@ from scenes.models.shadow import (
     ImagingShadows,
     Shadows,
     TracedBeams,
-    edge_outlines,
     imaging_shadows,
     no_shadows,
 )
@@ -399,7 +398,7 @@ class _CameraBench:
         shadows = None if self.shadows is None else self.shadows.cast(beams)
         if self.model.edges:
             free = no_shadows(len(every)) if shadows is None else shadows
-            shadows = free.and_edges(edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
+            shadows = free.and_edges(SeenEdges.of(beams, self.model, name, self.backend).outlines, f"edges of {name}")
         return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

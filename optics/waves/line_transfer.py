@@ -1,0 +1,373 @@
+"""Transfer function of a pupil that edges cut, at even steps of frequency along one direction, by lines along the shift.
+
+Every line of the pupil along the shift is light from one edge to the next. The pupil's autocorrelation is the sum over
+lines of the autocorrelations along them. These are worked out on cells as long as one step of the shift, so that all
+shifts together are one Fourier transform of a line; the cells that edges cut get the weights of Gauss' rule between
+edge and cell, for every pair of edges. Edges are therefore exact along the lines, wherever they stand, and neither are
+shadows cut to pieces nor is a wavefront continued into the dark.
+
+Across the lines stands Fejer's rule between the places where outlines begin, end or have a corner. Where edges of the
+two pupils cross, which is at another place for every shift, the integrand has a kink, and the error falls with the
+square of the number of lines. A third of the lines is a rule of its own; with other nodes on the cells it tells the
+error, and lines are added until it is small.
+
+``optics.waves.transfer`` serves any frequencies and defocus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+import numpy as np
+from numpy.polynomial import chebyshev, legendre
+from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
+
+from optics.geometry.polygon import area
+from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.quadrature import PupilNodes, gauss
+from optics.numerics.threads import one_blas_thread
+from optics.waves.edge_shadow import StopOutlines
+from optics.waves.pupil_shadow import SMALLEST
+from optics.waves.pupil_stack import PupilFunction, polynomials, products, to_terms
+from optics.waves.transfer import SETTLED, WORST_TRANSFER
+
+RIM_SIDES = 2048
+"""Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""
+
+LINES = (360, 1080, 3240)
+"""Across the pupil, the first that do."""
+
+_LEAST = 9
+"""Lines between two places where outlines begin or end."""
+
+_CORNER = 0.3
+"""Angle by which an outline turns at a corner, radians; that of a round one turns less from side to side."""
+
+_SHORT_CELLS = 0.005, 0.04
+"""Lengths of cells up to which one and two nodes do; three for longer ones."""
+
+_APART = 1e-6
+"""Distance of two places between which there are lines, of the pupil's radius."""
+
+_LONGEST_CELL = 0.06
+"""Of the pupil's radius: longer steps of a shift are several cells, which end little beyond the pupil."""
+
+
+@dataclass(frozen=True, eq=False)
+class CutPupil:
+    """Exit pupil that edges cut.
+
+    Attributes:
+        pupil: its wavefront and its own edge, without shadows.
+        clear: light comes through inside of all of these only, convex polygons in p, complex, counterclockwise, (V,).
+        blocked: light is stopped in any of these, likewise.
+    """
+
+    pupil: PupilFunction
+    clear: tuple[np.ndarray, ...]
+    blocked: tuple[np.ndarray, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LineTransfer:
+    """Transfer function at even steps of frequency.
+
+    Attributes:
+        values: complex, (M,), 1 at zero frequency.
+        perfect: of the same light with a perfect wavefront, (M,).
+        error: largest change of either from a third of the lines and other nodes on the cells.
+    """
+
+    values: np.ndarray
+    perfect: np.ndarray
+    error: float
+
+
+def cut_pupils(
+    pupils: Sequence[PupilFunction], u: np.ndarray, v: np.ndarray, nodes: PupilNodes, outlines: StopOutlines
+) -> tuple[CutPupil, ...]:
+    """Pupils with the outlines of edges in them.
+
+    Args:
+        pupils: B, without shadows.
+        u: direction cosines along the detector's first axis at nodes of the stop, (B, N).
+        v: likewise along the second.
+        nodes: of the stop.
+        outlines: of the edges on the stop's unit disk, as B images see them.
+    """
+    degree = pupils[0].eikonal_terms.shape[-1] - 1
+    terms = np.stack([u, v], axis=1) @ to_terms(nodes, degree).T
+    each: list[tuple[list[np.ndarray], list[np.ndarray]]] = [([], []) for _ in pupils]
+    for which, kind in enumerate((outlines.clear, outlines.blocked)):
+        for polygons in kind:
+            full = area(polygons) > SMALLEST
+            cosines = products(polygons[..., 0], polygons[..., 1], degree) @ np.swapaxes(terms, 1, 2)
+            for k, pupil in enumerate(pupils):
+                if full[k]:
+                    place = np.linalg.solve(pupil.axes, (cosines[k] - pupil.centre).T)
+                    each[k][which].append(_sensed(place[0] + 1j * place[1]))
+                elif which == 0:
+                    raise UnphysicalError(f"an edge leaves no light in the pupil of image {k}")
+    return tuple(CutPupil(pupil, tuple(c), tuple(b)) for pupil, (c, b) in zip(pupils, each, strict=True))
+
+
+def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
+    """Which points p, complex (N,), of the pupil no edge but its own lets light miss, (N,)."""
+    out = np.ones(len(points), bool)
+    for polygons, clear in ((cut.clear, True), (cut.blocked, False)):
+        for polygon in polygons:
+            left, right = _chords(polygon, points.imag)
+            out &= ((left <= points.real) & (points.real <= right)) == clear
+    return out
+
+
+@one_blas_thread()
+def line_transfer(
+    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int] = LINES
+) -> LineTransfer:
+    """Transfer function at the frequencies 0, step .. (count - 1) step along a direction.
+
+    Args:
+        cut: pupil of the image.
+        wavelength: metres.
+        direction: unit vector in detector x, y, (2,).
+        step: of the frequency, cycles/m, positive.
+        count: M.
+        lines: across the pupil, tried one after the other.
+
+    Raises:
+        UnphysicalError: even the most lines tell another value than a third of them.
+    """
+    way = complex(cut.pupil.normalised(*np.asarray(direction, float)))
+    pitch, turn = wavelength * step * abs(way), way / abs(way)
+    every = int(np.ceil(pitch / _LONGEST_CELL))
+    pitch, count = pitch / every, (count - 1) * every + 1
+    tables = _turned_tables(cut.pupil, turn)
+    wave, nodes, error = 2.0 * np.pi / wavelength, _first_nodes(pitch), np.inf
+    outlines = _turned(cut, turn)
+    for number in lines:
+        rows = _Lines.across(*outlines, number)
+        fine = _autocorrelation(rows, tables, wave, pitch, count, nodes)
+        coarse = _autocorrelation(rows.third(), tables, wave, pitch, count, nodes + 1)
+        error = max(float(np.max(np.abs(a - b))) for a, b in zip(fine, coarse, strict=True))
+        if error < SETTLED:
+            return LineTransfer(fine[0][::every], fine[1][::every], error)
+        nodes += 1
+    if not error < WORST_TRANSFER:
+        raise UnphysicalError(
+            f"the transfer function of a pupil that edges cut still changes by {error:.2g} with further lines (at most "
+            f"{WORST_TRANSFER:g}): its wavefront is too steep"
+        )
+    return LineTransfer(fine[0][::every], fine[1][::every], error)
+
+
+def _sensed(polygon: np.ndarray) -> np.ndarray:
+    """A polygon (V,), complex, counterclockwise."""
+    turned = np.sum((np.conj(polygon) * np.roll(polygon, -1)).imag) < 0.0
+    return polygon[::-1] if turned else polygon
+
+
+def _turned(cut: CutPupil, turn: complex) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Clear outlines, the pupil's own edge first, and blocked ones, with ``turn`` along x."""
+    angle = 2.0 * np.pi * np.arange(RIM_SIDES) / RIM_SIDES
+    rim = _sensed(np.sqrt(angle[1] / np.sin(angle[1])) * cut.pupil.edge.boundary(angle)[0])
+    back = np.conj(turn)
+    return [back * p for p in (rim, *cut.clear)], [back * p for p in cut.blocked]
+
+
+def _turned_tables(pupil: PupilFunction, turn: complex) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of eikonal and amplitude as polynomials in coordinates whose x is ``turn``, (D + 1, D + 1) each."""
+    count = len(pupil.eikonal_terms)
+    node, to_table = _chebyshev_nodes(count)
+    points = (node[:, None] + 1j * node).reshape(1, -1) * turn
+    first, second = (
+        to_table @ values.reshape(count, count) @ to_table.T
+        for values in polynomials((pupil.eikonal_terms[None], pupil.amplitude_terms[None]), points)
+    )
+    return first, second
+
+
+@cache
+def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Chebyshev's nodes, (count,), and the matrix from values there to coefficients."""
+    node = np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    matrix = chebyshev.chebvander(node, count - 1).T * (2.0 / count)
+    matrix[0] *= 0.5
+    return node, matrix
+
+
+def _first_nodes(pitch: float) -> int:
+    """Nodes on cells of a length, for wavefronts of few waves: where these do not do, more follow."""
+    return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1
+
+
+def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends, (N,) each, of the chords of a convex counterclockwise polygon (V,) at y (N,); where there is none the
+    left end is infinite and the right one minus that.
+    """
+    around = np.roll(polygon, -int(np.argmin(polygon.imag)))
+    top = int(np.argmax(around.imag))
+    rising, falling = around[: top + 1], np.concatenate([around[top:], around[:1]])[::-1]
+    right, left = (np.interp(y, np.maximum.accumulate(part.imag), part.real) for part in (rising, falling))
+    within = (y > around[0].imag) & (y < around[top].imag) & (left < right)
+    return np.where(within, left, np.inf), np.where(within, right, -np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lines:
+    """N lines along the shift, and where light begins and ends on them.
+
+    Attributes:
+        y: of the lines, (N,).
+        weight: of the rule across them, (N,).
+        coarse: of that on a third of the lines, 0 for the others, (N,).
+        begins, ends: of the light, (N, K) each; places alike where there is none.
+        lit: whether there is some, (N, K).
+        low, high: between which all lines lie along x.
+    """
+
+    y: np.ndarray
+    weight: np.ndarray
+    coarse: np.ndarray
+    begins: np.ndarray
+    ends: np.ndarray
+    lit: np.ndarray
+    low: float
+    high: float
+
+    @classmethod
+    def across(cls, clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray], number: int) -> _Lines:
+        """Some ``number`` lines across what clear outlines leave, the first of which is the pupil's own edge."""
+        parts = [_rule(a, b, number) for a, b in _between(clear, blocked)]
+        y, weight, coarse = (np.concatenate(part) for part in zip(*parts, strict=True))
+        chords = [_chords(polygon, y) for polygon in clear]
+        start = np.max([left for left, _ in chords], axis=0)
+        stop = np.min([right for _, right in chords], axis=0)
+        used = stop > start
+        y, weight, coarse, start, stop = (a[used] for a in (y, weight, coarse, start, stop))
+        dark = [_chords(polygon, y) for polygon in blocked]
+        left, right = (np.array([chord[k] for chord in dark]).reshape(len(dark), len(y)).T for k in (0, 1))
+        order = np.argsort(left, axis=1)
+        left, right = (np.take_along_axis(ends, order, axis=1) for ends in (left, right))
+        # light begins where the shadows before end, and ends where the next one begins
+        begins = np.maximum.accumulate(np.concatenate([start[:, None], right], axis=1), axis=1)
+        ends = np.minimum(np.concatenate([left, stop[:, None]], axis=1), stop[:, None])
+        lit = ends > begins
+        most = max(int(np.max(np.sum(lit, axis=1), initial=0)), 1)
+        first = np.argsort(~lit, axis=1, kind="stable")[:, :most]
+        begins, ends, lit = (np.take_along_axis(a, first, axis=1) for a in (begins, ends, lit))
+        rim = clear[0].real
+        begins, ends = (np.where(lit, a, start[:, None]) for a in (begins, ends))
+        return cls(y, weight, coarse, begins, ends, lit, float(np.min(rim)), float(np.max(rim)))
+
+    def third(self) -> _Lines:
+        """The third of the lines that is a rule of its own."""
+        some = self.coarse != 0.0
+        y, weight, begins, ends, lit = (a[some] for a in (self.y, self.coarse, self.begins, self.ends, self.lit))
+        return _Lines(y, weight, weight, begins, ends, lit, self.low, self.high)
+
+
+def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list[tuple[float, float]]:
+    """Stretches of y between the places where outlines begin, end or have a corner."""
+    rim = clear[0].imag
+    low, high = float(np.min(rim)), float(np.max(rim))
+    places = [low, high]
+    for polygon in (*clear[1:], *blocked):
+        before, after = polygon - np.roll(polygon, 1), np.roll(polygon, -1) - polygon
+        sharp = np.abs(np.angle(after * np.conj(before))) > _CORNER
+        places += [float(np.min(polygon.imag)), float(np.max(polygon.imag)), *polygon.imag[sharp].tolist()]
+    some = np.unique(np.clip(places, low, high))
+    some = some[np.concatenate([[True], np.diff(some) > _APART])]
+    return [(float(a), float(b)) for a, b in zip(some, some[1:], strict=False)]
+
+
+def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fejer's rule over a stretch that gets its share of ``number`` lines over [-1, 1]: places, weights, and weights of
+    the rule on every third place.
+    """
+    count = max(_LEAST, 3 * int(np.ceil(number * (high - low) / 6.0)))
+    half = 0.5 * (high - low)
+    coarse = np.zeros(count)
+    coarse[1::3] = half * _fejer(count // 3)
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    return 0.5 * (low + high) - half * np.cos(angle), half * _fejer(count), coarse
+
+
+@lru_cache(maxsize=256)
+def _fejer(count: int) -> np.ndarray:
+    """Weights of Fejer's first rule on [-1, 1], whose places are the cosines of odd multiples of pi / 2 count."""
+    angle = np.pi * (np.arange(count) + 0.5) / count
+    order = np.arange(1, count // 2 + 1)
+    return np.asarray((2.0 / count) * (1.0 - 2.0 * np.cos(2.0 * np.outer(angle, order)) @ (1.0 / (4.0 * order**2 - 1))))
+
+
+@cache
+def _cell_weights(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gauss' places and weights on a cell [0, 1], (I,) each, and polynomials, coefficients of Legendre's over [-1, 1]
+    (I + 1, I), of the integrals of Lagrange's from a place to the cell's end.
+    """
+    node, weight = gauss(count)
+    order = np.arange(count)
+    lagrange = (order[:, None] + 0.5) * legendre.legvander(node, count - 1).T * weight
+    primitive = legendre.legint(lagrange, lbnd=-1.0, axis=0)
+    rest = -0.5 * primitive
+    rest[0] += 0.5 * weight
+    return 0.5 * (node + 1.0), 0.5 * weight, rest
+
+
+def _autocorrelation(
+    rows: _Lines, tables: tuple[np.ndarray, np.ndarray], wave: float, pitch: float, count: int, nodes: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Autocorrelations at shifts 0 .. (count - 1) ``pitch`` along x with the wavefront and without, of 1 at 0.
+
+    Args:
+        rows: lines.
+        tables: eikonal and amplitude in their coordinates.
+        wave: number, 1/m.
+        pitch: length of a cell.
+        count: of shifts.
+        nodes: on a cell.
+    """
+    place, weight, rest = _cell_weights(nodes)
+    cells = int((rows.high - rows.low) / pitch) + 2
+    x = rows.low + pitch * (place[:, None] + np.arange(cells))
+    last = len(tables[0]) - 1
+    along = chebyshev.chebvander(x.ravel(), last).T
+    across = chebyshev.chebvander(rows.y, last)
+    path, light = ((across @ table.T @ along).reshape(len(rows.y), nodes, cells) for table in tables)
+    # what of each node counts: steps up and down at the edges, and in their cells the share behind the edge
+    edges = (np.concatenate([rows.begins, rows.ends], axis=1) - rows.low) / pitch
+    sign = np.concatenate([np.ones_like(rows.begins), -np.ones_like(rows.ends)], axis=1)
+    cell = np.clip(np.floor(edges).astype(int), 0, cells - 2)
+    behind = np.moveaxis(legendre.legval(2.0 * (edges - cell) - 1.0, rest), 0, -1)
+    share = behind / weight
+    counted = np.zeros((len(rows.y), cells, nodes))
+    every = np.broadcast_to(np.arange(len(rows.y))[:, None], cell.shape)
+    np.add.at(counted, (every, cell), sign[..., None] * share)
+    np.add.at(counted, (every, cell + 1), sign[..., None] * (1.0 - share))
+    counted = np.swapaxes(np.cumsum(counted, axis=1), 1, 2)
+    values = light * np.exp(1j * wave * path)
+    # two edges in cells that meet: what both leave is not the product of their shares
+    there = np.concatenate([rows.lit, rows.lit], axis=1)
+    apart = cell[:, :, None] - cell[:, None]
+    line, e, f = np.nonzero((apart >= 0) & (apart < count) & there[:, :, None] & there[:, None])
+    step, bent = apart[line, e, f], edges - cell
+    shared = np.moveaxis(legendre.legval(2.0 * np.maximum(bent[line, e], bent[line, f]) - 1.0, rest), 0, -1)
+    more = shared - behind[line, e] * share[line, f]
+    more *= (sign[line, e] * sign[line, f] * rows.weight[line])[:, None]
+    size = next_fast_len(cells + count)
+    out = []
+    for field, spectrum in (
+        (values, fft(values * counted, size, axis=-1)),
+        (light, rfft(light * counted, size, axis=-1)),
+    ):
+        power = np.einsum("n,i,nif->f", rows.weight, weight, spectrum.real**2 + spectrum.imag**2)
+        total = (ifft(power) if len(power) == size else irfft(power, size))[:count]
+        product = np.sum(more * field[line, :, cell[line, e]] * np.conj(field[line, :, cell[line, f]]), axis=-1)
+        total = total + np.bincount(step, product.real, count)
+        if np.iscomplexobj(product):
+            total = total + 1j * np.bincount(step, product.imag, count)
+        out.append(total / total[0].real)
+    return out[0], out[1]
