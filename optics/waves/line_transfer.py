@@ -31,13 +31,19 @@ from optics.numerics.threads import one_blas_thread
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction, polynomials, products, to_terms
-from optics.waves.transfer import SETTLED, WORST_TRANSFER
+from optics.waves.transfer import WORST_TRANSFER
 
 RIM_SIDES = 2048
 """Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""
 
-LINES = (360, 1080, 3240)
+LINES = (360, 600, 1080, 3240)
 """Across the pupil, the first that do."""
+
+SETTLED = 1e-4
+"""Change of a transfer function from a third of the lines below which there are enough: they are right to a tenth."""
+
+FEW_OUTLINES = 2
+"""Beside the pupil's own edge, for which the fewest lines are tried at all."""
 
 _LEAST = 9
 """Lines between two places where outlines begin or end."""
@@ -125,7 +131,7 @@ def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
 
 @one_blas_thread()
 def line_transfer(
-    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int] = LINES
+    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int] = ()
 ) -> LineTransfer:
     """Transfer function at the frequencies 0, step .. (count - 1) step along a direction.
 
@@ -135,7 +141,7 @@ def line_transfer(
         direction: unit vector in detector x, y, (2,).
         step: of the frequency, cycles/m, positive.
         count: M.
-        lines: across the pupil, tried one after the other.
+        lines: across the pupil, tried one after the other; by default those of LINES that this kind of pupil needs.
 
     Raises:
         UnphysicalError: even the most lines tell another value than a third of them.
@@ -147,7 +153,8 @@ def line_transfer(
     tables = _turned_tables(cut.pupil, turn)
     wave, nodes, error = 2.0 * np.pi / wavelength, _first_nodes(pitch), np.inf
     outlines = _turned(cut, turn)
-    for number in lines:
+    some = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
+    for number in lines or LINES[int(some) :]:
         rows = _Lines.across(*outlines, number)
         fine = _autocorrelation(rows, tables, wave, pitch, count, nodes)
         coarse = _autocorrelation(rows.third(), tables, wave, pitch, count, nodes + 1)
@@ -249,6 +256,7 @@ class _Lines:
         y, weight, coarse, start, stop = (a[used] for a in (y, weight, coarse, start, stop))
         dark = [_chords(polygon, y) for polygon in blocked]
         left, right = (np.array([chord[k] for chord in dark]).reshape(len(dark), len(y)).T for k in (0, 1))
+        right = np.where(right > left, right, np.inf)  # what a line does not meet lies behind its end
         order = np.argsort(left, axis=1)
         left, right = (np.take_along_axis(ends, order, axis=1) for ends in (left, right))
         # light begins where the shadows before end, and ends where the next one begins
@@ -338,36 +346,56 @@ def _autocorrelation(
     across = chebyshev.chebvander(rows.y, last)
     path, light = ((across @ table.T @ along).reshape(len(rows.y), nodes, cells) for table in tables)
     # what of each node counts: steps up and down at the edges, and in their cells the share behind the edge
-    edges = (np.concatenate([rows.begins, rows.ends], axis=1) - rows.low) / pitch
-    sign = np.concatenate([np.ones_like(rows.begins), -np.ones_like(rows.ends)], axis=1)
-    cell = np.clip(np.floor(edges).astype(int), 0, cells - 2)
-    behind = np.moveaxis(legendre.legval(2.0 * (edges - cell) - 1.0, rest), 0, -1)
-    share = behind / weight
-    counted = np.zeros((len(rows.y), cells, nodes))
-    every = np.broadcast_to(np.arange(len(rows.y))[:, None], cell.shape)
-    np.add.at(counted, (every, cell), sign[..., None] * share)
-    np.add.at(counted, (every, cell + 1), sign[..., None] * (1.0 - share))
-    counted = np.swapaxes(np.cumsum(counted, axis=1), 1, 2)
-    values = light * np.exp(1j * wave * path)
-    # two edges in cells that meet: what both leave is not the product of their shares
     there = np.concatenate([rows.lit, rows.lit], axis=1)
-    apart = cell[:, :, None] - cell[:, None]
-    line, e, f = np.nonzero((apart >= 0) & (apart < count) & there[:, :, None] & there[:, None])
-    step, bent = apart[line, e, f], edges - cell
-    shared = np.moveaxis(legendre.legval(2.0 * np.maximum(bent[line, e], bent[line, f]) - 1.0, rest), 0, -1)
-    more = shared - behind[line, e] * share[line, f]
-    more *= (sign[line, e] * sign[line, f] * rows.weight[line])[:, None]
-    size = next_fast_len(cells + count)
+    row, number = np.nonzero(there)
+    sign = np.where(number < rows.lit.shape[1], 1.0, -1.0)
+    edges = (np.concatenate([rows.begins, rows.ends], axis=1)[there] - rows.low) / pitch
+    cell = np.clip(np.floor(edges).astype(int), 0, cells - 2)
+    bent = edges - cell
+    behind = _rest(bent, rest)
+    share = behind / weight[:, None]
+    at, many = row * cells + cell, len(rows.y) * cells
+    counted = np.empty((len(rows.y), nodes, cells))
+    for i in range(nodes):
+        here = np.bincount(at, sign * share[i], many)
+        here[1:] += np.bincount(at, sign * (1.0 - share[i]), many)[:-1]
+        counted[:, i] = np.cumsum(here.reshape(len(rows.y), cells), axis=1)
+    # two edges in cells that meet: what both leave is not the product of their shares
+    first, second = _same_rows(row)
+    step = cell[first] - cell[second]
+    near = (step >= 0) & (step < count)
+    first, second, step = first[near], second[near], step[near]
+    more = _rest(np.maximum(bent[first], bent[second]), rest) - behind[:, first] * share[:, second]
+    more *= sign[first] * sign[second] * rows.weight[row[first]]
+    size, every = next_fast_len(cells + count), np.outer(rows.weight, weight).ravel()
+    phase, values = wave * path, np.empty(path.shape, complex)
+    np.multiply(light, np.cos(phase), out=values.real)
+    np.multiply(light, np.sin(phase), out=values.imag)
+    places = (row * nodes * cells + cell) + cells * np.arange(nodes)[:, None]
     out = []
-    for field, spectrum in (
-        (values, fft(values * counted, size, axis=-1)),
-        (light, rfft(light * counted, size, axis=-1)),
-    ):
-        power = np.einsum("n,i,nif->f", rows.weight, weight, spectrum.real**2 + spectrum.imag**2)
+    for field, transform in ((values, fft), (light, rfft)):
+        at_edges = field.ravel()[places]
+        product = np.sum(more * at_edges[:, first] * np.conj(at_edges[:, second]), axis=0)
+        spectrum = transform(field * counted, size, axis=-1).reshape(len(every), -1)
+        power = (every @ np.square(spectrum.view(float))).reshape(-1, 2).sum(axis=-1)
         total = (ifft(power) if len(power) == size else irfft(power, size))[:count]
-        product = np.sum(more * field[line, :, cell[line, e]] * np.conj(field[line, :, cell[line, f]]), axis=-1)
         total = total + np.bincount(step, product.real, count)
         if np.iscomplexobj(product):
             total = total + 1j * np.bincount(step, product.imag, count)
         out.append(total / total[0].real)
     return out[0], out[1]
+
+
+def _rest(place: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
+    """Weights of a cell's nodes behind places (P,) from 0 to 1 in it, (I, P)."""
+    return np.asarray(polynomials_of_rest.T @ legendre.legvander(2.0 * place - 1.0, len(polynomials_of_rest) - 1).T)
+
+
+def _same_rows(row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All ordered pairs of things that are of one row, by the rows of all, (P,), ascending."""
+    many = np.bincount(row)
+    start = np.cumsum(many) - many
+    own = many[row]
+    first = np.repeat(np.arange(len(row)), own)
+    second = np.arange(len(first)) - np.repeat(np.cumsum(own) - own, own) + np.repeat(start[row], own)
+    return first, second
