@@ -54,6 +54,9 @@ _CORNER = 0.3
 _SHORT_CELLS = 0.005, 0.04
 """Lengths of cells up to which one and two nodes do; three for longer ones."""
 
+_AT_ONCE = 2**14
+"""Nodes worked on together: some arrays of 200 kB that stay in the cache."""
+
 _APART = 1e-6
 """Distance of two places between which there are lines, of the pupil's radius."""
 
@@ -342,48 +345,103 @@ def _autocorrelation(
     cells = int((rows.high - rows.low) / pitch) + 2
     x = rows.low + pitch * (place[:, None] + np.arange(cells))
     last = len(tables[0]) - 1
-    along = chebyshev.chebvander(x.ravel(), last).T
-    across = chebyshev.chebvander(rows.y, last)
-    path, light = ((across @ table.T @ along).reshape(len(rows.y), nodes, cells) for table in tables)
-    # what of each node counts: steps up and down at the edges, and in their cells the share behind the edge
-    there = np.concatenate([rows.lit, rows.lit], axis=1)
-    row, number = np.nonzero(there)
-    sign = np.where(number < rows.lit.shape[1], 1.0, -1.0)
-    edges = (np.concatenate([rows.begins, rows.ends], axis=1)[there] - rows.low) / pitch
-    cell = np.clip(np.floor(edges).astype(int), 0, cells - 2)
-    bent = edges - cell
-    behind = _rest(bent, rest)
-    share = behind / weight[:, None]
-    at, many = row * cells + cell, len(rows.y) * cells
-    counted = np.empty((len(rows.y), nodes, cells))
-    for i in range(nodes):
-        here = np.bincount(at, sign * share[i], many)
-        here[1:] += np.bincount(at, sign * (1.0 - share[i]), many)[:-1]
-        counted[:, i] = np.cumsum(here.reshape(len(rows.y), cells), axis=1)
-    # two edges in cells that meet: what both leave is not the product of their shares
-    first, second = _same_rows(row)
-    step = cell[first] - cell[second]
-    near = (step >= 0) & (step < count)
-    first, second, step = first[near], second[near], step[near]
-    more = _rest(np.maximum(bent[first], bent[second]), rest) - behind[:, first] * share[:, second]
-    more *= sign[first] * sign[second] * rows.weight[row[first]]
-    size, every = next_fast_len(cells + count), np.outer(rows.weight, weight).ravel()
-    phase, values = wave * path, np.empty(path.shape, complex)
-    np.multiply(light, np.cos(phase), out=values.real)
-    np.multiply(light, np.sin(phase), out=values.imag)
-    places = (row * nodes * cells + cell) + cells * np.arange(nodes)[:, None]
-    out = []
-    for field, transform in ((values, fft), (light, rfft)):
-        at_edges = field.ravel()[places]
-        product = np.sum(more * at_edges[:, first] * np.conj(at_edges[:, second]), axis=0)
-        spectrum = transform(field * counted, size, axis=-1).reshape(len(every), -1)
-        power = (every @ np.square(spectrum.view(float))).reshape(-1, 2).sum(axis=-1)
-        total = (ifft(power) if len(power) == size else irfft(power, size))[:count]
-        total = total + np.bincount(step, product.real, count)
-        if np.iscomplexobj(product):
-            total = total + 1j * np.bincount(step, product.imag, count)
-        out.append(total / total[0].real)
-    return out[0], out[1]
+    along, across = chebyshev.chebvander(x.ravel(), last).T, chebyshev.chebvander(rows.y, last)
+    size = next_fast_len(cells + count)
+    with_wave, without = np.zeros(size), np.zeros(size // 2 + 1)
+    at_edges, at_edges_with = [], []
+    edges = _Edges.of(rows, pitch, cells, rest)
+    some = max(1, _AT_ONCE // (nodes * cells))
+    for start in range(0, len(rows.y), some):
+        block = slice(start, start + some)
+        path, light = ((across[block] @ table.T) @ along for table in tables)
+        light = light.reshape(-1, nodes, cells)
+        counted, own = edges.counted(start, len(light), cells, weight)
+        phase, values = (wave * path).reshape(light.shape), np.empty(light.shape, complex)
+        np.multiply(light, np.cos(phase), out=values.real)
+        np.multiply(light, np.sin(phase), out=values.imag)
+        at_edges.append(light.ravel()[own])
+        at_edges_with.append(values.ravel()[own])
+        every = np.outer(rows.weight[block], weight).ravel()
+        for total, spectrum in (
+            (with_wave, fft(values * counted, size, axis=-1)),
+            (without, rfft(light * counted, size, axis=-1)),
+        ):
+            squares = np.square(spectrum.reshape(len(every), -1).view(float))
+            total += (every @ squares).reshape(-1, 2).sum(axis=-1)
+    first, second, step, more = edges.pairs(rows.weight, count, weight)
+    light, values = np.concatenate(at_edges, axis=1), np.concatenate(at_edges_with, axis=1)
+    real = np.bincount(step, np.sum(more * light[:, first] * light[:, second], axis=0), count)
+    product = np.sum(more * values[:, first] * np.conj(values[:, second]), axis=0)
+    both = np.bincount(step, product.real, count) + 1j * np.bincount(step, product.imag, count)
+    found, perfect = ifft(with_wave)[:count] + both, irfft(without, size)[:count] + real
+    return found / found[0].real, perfect / perfect[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Edges of light on lines, P of them, line by line.
+
+    Attributes:
+        row: their lines.
+        cell: in which they stand.
+        bent: where in the cell, from 0 to 1.
+        sign: 1 where light begins, -1 where it ends.
+        behind: weights of the cell's nodes behind them, (I, P).
+        rest: from which ``behind`` comes, as ``_cell_weights`` gives it.
+    """
+
+    row: np.ndarray
+    cell: np.ndarray
+    bent: np.ndarray
+    sign: np.ndarray
+    behind: np.ndarray
+    rest: np.ndarray
+
+    @classmethod
+    def of(cls, rows: _Lines, pitch: float, cells: int, rest: np.ndarray) -> _Edges:
+        """Those of lines."""
+        there = np.concatenate([rows.lit, rows.lit], axis=1)
+        row, number = np.nonzero(there)
+        sign = np.where(number < rows.lit.shape[1], 1.0, -1.0)
+        place = (np.concatenate([rows.begins, rows.ends], axis=1)[there] - rows.low) / pitch
+        cell = np.clip(np.floor(place).astype(int), 0, cells - 2)
+        return cls(row, cell, place - cell, sign, _rest(place - cell, rest), rest)
+
+    def counted(self, start: int, lines: int, cells: int, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What of each node of some lines counts, (lines, I, cells): steps up and down at the edges, and in their cells
+        the share behind the edge; and where in these the nodes of edges' cells are, (I, P).
+        """
+        some = slice(*np.searchsorted(self.row, [start, start + lines]))
+        at, many, nodes = (self.row[some] - start) * cells + self.cell[some], lines * cells, len(weight)
+        sign, out = self.sign[some], np.empty((lines, nodes, cells))
+        for i, behind in enumerate(self.behind[:, some] / weight[:, None]):
+            here = np.bincount(at, sign * behind, many)
+            here[1:] += np.bincount(at, sign * (1.0 - behind), many)[:-1]
+            np.cumsum(here.reshape(lines, cells), axis=1, out=out[:, i])
+        first = (self.row[some] - start) * (nodes * cells) + self.cell[some]
+        return out, first + cells * np.arange(nodes)[:, None]
+
+    def pairs(
+        self, lines: np.ndarray, count: int, weight: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Two edges of a line whose cells meet at a shift: what both leave is not the product of their shares.
+
+        Args:
+            lines: weights of the lines.
+            count: of shifts, in cells.
+            weight: of the nodes of a cell.
+
+        Returns:
+            Numbers of both and the shift, (Q,) each, and what the nodes of the cells weigh more, (I, Q).
+        """
+        first, second = _same_rows(self.row)
+        step = self.cell[first] - self.cell[second]
+        near = (step >= 0) & (step < count)
+        first, second, step = first[near], second[near], step[near]
+        share = self.behind / weight[:, None]
+        more = _rest(np.maximum(self.bent[first], self.bent[second]), self.rest)
+        more -= self.behind[:, first] * share[:, second]
+        return first, second, step, more * (self.sign[first] * self.sign[second] * lines[self.row[first]])
 
 
 def _rest(place: np.ndarray, polynomials_of_rest: np.ndarray) -> np.ndarray:
