@@ -17,6 +17,7 @@ error, and lines are added until it is small.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
 
@@ -27,7 +28,7 @@ from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
 from optics.geometry.polygon import area
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes, gauss
-from optics.numerics.threads import one_blas_thread
+from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction, polynomials, products, to_terms
@@ -36,7 +37,7 @@ from optics.waves.transfer import WORST_TRANSFER
 RIM_SIDES = 2048
 """Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""
 
-LINES = (360, 600, 1080, 3240)
+LINES = (400, 720, 1440, 3240)
 """Across the pupil, the first that do."""
 
 SETTLED = 1e-4
@@ -132,38 +133,55 @@ def lit_at(cut: CutPupil, points: np.ndarray) -> np.ndarray:
     return out
 
 
-@one_blas_thread()
-def line_transfer(
-    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int] = ()
-) -> LineTransfer:
-    """Transfer function at the frequencies 0, step .. (count - 1) step along a direction.
+def line_transfers(
+    cut: Sequence[CutPupil],
+    wavelengths: Sequence[float],
+    directions: np.ndarray,
+    step: float,
+    count: int,
+    lines: Sequence[int] = (),
+) -> list[list[LineTransfer]]:
+    """Transfer functions at the frequencies 0, step .. (count - 1) step along some directions.
 
     Args:
-        cut: pupil of the image.
-        wavelength: metres.
-        direction: unit vector in detector x, y, (2,).
+        cut: pupils of B images.
+        wavelengths: of their light, metres, B.
+        directions: unit vectors in detector x, y, (A, 2).
         step: of the frequency, cycles/m, positive.
         count: M.
         lines: across the pupil, tried one after the other; by default those of LINES that this kind of pupil needs.
 
+    Returns:
+        Of every image those along every direction.
+
     Raises:
         UnphysicalError: even the most lines tell another value than a third of them.
     """
-    way = complex(cut.pupil.normalised(*np.asarray(direction, float)))
+    tasks = [(*one, way) for one in zip(cut, wavelengths, strict=True) for way in np.asarray(directions, float)]
+    with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
+        found = list(pool.map(lambda task: _line_transfer(*task, step, count, lines), tasks))
+    each = len(directions)
+    return [found[k : k + each] for k in range(0, len(found), each)]
+
+
+def _line_transfer(
+    cut: CutPupil, wavelength: float, direction: np.ndarray, step: float, count: int, lines: Sequence[int]
+) -> LineTransfer:
+    """``line_transfers`` of one image along one direction."""
+    way = complex(cut.pupil.normalised(*direction))
     pitch, turn = wavelength * step * abs(way), way / abs(way)
     every = int(np.ceil(pitch / _LONGEST_CELL))
     pitch, count = pitch / every, (count - 1) * every + 1
-    tables = _turned_tables(cut.pupil, turn)
+    tables, outlines = _turned_tables(cut.pupil, turn), _turned(cut, turn)
     wave, nodes, error = 2.0 * np.pi / wavelength, _first_nodes(pitch), np.inf
-    outlines = _turned(cut, turn)
-    some = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
-    for number in lines or LINES[int(some) :]:
+    many = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
+    for number in lines or LINES[int(many) :]:
         rows = _Lines.across(*outlines, number)
         fine = _autocorrelation(rows, tables, wave, pitch, count, nodes)
         coarse = _autocorrelation(rows.third(), tables, wave, pitch, count, nodes + 1)
         error = max(float(np.max(np.abs(a - b))) for a, b in zip(fine, coarse, strict=True))
         if error < SETTLED:
-            return LineTransfer(fine[0][::every], fine[1][::every], error)
+            break
         nodes += 1
     if not error < WORST_TRANSFER:
         raise UnphysicalError(

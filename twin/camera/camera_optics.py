@@ -28,7 +28,7 @@ from optics.numerics.invariants import hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
-from optics.waves.line_transfer import line_transfer
+from optics.waves.line_transfer import line_transfers
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
@@ -404,15 +404,16 @@ class CameraOptics:
             shortest = float(np.min(colours))
             cutoff = max(float(np.max(one.pupil.cutoff(np.eye(2), shortest))) for own in cut for one in own)
             frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), MTF_POINTS)
+        every = [cut[n if len(cut) > 1 else 0] for n in range(len(colours))]
+        told = [
+            line_transfers(own, [float(colour)] * len(own), np.eye(2), float(frequency[1]), len(frequency))
+            for own, colour in zip(every, colours, strict=True)
+        ]
         out = []
         for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
-            both = np.zeros((2, 2, len(frequency)), complex)
-            for n, (colour, share) in enumerate(zip(colours, shares, strict=True)):
-                one = cut[n if len(cut) > 1 else 0][k]
-                for axis, direction in enumerate(np.eye(2)):
-                    told = line_transfer(one, float(colour), direction, frequency[1], len(frequency))
-                    both[:, axis] += share * np.stack([told.values, told.perfect])
-            values, limit = np.abs(both)
+            # (colour, axis, with its wavefront and without, frequency)
+            parts = np.array([[(one.values, one.perfect) for one in own[k]] for own in told])
+            values, limit = np.abs(np.einsum("k,kawm->wam", shares, parts))
             place = (float(where[0]), float(where[1]))
             out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares))
             hold_mtf(out[-1])
