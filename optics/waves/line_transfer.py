@@ -1,4 +1,4 @@
-"""Transfer function of a pupil that edges cut, at even steps of frequency along one direction, by lines along the shift.
+"""Transfer function of a pupil that edges cut, at even steps of frequency along a direction, by lines along the shift.
 
 Every line of the pupil along the shift is light from one edge to the next. The pupil's autocorrelation is the sum over
 lines of the autocorrelations along them. These are worked out on cells as long as one step of the shift, so that all
@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import chebyshev, legendre
@@ -157,9 +158,14 @@ def line_transfers(
     Raises:
         UnphysicalError: even the most lines tell another value than a third of them.
     """
-    tasks = [(*one, way) for one in zip(cut, wavelengths, strict=True) for way in np.asarray(directions, float)]
+    tasks = [(one, wave, way) for one, wave in zip(cut, wavelengths, strict=True) for way in np.asarray(directions)]
+
+    def told(task: tuple[CutPupil, float, np.ndarray]) -> LineTransfer:
+        one, wave, way = task
+        return _line_transfer(one, wave, way, step, count, lines)
+
     with one_blas_thread(), ThreadPoolExecutor(cores()) as pool:
-        found = list(pool.map(lambda task: _line_transfer(*task, step, count, lines), tasks))
+        found = list(pool.map(told, tasks))
     each = len(directions)
     return [found[k : k + each] for k in range(0, len(found), each)]
 
@@ -309,7 +315,7 @@ def _between(clear: Sequence[np.ndarray], blocked: Sequence[np.ndarray]) -> list
         places += [float(np.min(polygon.imag)), float(np.max(polygon.imag)), *polygon.imag[sharp].tolist()]
     some = np.unique(np.clip(places, low, high))
     some = some[np.concatenate([[True], np.diff(some) > _APART])]
-    return [(float(a), float(b)) for a, b in zip(some, some[1:], strict=False)]
+    return [(float(a), float(b)) for a, b in pairwise(some)]
 
 
 def _rule(low: float, high: float, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -415,7 +415,8 @@ class CameraOptics:
             parts = np.array([[(one.values, one.perfect) for one in own[k]] for own in told])
             values, limit = np.abs(np.einsum("k,kawm->wam", shares, parts))
             place = (float(where[0]), float(where[1]))
-            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares))
+            accuracy = max(one.error for own in told for one in own[k])
+            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares, accuracy=accuracy))
             hold_mtf(out[-1])
         return tuple(out)
 
@@ -449,7 +450,9 @@ class CameraOptics:
 
 def even_step(frequency: np.ndarray) -> bool:
     """Whether frequencies (M,) go up from 0 in even steps."""
-    return len(frequency) > 1 and frequency[1] > 0.0 and np.allclose(frequency, frequency[1] * np.arange(len(frequency)))
+    return (
+        len(frequency) > 1 and frequency[1] > 0.0 and np.allclose(frequency, frequency[1] * np.arange(len(frequency)))
+    )
 
 
 def rim(count: int) -> np.ndarray:

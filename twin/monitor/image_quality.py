@@ -44,6 +44,7 @@ from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_b
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import (
     ImagingShadows,
+    SeenEdges,
     Shadows,
     TracedBeams,
     imaging_shadows,

@@ -298,8 +298,13 @@ class TargetPath:
         field = self._field(rays, systems, places, colour)
         cut = cut_pupils(self._followed(field, lit), field.u, field.v, self.nodes, outlines)
         for k, pupil in enumerate(cut):
-            (x, y), (a, b) = np.linalg.inv(pupil.pupil.axes), np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None]
-            off = float(self.nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k]))
+            (x, y), (a, b) = (
+                np.linalg.inv(pupil.pupil.axes),
+                np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None],
+            )
+            off = float(
+                self.nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k])
+            )
             if off > WORST_PLACED:
                 raise UnphysicalError(f"outlines of its edges are wrong about {off:.2g} of a traced beam's rays")
         return cut
