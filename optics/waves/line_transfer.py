@@ -28,7 +28,7 @@ from scipy.fft import fft, ifft, irfft, next_fast_len, rfft
 
 from optics.geometry.polygon import area
 from optics.numerics.physical_error import UnphysicalError
-from optics.numerics.quadrature import PupilNodes, gauss
+from optics.numerics.quadrature import PupilNodes, gauss, nodes_for
 from optics.numerics.threads import cores, one_blas_thread
 from optics.waves.edge_shadow import StopOutlines
 from optics.waves.pupil_shadow import SMALLEST
@@ -55,6 +55,10 @@ _CORNER = 0.3
 
 _SHORT_CELLS = 0.005, 0.04
 """Lengths of cells up to which one and two nodes do; three for longer ones."""
+
+_TURNS = 0.2
+"""Radians of phase over a cell beyond which it gets a further node: near the cut-off little else than cells that edges
+cut is left."""
 
 _AT_ONCE = 2**14
 """Nodes worked on together: some arrays of 200 kB that stay in the cache."""
@@ -179,7 +183,8 @@ def _line_transfer(
     every = int(np.ceil(pitch / _LONGEST_CELL))
     pitch, count = pitch / every, (count - 1) * every + 1
     tables, outlines = _turned_tables(cut.pupil, turn), _turned(cut, turn)
-    wave, nodes, error = 2.0 * np.pi / wavelength, _first_nodes(pitch), np.inf
+    wave, error = 2.0 * np.pi / wavelength, np.inf
+    nodes = _first_nodes(pitch, wave * pitch * _steepest(tables[0]))
     many = len(cut.clear) + len(cut.blocked) > FEW_OUTLINES
     for number in lines or LINES[int(many) :]:
         rows = _Lines.across(*outlines, number)
@@ -232,9 +237,20 @@ def _chebyshev_nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     return node, matrix
 
 
-def _first_nodes(pitch: float) -> int:
-    """Nodes on cells of a length, for wavefronts of few waves: where these do not do, more follow."""
-    return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1
+def _first_nodes(pitch: float, turn: float) -> int:
+    """Nodes on cells of a length, over which the phase runs by up to ``turn`` radians: where these do not do, more
+    follow.
+    """
+    more = nodes_for(turn, 0) if turn > 1.0 else int(turn > _TURNS)
+    return int(np.searchsorted(_SHORT_CELLS, pitch)) + 1 + more
+
+
+def _steepest(table: np.ndarray) -> float:
+    """Largest derivative along x, over the unit disk, of a polynomial with coefficients (D + 1, D + 1)."""
+    axis = np.linspace(-1.0, 1.0, 33)
+    slope = chebyshev.chebgrid2d(axis, axis, chebyshev.chebder(table, axis=0))
+    inside = np.hypot(axis[:, None], axis) <= 1.0
+    return float(np.max(np.abs(slope), where=inside, initial=0.0))
 
 
 def _chords(polygon: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
