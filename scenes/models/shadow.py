@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise
+from functools import cached_property, lru_cache
+from itertools import accumulate, pairwise
 from typing import assert_never
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from optics.geometry.aperture import Circle, Rectangle
+from optics.geometry.aperture import Circle, Edge, Rectangle
 from optics.geometry.polygon import area, hull, intersect
 from optics.geometry.tree import PlacedBodies
 from optics.numerics.backend import Backend
@@ -111,7 +111,7 @@ class Shadows:
         """These shadows together with those of edges of surfaces.
 
         Args:
-            outlines: of the edges, as ``edge_outlines`` gives them.
+            outlines: of the edges, as ``SeenEdges.outlines`` gives them.
             name: under which ``shares`` tells what the edges take beside all bodies.
 
         Raises:
@@ -261,40 +261,61 @@ def no_shadows(count: int) -> Shadows:
     return Shadows.within(np.zeros((count, 0, 3, 2)), ())
 
 
-def edge_outlines(
-    beams: TracedBeams, model: CameraModel, camera: str, backend: Backend
-) -> Callable[[int], StopOutlines]:
-    """The edges of a camera's surfaces as its images see them on the stop, by the sides that stand for a circle.
+@dataclass(frozen=True, eq=False)
+class SeenEdges:
+    """The edges of a camera's surfaces as B images see them.
 
-    Args:
-        beams: to the images.
-        model: of the camera.
-        camera: its name in the assembly, that its elements' names begin with.
-        backend: where to trace.
-
-    The outlines raise UnphysicalError where rays meet a surface at places that no polynomials follow.
+    Attributes:
+        edges: of every surface that has some, in the order of the light.
+        places: where rays meet these surfaces, edges or not, in their own x and y, metres of nominal size, (B, N, 2).
+        nodes: of the stop, through which the rays go.
     """
-    cut = {name: model.mirrors.index(name) for name in model.edges}
-    launched = beams.rays.launched
-    heading = np.broadcast_to(beams.heading, (len(launched), 3))[:, None]
-    sent = make_rays(backend, launched, np.broadcast_to(heading, launched.shape))
-    traced = trace(backend, beams.systems, sent, keep=tuple(cut.values()))
-    places = {}
-    for name, number in cut.items():
-        body = beams.assembly.elements[f"{camera}/{name}"].body
-        size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
-        places[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
 
-    def outlines(round_sides: int) -> StopOutlines:
-        found, lit = StopOutlines(), None
-        for name, place in places.items():
-            edges = model.edges[name]
-            found += outlines_on_stop(place, edges, beams.nodes, round_sides, lit)
-            through = np.all([edge.passes(place[..., 0], place[..., 1]) for edge in edges], axis=0)
-            lit = through if lit is None else lit & through
+    edges: Mapping[str, tuple[Edge, ...]]
+    places: Mapping[str, np.ndarray]
+    nodes: PupilNodes
+
+    @classmethod
+    def of(cls, beams: TracedBeams, model: CameraModel, camera: str, backend: Backend) -> SeenEdges:
+        """Those of a camera.
+
+        Args:
+            beams: to the images.
+            model: of the camera.
+            camera: its name in the assembly, that its elements' names begin with.
+            backend: where to trace.
+        """
+        cut = {name: model.mirrors.index(name) for name in model.edges}
+        launched = beams.rays.launched
+        heading = np.broadcast_to(beams.heading, (len(launched), 3))[:, None]
+        sent = make_rays(backend, launched, np.broadcast_to(heading, launched.shape))
+        traced = trace(backend, beams.systems, sent, keep=tuple(cut.values()))
+        places = {}
+        for name, number in cut.items():
+            body = beams.assembly.elements[f"{camera}/{name}"].body
+            size = beams.placed.scale[beams.owner, beams.placed.index[body]].real
+            places[name] = np.asarray(traced.hit(number) / size[:, None, None])[..., :2]
+        return cls(model.edges, places, beams.nodes)
+
+    @cached_property
+    def passed(self) -> list[np.ndarray]:
+        """Which rays come through every surface and those before it, (B, N) each."""
+        through = [
+            np.all([edge.passes(place[..., 0], place[..., 1]) for edge in self.edges[name]], axis=0)
+            for name, place in self.places.items()
+        ]
+        return list(accumulate(through, np.logical_and))
+
+    def outlines(self, round_sides: int) -> StopOutlines:
+        """Outlines on the stop, with so many sides for a circle.
+
+        Raises:
+            UnphysicalError: rays meet a surface at places that no polynomials follow.
+        """
+        found = StopOutlines()
+        for (name, place), lit in zip(self.places.items(), [None, *self.passed[:-1]], strict=True):
+            found += outlines_on_stop(place, self.edges[name], self.nodes, round_sides, lit)
         return found
-
-    return outlines
 
 
 @lru_cache(maxsize=8)

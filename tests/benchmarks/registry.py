@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.benchmarks import (
+    cut_speed,
     jacobian_speed,
     large_speed,
     layout_speed,
@@ -52,6 +53,7 @@ BENCHMARKS = (
     Benchmark("pushbroom", "images of the ground", pushbroom_speed.measure, 60, 15),
     Benchmark("tables", "tables of measurements with a million rows", table_speed.measure, 40, 2),
     Benchmark("quality", "image quality with shadows and without", quality_speed.measure, 20, 5),
+    Benchmark("cut", "MTF of obscured pupils and of free ones", cut_speed.measure, 15, 4),
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),

@@ -59,8 +59,8 @@ class PupilRaster:
         return np.asarray(overlap)
 
     def shifts(self, count: int) -> np.ndarray:
-        """From 0 to the raster's width, whole cells, at most (count,)."""
-        return np.unique(np.linspace(0, len(self.share) - 1, count).astype(int))
+        """From 0 to the raster's width in even steps of whole cells, at most (count,)."""
+        return np.arange(0, len(self.share), -(-(len(self.share) - 1) // (count - 1)))
 
     def mtf(self, shifts: np.ndarray, perfect: bool = False) -> np.ndarray:
         """Along u and along v at shifts (M,) of cells, (2, M)."""

@@ -28,6 +28,7 @@ from optics.numerics.invariants import hold_within
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.threads import one_blas_thread
 from optics.raytrace.assembly import Assembly
+from optics.waves.line_transfer import line_transfers
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import PupilFunction
 from optics.waves.transfer import polychromatic_transfer
@@ -54,6 +55,9 @@ RINGS = 12
 
 MAP_POINTS = 65
 """Points of a wavefront's map on each axis."""
+
+MTF_POINTS = 65
+"""Frequencies of an MTF if none are asked for."""
 
 SPOT_RINGS = 8
 """Rings of a spot diagram's rays about the chief ray, six more rays on each."""
@@ -361,12 +365,14 @@ class CameraOptics:
         """
         colours = np.array([self.wavelength]) if wavelengths is None else np.asarray(wavelengths, float)
         shares = np.ones(len(colours)) if weights is None else np.asarray(weights, float)
+        if self.model.edges and (frequency is None or even_step(frequency)):
+            return self._mtfs_by_lines(fields, frequency, colours, shares / np.sum(shares))
         pupils = self.colour_pupils(fields, colours)
         if frequency is None:
             cutoff = max(
                 float(np.max(pupil.cutoff(np.eye(2), float(np.min(colours))))) for each in pupils for pupil in each
             )
-            frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), 65)
+            frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), MTF_POINTS)
         both = np.concatenate([frequency[:, None] * axis for axis in np.eye(2)])
         out = []
         for where, own in zip(np.asarray(fields, dtype=np.float64), pupils, strict=True):
@@ -379,6 +385,38 @@ class CameraOptics:
             )
             place = (float(where[0]), float(where[1]))
             out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares / np.sum(shares)))
+            hold_mtf(out[-1])
+        return tuple(out)
+
+    def _mtfs_by_lines(
+        self,
+        fields: Sequence[Field] | np.ndarray,
+        frequency: np.ndarray | None,
+        colours: np.ndarray,
+        shares: np.ndarray,
+    ) -> tuple[Mtf, ...]:
+        """``mtfs`` of pupils that edges cut at even steps of frequency."""
+        light = self.directions(fields)
+        places = self.path.places(self.state, light)
+        used = colours if lenses(self.model.spec) else [np.min(colours)]
+        cut = [self.path.cut_pupils(self.state, light, places, float(colour)) for colour in used]
+        if frequency is None:
+            shortest = float(np.min(colours))
+            cutoff = max(float(np.max(one.pupil.cutoff(np.eye(2), shortest))) for own in cut for one in own)
+            frequency = np.linspace(0.0, min(cutoff, 2.0 * self.nyquist), MTF_POINTS)
+        every = [cut[n if len(cut) > 1 else 0] for n in range(len(colours))]
+        told = [
+            line_transfers(own, [float(colour)] * len(own), np.eye(2), float(frequency[1]), len(frequency))
+            for own, colour in zip(every, colours, strict=True)
+        ]
+        out = []
+        for k, where in enumerate(np.asarray(fields, dtype=np.float64)):
+            # (colour, axis, with its wavefront and without, frequency)
+            parts = np.array([[(one.values, one.perfect) for one in own[k]] for own in told])
+            values, limit = np.abs(np.einsum("k,kawm->wam", shares, parts))
+            place = (float(where[0]), float(where[1]))
+            accuracy = max(one.error for own in told for one in own[k])
+            out.append(Mtf(place, frequency, values, limit, colours, self.nyquist, shares, accuracy=accuracy))
             hold_mtf(out[-1])
         return tuple(out)
 
@@ -408,6 +446,13 @@ class CameraOptics:
     def _place(self, rays: LineRays, k: int) -> tuple[float, float]:
         x, y = rays.position[k, 0, :2] / rays.size
         return float(y), float(x)
+
+
+def even_step(frequency: np.ndarray) -> bool:
+    """Whether frequencies (M,) go up from 0 in even steps."""
+    return (
+        len(frequency) > 1 and frequency[1] > 0.0 and np.allclose(frequency, frequency[1] * np.arange(len(frequency)))
+    )
 
 
 def rim(count: int) -> np.ndarray:

@@ -173,6 +173,8 @@ class Mtf:
         nyquist: of the pixels, cycles/m.
         weights: signal at each wavelength, sum 1, (K,).
         error: by how much the values change at most where more wavelengths are taken; 0 for lines.
+        accuracy: of a pupil that edges cut: change of the values by a third of the lines through it, at most; they are
+            right to a tenth of that. 0 for a free pupil.
     """
 
     field: Field
@@ -183,6 +185,7 @@ class Mtf:
     nyquist: float
     weights: np.ndarray
     error: float = 0.0
+    accuracy: float = 0.0
 
     @property
     def at_nyquist(self) -> np.ndarray:
@@ -202,7 +205,12 @@ class Mtf:
                 "direction": ["along line", "along track"],
                 "frequency": ("frequency", self.frequency, {"units": "1/m", "long_name": "spatial frequency"}),
             },
-            {"reference_frames": frames_text("optics"), "field": self.field, "nyquist_per_m": self.nyquist},
+            {
+                "reference_frames": frames_text("optics"),
+                "field": self.field,
+                "nyquist_per_m": self.nyquist,
+                **({"accuracy": self.accuracy} if self.accuracy else {}),
+            },
         )
 
 

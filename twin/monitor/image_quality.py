@@ -423,7 +423,8 @@ class _CameraBench:
         shadows = None if self.shadows is None else self.shadows.cast(beams)
         if self.model.edges:
             free = shadow.no_shadows(len(every)) if shadows is None else shadows
-            shadows = free.and_edges(shadow.edge_outlines(beams, self.model, name, self.backend), f"edges of {name}")
+            seen = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
+            shadows = free.and_edges(seen.outlines, f"edges of {name}")
         return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

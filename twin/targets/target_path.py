@@ -17,6 +17,7 @@ from optics.geometry.polygon import covered
 from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.line_of_sight import chief_rays
@@ -24,16 +25,24 @@ from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import make_rays, require_some, trace
 from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
-from optics.waves.edge_shadow import settled_shadows
+from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
+from optics.waves.line_transfer import CutPupil, cut_pupils, lit_at
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
-from scenes.models.shadow import ImagingShadows, TracedBeams, edge_outlines
+from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
+
+LINE_SIDES = 192
+"""Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
+
+WORST_PLACED = 5e-3
+"""Share of the rays through the pupil's quadrature that may pass edges where outlines tell otherwise: four, close to
+an edge."""
 
 MAP_POINTS = 7
 MAP_ORDER = 4
@@ -254,18 +263,51 @@ class TargetPath:
         state = self.coloured(state, colour)
         placed, systems, rays = self._imaging(state, directions)
         taken, _ = self._taken(placed, systems, rays, directions)
-        origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
-        collimator = self.collimator
-        incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
-        field = pupil_field(rays, colour, origin, incoming)
-        turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
-        turned = turned.in_lengths_of(systems.size)
+        turned = self._field(rays, systems, places, colour, target_shift)
         if not self.model.edges or taken is None:
             return fit_pupils(turned, self.nodes, DEGREE, taken)
         points = np.stack([self.nodes.x, self.nodes.y], axis=-1)
         lit = ~covered(taken, points, SMALLEST)
         cut = fit_pupils(turned, self.nodes, DEGREE, taken, lit)
         return tuple(with_nodes_enough(pupil, turned.wavelength) for pupil in cut)
+
+    def _field(
+        self, rays: ImagingRays, systems: SystemBatch, places: np.ndarray, wavelength: float, target_shift: float = 0.0
+    ) -> PupilField:
+        """Field of traced beams in the pupil, along the line CCD and across, with arguments of ``pupils``."""
+        origin = systems.size[:, None] * np.stack([places[:, 1], places[:, 0], np.zeros(len(places))], axis=-1)
+        collimator = self.collimator
+        incoming = None if collimator is None else lambda point: collimator.path(point, target_shift)
+        field = pupil_field(rays, wavelength, origin, incoming)
+        turned = PupilField(field.v, field.u, field.eikonal, field.amplitude, field.wavelength)
+        return turned.in_lengths_of(systems.size)
+
+    def cut_pupils(
+        self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
+    ) -> tuple[CutPupil, ...]:
+        """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``."""
+        colour = self.model.spec.wavelength if wavelength is None else wavelength
+        state = self.coloured(state, colour)
+        placed, systems, rays = self._imaging(state, directions)
+        owner = np.zeros(len(directions), dtype=int)
+        beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+        bodies = np.zeros((len(directions), 0, 3, 2)) if self.shadows is None else self.shadows.cast(beams).pieces
+        seen = SeenEdges.of(beams, self.model, self.name, self.backend)
+        outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
+        lit = seen.passed[-1] & ~covered(bodies, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        field = self._field(rays, systems, places, colour)
+        cut = cut_pupils(fit_pupils(field, self.nodes, DEGREE, None, lit), field.u, field.v, self.nodes, outlines, lit)
+        for k, pupil in enumerate(cut):
+            (x, y), (a, b) = (
+                np.linalg.inv(pupil.pupil.axes),
+                np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None],
+            )
+            off = float(
+                self.nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k])
+            )
+            if off > WORST_PLACED:
+                raise UnphysicalError(f"outlines of its edges are wrong about {off:.2g} of a traced beam's rays")
+        return cut
 
     def shadows_on_stop(self, state: State, directions: np.ndarray) -> tuple[np.ndarray, float]:
         """What edges of the camera's surfaces and bodies take of beams of directions (F, 3).
@@ -291,8 +333,8 @@ class TargetPath:
         if not self.model.edges:
             return taken, 0.0
         others = () if taken is None else tuple(np.moveaxis(taken, 1, 0))
-        seen = edge_outlines(beams, self.model, self.name, self.backend)
-        return settled_shadows(seen, len(directions), others)
+        seen = SeenEdges.of(beams, self.model, self.name, self.backend)
+        return settled_shadows(seen.outlines, len(directions), others)
 
     def local_map(self, state: State, direction: np.ndarray, reach: float) -> LocalMap:
         """Mapping of target coordinates up to ``reach`` (metres) about a direction (3,) of the light."""

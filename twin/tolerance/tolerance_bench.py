@@ -25,7 +25,7 @@ from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
 from optics.waves.lit_stop import LitStop
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_terms import RoughWavefrontError, products, to_terms
+from optics.waves.pupil_terms import products, to_terms
 from optics.waves.transfer import transfer
 from optics.waves.varied_pupil import VariedTransfer
 from optics.waves.wavefront import path_to_sphere
@@ -216,7 +216,7 @@ class ToleranceBench:
         test = self.setup.test
         try:
             pupils = self.optics.pupils(self.fields)
-        except (RoughWavefrontError, UnphysicalError) as error:
+        except UnphysicalError as error:
             raise test.error(f"the designed camera has no MTF: {error}", ("merits", asked[0][1].name)) from error
         cosines = direction[:, 1:, 1::-1]
         out = {}
