@@ -55,6 +55,9 @@ LEAST_SHADOW = 2
 """Nodes on and across the chords of an overlap, and on each side of a shadow's box, for a constant phase. The transfer
 function is then right to 2e-6, and to 5e-5 with shadows."""
 
+FEWEST_LIT = (DEGREE + 1) * (DEGREE + 2) // 2
+"""Nodes in the light from which polynomials are told: as many as those of the lowest degree."""
+
 EVENLY = 1e-2
 """As ``FAINTLY``, of direction cosines and amplitudes, which vary so little that nothing has to be added to them."""
 
@@ -450,6 +453,11 @@ def fit_pupils(
         raise UnphysicalError(
             f"{share:.1%} of the pupil of image {which} carries no light: a beam that another aperture than the stop "
             "cuts has no smooth pupil; enlarge that aperture or move the field point inward"
+        )
+    if lit is not None and np.any(few := np.sum(lit, axis=-1) < FEWEST_LIT):
+        which = int(np.argmax(few))
+        raise UnphysicalError(
+            f"edges leave light at {int(np.sum(lit[which]))} of {nodes.count} rays of image {which}: too few to follow"
         )
     with one_blas_thread():
         for used in (degree,) if lit is None else CUT_DEGREES:

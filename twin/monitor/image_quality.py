@@ -73,8 +73,7 @@ _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
 
 COLOURS = 5
-"""Gauss' wavelengths of a band. At one frequency inside of all cut-offs four are right to 1e-7; cut-offs inside the
-band need more, but there the MTF is next to nothing."""
+"""Gauss' wavelengths of a band: four are right to 1e-7 but near cut-offs inside the band, where the MTF is nothing."""
 
 _ROUNDING = 1e-5
 """By which shares may leave 0 to 1, and an error at best focus that on the line CCD, in waves."""
@@ -86,8 +85,7 @@ _MOST_WAVES = 1e6
 """Wavefront error beyond which a number is none of an image, waves rms."""
 
 _FEW, _APART = quadrature.even_disk(500), 0.02
-"""Points of the stop by which the area of shadows is held to their outlines; they count a share to 1 %. Shares of the
-stop's area and of the light differ by as little: the light is nearly even."""
+"""Points of the stop by which the area of shadows is held to their outlines, and by how much they may differ."""
 
 AT_ONCE = 40
 """States traced in one launch, to bound memory: 40 take 60 MB."""
@@ -341,7 +339,6 @@ class _CameraBench:
         stop = instrument.assembly.elements[f"{name}/{spec.stop}"].aperture
         assert isinstance(stop, Circle)
         self.stop = stop
-        # edges leave rays in the dark, where the wavefront may bend more
         self.refracts = len(self.colours) > 1 and bool(lenses(spec))
         self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
         self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
@@ -558,9 +555,8 @@ class _CameraBench:
 class _Mean:
     """Mean over the free part of each stop, of values at the bench's nodes.
 
-    Values are continued into the shadows by their polynomials, and what they hold there is taken off. Where edges of
-    surfaces cut the beams, polynomials stand for the rays in the dark, too, which may pass the rims of lenses far
-    outside.
+    Polynomials continue the values into the shadows, where they are taken off. They stand for the rays in the dark of
+    edges, too, which may pass the rims of lenses far outside.
     """
 
     def __init__(self, bench: _CameraBench, shadows: shadow.Shadows | None, free: np.ndarray | None = None) -> None:
