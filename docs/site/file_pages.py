@@ -37,6 +37,7 @@ READ_BY = {
     "orbit_monitor": "`python -m twin.orbit monitor FILE`",
     "orbit_check": "`python -m twin.orbit check FILE`",
     "orbit_match": "`python -m twin.orbit match FILE`",
+    "tolerance": "`python -m twin.tolerance FILE`",
     "three_line_camera": "tests in orbit, which name it: `camera: th1`",
     "study": "`python -m twin.study FILE`",
 }

@@ -132,10 +132,11 @@ def test_outlines_come_from_the_stop_and_tell_what_is_lit() -> None:
     dark = disk(0.35, 0.1 + 0.2j)
     on_stop = np.stack([dark.real, dark.imag], axis=-1)[None]
     smooth = PupilFunction(pupil.centre, pupil.axes, pupil.edge, np.zeros((9, 9)), np.eye(9))
-    (cut,) = cut_pupils([smooth], u, v, nodes, StopOutlines((), (on_stop,)))
+    lit = np.abs(nodes.x + 1j * nodes.y - (0.1 + 0.2j))[None] > 0.35
+    (cut,) = cut_pupils([smooth], u, v, nodes, StopOutlines((), (on_stop,)), lit)
     np.testing.assert_allclose(cut.blocked[0][::-1], np.conj(dark), atol=1e-12)
     points = nodes.x - 1j * nodes.y
     np.testing.assert_array_equal(lit_at(cut, points), np.abs(points - (0.1 - 0.2j)) > 0.35)
     nothing = np.zeros((1, 3, 2))
     with pytest.raises(UnphysicalError, match="leaves no light in the pupil of image 0"):
-        cut_pupils([cut.pupil], u, v, nodes, StopOutlines((nothing,), ()))
+        cut_pupils([cut.pupil], u, v, nodes, StopOutlines((nothing,), ()), lit)

@@ -91,7 +91,6 @@ def test_without_the_corrections_dirt_does_harm(bench):
         assert square > chi2.isf(1e-6, 2)
 
 
-@pytest.mark.second
 def test_clean_frames_are_not_touched(bench):
     found, told = squares(bench, (), range(2000, 2010))
     assert found.sum() < chi2.isf(1e-4, 20)

@@ -141,7 +141,6 @@ def test_a_reading_whose_state_cannot_be_traced_says_so(pair, blurred) -> None:
     assert told.recovered_dict()["retraced"]["model"]["off_in_sigma"] is None
 
 
-@pytest.mark.second
 def test_what_no_spot_sees_is_a_warning(orbit) -> None:
     """The line CCD alone, 20 um: d_alpha is -0.73 arcsec and read as 0. And coma of M2 at five times its sigma, which
     moves spots as likelier motions do.

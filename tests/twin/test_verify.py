@@ -440,7 +440,6 @@ def test_a_run_made_again_is_the_same_to_the_byte(compared, tmp_path) -> None:
     assert folder_state(tmp_path / "again").whole
 
 
-@pytest.mark.second
 def test_a_number_that_the_run_does_not_give_is_found(compared, tmp_path) -> None:
     """Though every checksum is right: whoever wrote the folder wrote another number into it."""
     doctored = tmp_path / "doctored"
