@@ -26,14 +26,16 @@ DRAWS = 2000
 """Cameras by which limits are chosen."""
 CHECKED = 1000
 """Of these, cameras that are traced in every round."""
-ROUNDS = 8
+ROUNDS = 6
 BOUND = 2.0
 """By which factor a limit may change in a round."""
 _STEPS = 60
 _STEP = 1e-5
 """Step of the logarithm of a limit by which margins are differentiated: along the parts' own derivatives."""
-_SETTLED = 0.03
+_SETTLED = 0.1
 """Change of the logarithms of the limits below which no further round is made."""
+_LAST = 4
+"""Times that all limits are tightened together at last, where exact traces say that the yield is not met."""
 _NEAR = 0.02
 """Share of the cameras about the quantile whose gradients are averaged."""
 _SAFE = 1.0
@@ -90,17 +92,24 @@ def allocate(
         advance("allocation", turn, ROUNDS)
         bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
         step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
-        total = total + step
-        now = bench.scaled(np.exp(total))
-        trade = _Trade(now, sensitivities(now).model, samples, costs, share)
-        if np.max(np.abs(step)) < _SETTLED and trade.quantile(np.zeros(len(step)))[0] <= 0.0:
+        total, trade = total + step, _Trade.at(bench, total + step, samples, costs, share)
+        if np.max(np.abs(step)) < _SETTLED:
             break
-    reached = trade.quantile(np.zeros(len(total)))[0] <= 0.0
-    limits, rounded = _graded(setup, trade, total, spec, reached)
-    level = np.log(rounded) - total
+    nothing = np.zeros(len(total))
+    for _ in range(_LAST):
+        if trade.quantile(nothing)[0] <= 0.0:
+            break
+        total = total + trade.tightened(np.where(costs.kept, 0.0, np.clip(low - total, -np.log(BOUND), 0.0)))
+        trade = _Trade.at(bench, total, samples, costs, share)
+    reached = trade.quantile(nothing)[0] <= 0.0
+    for looser in (reached, False):
+        limits, rounded = _graded(setup, trade, total, spec, looser)
+        final = _Trade.at(bench, np.log(rounded), samples, costs, share)
+        if final.quantile(nothing)[0] <= 0.0:
+            break
     advance("allocation", ROUNDS, ROUNDS)
-    cost = costs.of_level(np.zeros(len(total))), costs.of_level(np.log(rounded))
-    return Allocation(np.exp(total), rounded, FrozenMap(limits), cost, (first, trade.passing(level)), reached)
+    cost = costs.of_level(nothing), costs.of_level(np.log(rounded))
+    return Allocation(np.exp(total), rounded, FrozenMap(limits), cost, (first, final.passing(nothing)), reached)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +170,12 @@ class _Trade:
         own = self._worst(self.model.parts(np.ones(len(costs.kept))))[:count]
         self.offset = float(np.quantile(exact, share) - np.quantile(own, share))
 
+    @classmethod
+    def at(cls, bench: ToleranceBench, total: np.ndarray, samples: Samples, costs: _Costs, share: float) -> _Trade:
+        """About limits at exp(total) (E,) times those of a bench."""
+        now = bench.scaled(np.exp(total))
+        return cls(now, sensitivities(now).model, samples, costs, share)
+
     def _margins(self, values: np.ndarray) -> np.ndarray:
         """Worst margin of every camera, (S,), of values (S, M); infinite without light."""
         each = np.stack([merit.margin(values[:, m]) for m, merit in enumerate(self.bench.merits)])
@@ -196,14 +211,8 @@ class _Trade:
             high: likewise.
             total: where the bench's own limits are, (E,).
         """
-        start = np.zeros(len(low))
-        for part in np.linspace(0.0, 1.0, 17):
-            start = part * low
-            if self.quantile(start)[0] <= 0.0:
-                break
-        else:
-            return low
-        if self.costs.kept.all():
+        start = self.tightened(low)
+        if self.costs.kept.all() or self.quantile(start)[0] > 0.0:
             return start
         size = self.costs.of_level(total)
         found = minimize(
@@ -221,6 +230,15 @@ class _Trade:
         )
         return self._between(start, np.clip(found.x, low, high), total)
 
+    def tightened(self, low: np.ndarray) -> np.ndarray:
+        """The first step (E,) on the way to the tightest limits, ``low``, that passes; that to the tightest if none
+        does.
+        """
+        for part in np.linspace(0.0, 1.0, 33):
+            if self.quantile(part * low)[0] <= 0.0:
+                return np.asarray(part * low)
+        return low
+
     def _between(self, inside: np.ndarray, outside: np.ndarray, total: np.ndarray) -> np.ndarray:
         """The cheapest limits that pass on the way from those that do to others."""
         best = inside
@@ -233,9 +251,9 @@ class _Trade:
 
 
 def _graded(
-    setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, reached: bool
+    setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
-    """Limits rounded down to grades, then one after the other a grade up wherever the yield allows it.
+    """Limits rounded down to grades; then, if some may be looser, one after the other goes up where the yield allows it.
 
     Returns:
         Entry -> limit, and limits over the stated ones, (E,).
@@ -252,7 +270,7 @@ def _graded(
     def scales(which: np.ndarray) -> np.ndarray:
         return np.array([ladder[k][1] for ladder, k in zip(ladders, which, strict=True)]) / old
 
-    if reached:
+    if looser:
         gain = trade.costs.cost * trade.costs.exponent
         for e in np.argsort(-gain, kind="stable"):
             for k in range(1, len(ladders[e])):
@@ -266,7 +284,7 @@ def _graded(
 
 
 def _ladder(limit: str | float, kind: str, value: float, grades: Sequence[float]) -> list[tuple[str | float, float]]:
-    """The grade at or below a value and the next two above it, as files have them and in SI; grades are counted in the
+    """The grade at or below a value and those near above it, as files have them and in SI; grades are counted in the
     unit of the old limit.
     """
     parts = split_quantity(limit)
@@ -276,4 +294,6 @@ def _ladder(limit: str | float, kind: str, value: float, grades: Sequence[float]
     steps = sorted(float(f"{g}e{d}") for d in (decade - 1, decade, decade + 1) for g in grades)
     below = max((k for k, step in enumerate(steps) if step <= number * (1.0 + 1e-9)), default=0)
     texts: list[str | float] = [f"{step:g} {parts[1]}" if parts is not None else step for step in steps]
-    return [(text, amount_si(text, kind)) for text in texts[below : below + 3]]
+    # farther than in a round the model is not trusted
+    near = [text for text, step in zip(texts, steps, strict=True) if step <= BOUND * number]
+    return [(text, amount_si(text, kind)) for text in near[below:]]
