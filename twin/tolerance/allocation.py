@@ -253,7 +253,7 @@ class _Trade:
 def _graded(
     setup: ToleranceSetup, trade: _Trade, total: np.ndarray, spec: AllocationSpec, looser: bool
 ) -> tuple[dict[str, str | float], np.ndarray]:
-    """Limits rounded down to grades; then, if some may be looser, one after the other goes up where the yield allows it.
+    """Limits rounded down to grades; then, if some may be looser, one after the other goes up where the yield allows.
 
     Returns:
         Entry -> limit, and limits over the stated ones, (E,).
