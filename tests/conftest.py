@@ -95,8 +95,11 @@ class Calibrated:
 
 
 def _of_one_instrument(one: MonitorExperiment, resolved: ResolvedJob, backend: Backend) -> bool:
+    """Equal with the order in which parts are named, which is that of the results and no part of equality."""
     return one.backend == backend and all(
-        getattr(one.resolved, name) == getattr(resolved, name) for name in ("instrument", "cameras", "detector")
+        getattr(one.resolved, name) == getattr(resolved, name)
+        and repr(getattr(one.resolved, name)) == repr(getattr(resolved, name))
+        for name in ("instrument", "cameras", "detector")
     )
 
 

@@ -123,9 +123,17 @@ class Procedure:
         return Named(self.setup).get() if isinstance(self.setup, str) else self.setup
 
 
+BASES: dict[str, Named] = {
+    # a study imports only what its own base needs: a worker then starts in half the time
+    "render": Named("twin.study.runs.render_base:RenderBase"),
+    "tolerance": Named("twin.tolerance.samples:ToleranceBase"),
+}
+"""Command -> what evaluates many of its runs at once for a study; tests of `PROCEDURES` are run one after the other."""
+
+
 def studied() -> tuple[str, ...]:
-    """Tests that a study can vary."""
-    return tuple(name for name, procedure in PROCEDURES.items() if procedure.varied)
+    """Commands that a study can vary."""
+    return (*BASES, *(name for name, procedure in PROCEDURES.items() if procedure.varied))
 
 
 PROCEDURES: dict[str, Procedure] = {

@@ -348,7 +348,7 @@ class BaseSpec(Spec):
             name in the library.
     """
 
-    command: Annotated[str, OneOf(lambda: ("render", "tolerance", *studied()))]
+    command: Annotated[str, OneOf(studied)]
     file: Reference
 
 

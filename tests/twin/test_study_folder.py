@@ -63,9 +63,11 @@ def is_whole(path: Path, report: str) -> bool:
 @pytest.mark.second
 def test_sources_are_all_that_can_compute() -> None:
     """Everything that the program of a worker may import, wherever in a file the import stands."""
+    from scenes.specs.procedures import BASES
     from tests.test_architecture import PACKAGES, imported_modules
 
-    todo, seen = ["twin.study.runs.task", "twin.study.runs.plan"], set()
+    named = [base.path.partition(":")[0] for base in BASES.values()]
+    todo, seen = ["twin.study.runs.task", "twin.study.runs.plan", *named], set()
     while todo:
         name = todo.pop()
         place = ROOT.joinpath(*name.split("."))

@@ -7,10 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optics.geometry.polygon import covered
 from optics.geometry.tree import State
+from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.lit_stop import LitStop, holes
+from optics.waves.pupil_shadow import SMALLEST
+from optics.waves.pupil_terms import products, smooth_terms
 from optics.waves.wavefront import PartFit, fit_part, fit_wavefront, orthonormal_parts
 from twin.targets.target_path import LineRays, TargetPath
 
@@ -26,6 +30,9 @@ SHARPEST = 1e-4
 
 _SHADOW_NODES = 6
 """Along each side of a shadow's box."""
+
+_ASTRAY, _DARK_DEGREE = 2.0, 12
+"""Ranges of the light's wavefront beyond which rays in the dark do not count, and degree of what stands for them."""
 
 _FINER_RINGS, _FINER_NODES = 4, 2
 """More of both for the finer quadrature, by which numbers are held."""
@@ -90,9 +97,10 @@ def exact_fit(
     if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
         return None
     waves = np.split(-to_sphere(rays)[0, 1:] / path.model.spec.wavelength, [len(points[0])])
+    tamed = [_tamed(stop, pieces, rings + r, wave) for stop, (r, _), wave in zip(stops, more, waves, strict=True)]
     try:
         coarse, fine = (
-            fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in zip(stops, waves, strict=True)
+            fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in zip(stops, tamed, strict=True)
         )
     except UnphysicalError:
         return None
@@ -100,6 +108,23 @@ def exact_fit(
     if not change < RAYS_ACCURACY:
         return None
     return ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
+
+
+def _tamed(stop: LitStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
+    """The wavefront (N,) with a smooth continuation of the light's where rays in the dark go far astray, as those do
+    that pass the rims of lenses outside; what it is there is taken off again.
+    """
+    points = np.stack([stop.x[0], stop.y[0]], axis=-1)
+    free = ~covered(pieces, points, SMALLEST)[0]
+    middle, spread = np.mean(wave[free]), np.ptp(wave[free])
+    if np.all(np.abs(wave[~free] - middle) <= _ASTRAY * spread):
+        return wave
+    own = slice(0, quadrature.disk(rings).count)
+    near = points / np.maximum(np.hypot(*points.T), 1.0)[:, None]
+    table = products(near[:, 0], near[:, 1], _DARK_DEGREE)
+    known = free[None, own], wave[None, own, None]
+    terms = smooth_terms(table[own], stop.weight[0, own], *known)
+    return np.where(free, wave, table @ terms[0, :, 0])
 
 
 def counted_fit(nodes: PupilNodes, weight: np.ndarray, flat: np.ndarray, terms: int, free: bool) -> PartFit:

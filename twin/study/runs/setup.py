@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job_tables import HEAT_KEYS
 from scenes.specs.load import find_named
-from scenes.specs.procedures import PROCEDURES, Named, studied
+from scenes.specs.procedures import BASES, PROCEDURES, studied
 from scenes.specs.study import FactorSpec, Scalar, StudySpec
 from scenes.yaml import yaml_file
 from scenes.yaml.csv_table import lines_of, table_text
@@ -352,14 +352,6 @@ def _cell(text: str) -> Any:
         return text
 
 
-BASES = {
-    # a study imports only what its own base needs: a worker then starts in half the time
-    "render": Named("twin.study.runs.render_base:RenderBase"),
-    "tolerance": Named("twin.tolerance.samples:ToleranceBase"),
-}
-"""Command -> what evaluates many of its runs at once; the tests of `PROCEDURES` are run one after the other."""
-
-
 def _job(command: str) -> BaseJob:
     """The job of that name: one of `BASES`, or a test of `PROCEDURES` that can be varied.
 
@@ -370,6 +362,6 @@ def _job(command: str) -> BaseJob:
         job: BaseJob = BASES[command]()
         return job
     if command not in studied():
-        allowed = ", ".join((*BASES, *studied()))
+        allowed = ", ".join(studied())
         raise InputError(Issue(f"this version of the twin cannot run {command!r} in a study", allowed=allowed))
     return ProcedureBase(PROCEDURES[command])
