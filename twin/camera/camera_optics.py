@@ -388,6 +388,7 @@ class CameraOptics:
             hold_mtf(out[-1])
         return tuple(out)
 
+    @one_blas_thread()  # of small matrices: a second thread would only wait, which counts
     def _mtfs_by_lines(
         self,
         fields: Sequence[Field] | np.ndarray,

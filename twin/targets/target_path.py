@@ -7,6 +7,7 @@ sense, so that its image is ``f / focal_length`` times its size and upright in t
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
+from optics.numerics.quadrature import PupilNodes
 from optics.raytrace.aim import transverse_axes
 from optics.raytrace.assembly import Assembly, points_to_world
 from optics.raytrace.line_of_sight import chief_rays
@@ -39,6 +41,9 @@ RINGS = 14
 
 LINE_SIDES = 192
 """Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
+
+SMOOTH = 1e-6
+"""Rms eikonal that the polynomials of a wavefront leave which is smooth, wavelengths."""
 
 WORST_PLACED = 5e-3
 """Share of the rays through the pupil's quadrature that may pass edges where outlines tell otherwise: four, close to
@@ -227,12 +232,15 @@ class TargetPath:
             TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
         ).pieces
 
-    def _imaging(self, state: State, directions: np.ndarray) -> tuple[PlacedBodies, SystemBatch, ImagingRays]:
-        """Beams through the nodes of the stop to the line CCD."""
+    def _imaging(
+        self, state: State, directions: np.ndarray, nodes: PupilNodes | None = None
+    ) -> tuple[PlacedBodies, SystemBatch, ImagingRays]:
+        """Beams through nodes of the stop, ``self.nodes`` by default, to the line CCD."""
+        nodes = self.nodes if nodes is None else nodes
         placed = self.assembly.place([state])
         systems, to_stop = self._systems(state, len(directions), placed)
         start, first = self._launch(directions), self._axes[:, 1]
-        rays = imaging_rays(self.backend, systems, to_stop, directions, start, self.stop, self.nodes, first)
+        rays = imaging_rays(self.backend, systems, to_stop, directions, start, self.stop, nodes, first)
         return placed, systems, rays
 
     def pupils(
@@ -285,26 +293,36 @@ class TargetPath:
     def cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, wavelength: float | None = None
     ) -> tuple[CutPupil, ...]:
-        """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``."""
+        """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``.
+
+        A smooth wavefront needs no more nodes than a free pupil's; any other is traced at those of ``nodes``.
+        """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
+        with suppress(UnphysicalError):
+            few = self._cut_pupils(state, directions, places, colour, quadrature.disk(RINGS))
+            if all(one.pupil.eikonal_residual <= SMOOTH * colour for one in few):
+                return few
+        return self._cut_pupils(state, directions, places, colour, self.nodes)
+
+    def _cut_pupils(
+        self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
+    ) -> tuple[CutPupil, ...]:
         state = self.coloured(state, colour)
-        placed, systems, rays = self._imaging(state, directions)
+        placed, systems, rays = self._imaging(state, directions, nodes)
         owner = np.zeros(len(directions), dtype=int)
-        beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, self.nodes)
+        beams = TracedBeams(self.assembly, placed, owner, systems, rays, directions, nodes)
         bodies = np.zeros((len(directions), 0, 3, 2)) if self.shadows is None else self.shadows.cast(beams).pieces
         seen = SeenEdges.of(beams, self.model, self.name, self.backend)
         outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(bodies, 1, 0)))
-        lit = seen.passed[-1] & ~covered(bodies, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
+        lit = seen.passed[-1] & ~covered(bodies, np.stack([nodes.x, nodes.y], axis=-1), SMALLEST)
         field = self._field(rays, systems, places, colour)
-        cut = cut_pupils(fit_pupils(field, self.nodes, DEGREE, None, lit), field.u, field.v, self.nodes, outlines, lit)
+        cut = cut_pupils(fit_pupils(field, nodes, DEGREE, None, lit), field.u, field.v, nodes, outlines, lit)
         for k, pupil in enumerate(cut):
             (x, y), (a, b) = (
                 np.linalg.inv(pupil.pupil.axes),
                 np.stack([field.u[k], field.v[k]]) - pupil.pupil.centre[:, None],
             )
-            off = float(
-                self.nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k])
-            )
+            off = float(nodes.share @ (lit_at(pupil, (x[0] * a + x[1] * b) + 1j * (y[0] * a + y[1] * b)) != lit[k]))
             if off > WORST_PLACED:
                 raise UnphysicalError(f"outlines of its edges are wrong about {off:.2g} of a traced beam's rays")
         return cut
