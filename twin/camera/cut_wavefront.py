@@ -97,17 +97,20 @@ def exact_fit(
     if not np.all(rays.valid[0] | (np.hypot(*every.T) > 1.0)):
         return None
     waves = np.split(-to_sphere(rays)[0, 1:] / path.model.spec.wavelength, [len(points[0])])
-    tamed = [_tamed(stop, pieces, rings + r, wave) for stop, (r, _), wave in zip(stops, more, waves, strict=True)]
-    try:
-        coarse, fine = (
-            fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in zip(stops, tamed, strict=True)
-        )
-    except UnphysicalError:
-        return None
-    change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
-    if not change < RAYS_ACCURACY:
-        return None
-    return ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
+    both = list(zip(stops, waves, strict=True))
+    tamed = [(stop, _tamed(stop, pieces, rings + r, wave)) for (stop, wave), (r, _) in zip(both, more, strict=True)]
+    for tried in (both, tamed):
+        try:
+            coarse, fine = (fit_part(stop.x[0], stop.y[0], stop.weight[0], wave, terms) for stop, wave in tried)
+        except UnphysicalError:
+            continue
+        # rays in the dark that go astray leave no square above zero
+        if not min(coarse.rms, fine.rms) > 0.0:
+            continue
+        change = max(abs(fine.rms - coarse.rms) / max(fine.rms, SHARPEST), abs(fine.strehl - coarse.strehl))
+        if change < RAYS_ACCURACY:
+            return ExactFit(fine, float(stops[1].light[0]), float(holes(pieces)[0]), max(change, error))
+    return None
 
 
 def _tamed(stop: LitStop, pieces: np.ndarray, rings: int, wave: np.ndarray) -> np.ndarray:
