@@ -27,13 +27,12 @@ class VariedTransfer:
     Attributes:
         phasors: of the known pupil at the nodes of the overlap with their weights, complex (Q,); their sum is its
             transfer function.
-        steps: of polynomials of the pupil from one end of the shift to the other, times the wave number, (Q, K).
-        solve: from values at the traced nodes of the stop to coefficients of these polynomials, (K, N).
+        turns: from optical paths at the traced nodes of the stop to what they add to the phases at the nodes of the
+            overlap, by polynomials over the pupil, (Q, N), radians per metre.
     """
 
     phasors: np.ndarray
-    steps: np.ndarray
-    solve: np.ndarray
+    turns: np.ndarray
 
     @classmethod
     def of(
@@ -43,7 +42,6 @@ class VariedTransfer:
         wavelength: float,
         cosines: np.ndarray,
         degree: int,
-        finer: int = 0,
     ) -> VariedTransfer | None:
         """Work out what does not vary.
 
@@ -53,7 +51,6 @@ class VariedTransfer:
             wavelength: metres.
             cosines: direction cosines along these axes of the rays whose wavefront varies, (N, 2).
             degree: of the polynomials of its variation.
-            finer: further nodes along each direction.
 
         Returns:
             None beyond the cut-off.
@@ -62,9 +59,9 @@ class VariedTransfer:
         right, left, inside = pupil.edge.corners(shift)
         if not inside[0]:
             return None
-        own = [pupil.edge.overlap(shift, right, left, gauss(ACROSS + finer), gauss(ALONG + finer))]
+        own = [pupil.edge.overlap(shift, right, left, gauss(ACROSS), gauss(ALONG))]
         if pupil.shadow is not None:
-            taken, area = pupil.shadow.overlap(shift[None], IN_SHADOW + finer)
+            taken, area = pupil.shadow.overlap(shift[None], IN_SHADOW)
             own.append((taken[0], area[0]))
         points, weight = (np.concatenate(arrays, axis=1)[0] for arrays in zip(*own, strict=True))
         ahead, behind = points + 0.5 * shift, points - 0.5 * shift
@@ -74,11 +71,11 @@ class VariedTransfer:
         phasors = scale * weight * light * light_behind * np.exp(1j * wave * (path - path_behind))
         place = np.linalg.solve(pupil.axes, (cosines - pupil.centre).T)
         steps = products(ahead.real, ahead.imag, degree) - products(behind.real, behind.imag, degree)
-        return cls(phasors, wave * steps, np.linalg.pinv(products(place[0], place[1], degree)))
+        return cls(phasors, wave * steps @ np.linalg.pinv(products(place[0], place[1], degree)))
 
     def modulation(self, paths: np.ndarray) -> np.ndarray:
         """MTF where the optical paths of the rays are longer by ``paths`` (..., N), metres, than the known pupil's."""
-        phase = paths @ (self.steps @ self.solve).T
+        phase = paths @ self.turns.T
         return np.asarray(np.abs(np.cos(phase) @ self.phasors + 1j * (np.sin(phase) @ self.phasors)))
 
     def curvature(self, slopes: np.ndarray) -> np.ndarray:
@@ -87,7 +84,7 @@ class VariedTransfer:
         Args:
             slopes: of the rays' optical paths by the numbers, (K, N), metres.
         """
-        phases = slopes @ (self.steps @ self.solve).T
+        phases = slopes @ self.turns.T
         whole = np.sum(self.phasors)
         first = 1j * phases @ self.phasors
         second = -(phases * self.phasors) @ phases.T

@@ -177,9 +177,9 @@ class _Trade:
         return cls(now, sensitivities(now).model, samples, costs, share)
 
     def _margins(self, values: np.ndarray) -> np.ndarray:
-        """Worst margin of every camera, (S,), of values (S, M); infinite without light."""
-        each = np.stack([merit.margin(values[:, m]) for m, merit in enumerate(self.bench.merits)])
-        return np.asarray(np.where(np.isnan(each), 1e3, each).max(axis=0))
+        """Worst margin of every camera, (S,), of values (S, M); without light one that quantiles can be taken of."""
+        worst = self.bench.worst_margins(values)
+        return np.asarray(np.where(np.isinf(worst), 1e3, worst))
 
     def _worst(self, parts: np.ndarray) -> np.ndarray:
         return self._margins(self.bench.values(parts))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from optics.numerics.backend import Backend
+from scenes.specs.study import StudySpec
 from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
@@ -145,8 +146,6 @@ def study_of(setup: ToleranceSetup, bench: ToleranceBench, samples: int, seed: i
         samples: number of cameras.
         seed: of the draws.
     """
-    from scenes.specs.study import StudySpec
-
     test = setup.test
     factors: dict[str, Any] = {}
     for number in bench.numbers:

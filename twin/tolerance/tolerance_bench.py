@@ -530,6 +530,13 @@ class ToleranceBench:
         """Values of all merits, (..., M)."""
         return np.stack([merit.values(parts) for merit in self.merits], axis=-1)
 
+    def worst_margins(self, values: np.ndarray) -> np.ndarray:
+        """How far cameras of values (S, M) are beyond the requirement that they meet least, (S,); infinite without
+        light.
+        """
+        each = np.stack([merit.margin(values[:, k]) for k, merit in enumerate(self.merits)])
+        return np.asarray(np.where(np.isnan(each), np.inf, each).max(axis=0))
+
     def passing(self, values: np.ndarray) -> np.ndarray:
         """Whether values (..., M) meet their requirements, (..., M)."""
         each: Iterable[np.ndarray] = (merit.passes(values[..., k]) for k, merit in enumerate(self.merits))

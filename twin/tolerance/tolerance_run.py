@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.tolerance import MERIT_UNITS, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import LENGTH
+from scenes.yaml.yaml_file import dump_yaml
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
@@ -314,8 +316,7 @@ def _warnings(
 
 def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -> dict[str, str]:
     """The worst cameras as jobs that ``python -m twin.render`` and ``twin.camera`` take, the worst first."""
-    margins = np.stack([m.margin(samples.values[:, k]) for k, m in enumerate(bench.merits)], axis=-1)
-    worst = np.where(np.isnan(margins), np.inf, margins).max(axis=-1)
+    worst = bench.worst_margins(samples.values)
     out = {}
     for rank, s in enumerate(np.argsort(-worst, kind="stable")[:WORST]):
         moves = np.nan_to_num(samples.moves[s])
@@ -344,8 +345,6 @@ def _perturb(motion: Any) -> dict[str, Any]:
 
 
 def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
-    from scenes.yaml.yaml_file import dump_yaml
-
     try:
         JobSpec.model_validate(data)
     except (InputError, ValueError) as error:  # a motion larger than a job may say
@@ -361,7 +360,7 @@ def merit_unit(merit: Merit) -> tuple[str, float]:
     unit = MERIT_UNITS[merit.spec.kind]
     if unit is None:
         return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
-    return ("um", 1e-6) if unit is LENGTH else ("arcsec", float(np.radians(1.0 / 3600.0)))
+    return ("um", 1e-6) if unit is LENGTH else ("arcsec", ARCSEC)
 
 
 def _shown(value: float, merit: Merit) -> float | None:
