@@ -404,5 +404,25 @@ PROCEDURES: dict[str, Procedure] = {
         files=(FileKind("monitor_design", "scenes.specs.camera:MonitorDesignSpec", "a search for a monitor's layout"),),
         judged=False,
     ),
+    "asbuilt estimate": Procedure(
+        "asbuilt",
+        setup="scenes.specs.asbuilt:AsBuiltSetup",
+        resolve="scenes.specs.asbuilt:resolve_asbuilt",
+        run="twin.asbuilt.asbuilt_run:run_asbuilt",
+        numbers="twin.asbuilt.asbuilt_run:ASBUILT",
+        report="twin.asbuilt.asbuilt_report:asbuilt_report",
+        files=(FileKind("asbuilt", "scenes.specs.asbuilt:AsBuiltSpec", "the measurements of one instrument"),),
+        about="""
+    Estimate the state of one instrument: all motions of its prior from everything that was measured, with the
+    combinations that are known, what is possible for the camera beside what the design promises, and the next move.
+
+    asbuilt.json holds the motions and combinations with their sigmas, the agreement of every measurement with all
+    others, the merits with their quantiles under the prior, as built and after the next move, and that move.
+    artefacts/ gets the instrument as built, which every command takes as its instrument, and what is still unknown of
+    it as a disturbances file.
+
+    Example: `python -m twin.asbuilt scenes/examples/asbuilt_gf7.yaml`
+    """,
+    ),
 }
 """Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

@@ -422,6 +422,34 @@ class ToleranceBench:
 
     # merits
 
+    def parts_of(self, states: Sequence[State]) -> np.ndarray:
+        """Parts of all merits (S, P) of cameras in any states, as they are. Raises PhysicalError: the light is lost."""
+        if not len(self.fields):
+            return self._parts(states, None, None)
+        return self._parts(states, *self._errors(states))
+
+    def numbers_of(self, states: Sequence[State]) -> np.ndarray:
+        """Numbers (S, R) of cameras whose squares sum to their merits' mean squares over fields or points, each in
+        units of its requirement; an MTF counts as the wavefront at its fields, a quarter of the wavelength rms as one.
+
+        They change linearly with small motions. Raises PhysicalError: the light is lost.
+        """
+        count = len(states)
+        paths, chiefs = self._errors(states) if len(self.fields) else (None, None)
+        terms = None if paths is None else self._residuals(paths).reshape(count, len(self.fields), -1)
+        parts = self._parts(states, paths, chiefs)
+        out = []
+        for merit in self.merits:
+            if merit.spec.kind in ("wavefront", "mtf"):
+                assert terms is not None
+                own = terms[:, merit.fields].reshape(count, -1) / np.sqrt(len(merit.fields))
+                size = merit.spec.requirement if merit.spec.kind == "wavefront" else 0.25
+            else:
+                own = parts[:, merit.parts] / np.sqrt(merit.parts.stop - merit.parts.start)
+                size = merit.spec.requirement
+            out.append(own / size)
+        return np.concatenate(out, axis=1)
+
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
         """Second derivatives of the parts by pairs of numbers, (P, K, K), as first derivatives of the wavefronts make
         them; 0 for parts that are no function of a wavefront.

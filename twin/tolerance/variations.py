@@ -6,7 +6,7 @@ order in which a file lists them does not matter.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,8 +22,9 @@ from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
 from scenes.specs.job import PlainPerturbationSpec, perturbation_issues
 from scenes.specs.motion_text import AXES, node_named
-from scenes.specs.tolerance import CompensatorSpec, ToleranceBudgetSpec, ToleranceSetup, ToleranceSpec, Varied
+from scenes.specs.tolerance import CompensatorSpec, ToleranceSetup, ToleranceSpec, Varied
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
+from scenes.yaml.spec import Spec
 
 HEAT = ("temperature", "gradient")
 SHAPE = ("scale", "stretch", "radius", "conic", "index")
@@ -90,11 +91,19 @@ def compensator_numbers(
     return tuple(maker.compensator(name, one) for name, one in setup.test.compensators.items())
 
 
+def actuator_number(
+    test: Spec, instrument: Instrument, thermal: ThermalModel, name: str, one: CompensatorSpec
+) -> VariedNumber:
+    """The number of an actuator under ``actuators`` of a test, as ``tolerance_numbers``."""
+    moves = _Maker(test, instrument, thermal)._moves(one, ("actuators", name), one.range_si or 1.0)
+    return VariedNumber(name, name, one.parts[1], 1.0, moves)
+
+
 @dataclass(frozen=True, eq=False)
 class _Maker:
     """Makes numbers of entries."""
 
-    test: ToleranceBudgetSpec
+    test: Spec
     instrument: Instrument
     thermal: ThermalModel
 
@@ -167,28 +176,57 @@ class _Maker:
 
     def _heat(self, body: str, kind: str, axis: str, key: KeyPath, limit: float) -> FrozenMap[str, BodyMove]:
         """What a change of temperature does, taken between none and the limit."""
-        if kind == "temperature":
-            heat = Temperature(limit)
-        else:
-            heat = Temperature(0.0, triple(limit * np.eye(3)[AXES[axis]]))
         try:
-            self.thermal.check({body: heat})
-            state = self.thermal.state({body: heat})
+            return heat_moves(self.thermal, self.instrument, body, kind, AXES.get(axis, 0), limit)
         except TemperatureError as error:
             raise self.test.error(str(error), (*key, "limit"), allowed=error.allowed) from error
-        return FrozenMap({path: self._per_unit(path, motion, limit) for path, motion in state.items()})
 
-    def _per_unit(self, path: str, motion: Motion, amount: float) -> BodyMove:
-        about = np.array(self._body(path).pivots[motion.pivot])
-        growth = (1.0 + motion.scale) * (1.0 + motion.stretch) - 1.0
-        turned = rotation_matrix(np.array(motion.rotate))
-        shift = about + np.array(motion.shift) - (1.0 + growth) * turned @ about
-        return BodyMove(
-            rotate=np.array(motion.rotate) / amount,
-            shift=shift / amount,
-            figure=FrozenMap({j: a / amount for j, a in motion.figure.items()}),
-            shape=FrozenMap({name: getattr(motion, name) / amount for name in SHAPE if getattr(motion, name)}),
-        )
+
+def heat_moves(
+    thermal: ThermalModel,
+    instrument: Instrument,
+    body: str,
+    kind: str,
+    axis: int,
+    amount: float,
+    others: Mapping[str, Temperature] = FrozenMap(),
+) -> FrozenMap[str, BodyMove]:
+    """What a change of temperature does to every body, per SI unit, taken between none and an amount.
+
+    Args:
+        thermal: of the instrument.
+        instrument: whose bodies they are.
+        body: that is warmed, with all it carries.
+        kind: ``temperature`` or ``gradient``.
+        axis: of a gradient.
+        amount: kelvin, or K/m.
+        others: temperatures that other bodies have meanwhile.
+
+    Raises:
+        TemperatureError: expansion or index is not known there.
+    """
+    heat = Temperature(amount) if kind == "temperature" else Temperature(0.0, triple(amount * np.eye(3)[axis]))
+    fields = {**others, body: heat}
+    thermal.check(fields)
+    return FrozenMap(
+        {
+            path: _per_unit(instrument.assembly.tree[path], motion, amount)
+            for path, motion in thermal.state(fields).items()
+        }
+    )
+
+
+def _per_unit(body: Body, motion: Motion, amount: float) -> BodyMove:
+    about = np.array(body.pivots[motion.pivot])
+    growth = (1.0 + motion.scale) * (1.0 + motion.stretch) - 1.0
+    turned = rotation_matrix(np.array(motion.rotate))
+    shift = about + np.array(motion.shift) - (1.0 + growth) * turned @ about
+    return BodyMove(
+        rotate=np.array(motion.rotate) / amount,
+        shift=shift / amount,
+        figure=FrozenMap({j: a / amount for j, a in motion.figure.items()}),
+        shape=FrozenMap({name: getattr(motion, name) / amount for name in SHAPE if getattr(motion, name)}),
+    )
 
 
 def _rigid(pose: Pose, kind: str, way: np.ndarray, point: np.ndarray) -> BodyMove:

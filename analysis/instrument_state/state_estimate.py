@@ -1,0 +1,409 @@
+"""The state of an instrument from everything that was measured on it: Bayesian least squares on an exact model.
+
+A state is an amount for each of M motions with a joint normal prior, x = m + G u with u ~ N(0, I). Measurements are
+groups of numbers y = h(x) + B b + e: h is the traced instrument, e ~ N(0, R), and b are biases of the instrument of
+measurement, free or with a prior of their own. Each group is whitened and its free biases are projected out. The
+estimate is the mode of the posterior distribution, found by Gauss-Newton steps on the exact h; its covariance is that
+of the linearisation there (Tarantola, Inverse Problem Theory, 2005, sec. 3.4). With a linear h and one group of monitor
+spots it is the best linear unbiased prediction of ``analysis.monitor.disturbances``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.chi_square import chance_beyond, limit_of
+from analysis.measurement_error import UndeterminedError
+from analysis.short_repr import shows
+
+__all__ = ["FALSE_ALARM", "Agreement", "MeasuredGroup", "StateEstimate", "StatePrior", "estimate_state"]
+
+Array = NDArray[np.float64]
+Predict = Callable[[Array], Array]
+"""States (S, M), SI -> what the measurements would read without errors, (S, D), group after group; NaN where the light
+is lost."""
+Slope = Callable[[Array], Array]
+"""One state (M,) -> derivatives (D, M) of what the measurements read."""
+
+FALSE_ALARM = 1e-3
+"""Chance that measurements which are as stated are called a contradiction."""
+SETTLED = 0.01
+"""Change of the predicted measurements by the last step, in standard deviations of each."""
+MOST_STEPS = 20
+_SHORTEST = 2.0**-8
+_MOST_LEFT_OUT = 1.0 / 3.0
+"""Share of a group's blocks that are left out at most: of more the measurement itself is in doubt."""
+_NO_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class StatePrior:
+    """What is known of a state before anything is measured.
+
+    Attributes:
+        labels: (M,) names of the motions.
+        mean: (M,) SI.
+        root: G, (M, U), SI; the covariance is G G'.
+    """
+
+    labels: tuple[str, ...]
+    mean: Array
+    root: Array
+
+    @classmethod
+    def of(cls, labels: Sequence[str], covariance: Array, mean: Array | None = None) -> StatePrior:
+        """Prior of a covariance (M, M), SI, positive semidefinite, and a mean (M,), zero by default."""
+        sigma = np.sqrt(np.diagonal(covariance))
+        safe = np.where(sigma > 0.0, sigma, 1.0)
+        correlation = covariance / safe / safe[:, None]
+        if np.array_equal(correlation, np.diag(np.diagonal(correlation))):
+            root = np.diag(sigma)
+        else:
+            values, vectors = np.linalg.eigh(correlation)
+            # the symmetric root keeps motions without correlations by themselves
+            root = safe[:, None] * ((vectors * np.sqrt(np.clip(values, 0.0, None))) @ vectors.T)
+        return cls(tuple(labels), np.zeros(len(sigma)) if mean is None else np.asarray(mean, np.float64), root)
+
+    @cached_property
+    def sigma(self) -> Array:
+        """(M,) standard deviations, SI."""
+        return np.asarray(np.sqrt(np.sum(self.root**2, axis=1)))
+
+    @property
+    def covariance(self) -> Array:
+        """(M, M) SI."""
+        return np.asarray(self.root @ self.root.T)
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredGroup:
+    """Numbers of one measurement.
+
+    Attributes:
+        name: of the measurement.
+        kind: what was measured: ``wavefronts``, ``focus`` ...
+        labels: (D,) of the numbers.
+        values: (D,) SI.
+        covariance: (D, D) of their errors, SI.
+        biases: (D, B) what one unit of each bias does to the numbers.
+        bias_sigmas: (B,) standard deviations of the biases; infinite for a free one.
+        blocks: (D,) name of what one gross error would spoil together, such as a field.
+    """
+
+    name: str
+    kind: str
+    labels: tuple[str, ...]
+    values: Array
+    covariance: Array
+    biases: Array
+    bias_sigmas: Array
+    blocks: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        """Check shapes. Raises ValueError."""
+        count = len(self.values)
+        if self.covariance.shape != (count, count) or self.biases.shape != (count, len(self.bias_sigmas)):
+            raise ValueError(f"measurement {self.name}: covariance or biases are not those of {count} numbers")
+        if len(self.labels) != count or len(self.blocks) != count:
+            raise ValueError(f"measurement {self.name}: {count} numbers need as many labels and blocks")
+
+    def with_values(self, values: Array) -> MeasuredGroup:
+        """The same measurement with other numbers (D,)."""
+        return MeasuredGroup(
+            self.name, self.kind, self.labels, values, self.covariance, self.biases, self.bias_sigmas, self.blocks
+        )
+
+    def whitener(self, without: Sequence[str] = ()) -> Array:
+        """W (R, D) by which errors become independent with unit variance and free biases vanish.
+
+        Args:
+            without: blocks that are left out.
+
+        Raises:
+            UndeterminedError: the covariance is not positive definite.
+        """
+        kept = np.array([block not in without for block in self.blocks])
+        out = np.zeros((0, len(self.values)))
+        if not kept.any():
+            return out
+        own, free = self.biases[kept], np.isinf(self.bias_sigmas)
+        known = own[:, ~free] * self.bias_sigmas[~free]
+        spread = self.covariance[np.ix_(kept, kept)] + known @ known.T
+        scale = np.sqrt(np.diagonal(spread))
+        if not np.all(scale > 0.0):
+            raise UndeterminedError(f"measurement {self.name}: an error of zero")
+        try:
+            root = scale[:, None] * np.linalg.cholesky(spread / scale / scale[:, None])
+        except np.linalg.LinAlgError as error:
+            raise UndeterminedError(f"measurement {self.name}: its covariance is not positive definite") from error
+        white = np.linalg.inv(root)
+        if free.any():
+            u, s, _ = np.linalg.svd(white @ own[:, free])
+            rank = int(np.sum(s > _NO_RANK * s[0])) if s.size and s[0] > 0.0 else 0
+            white = u[:, rank:].T @ white
+        out = np.zeros((len(white), len(self.values)))
+        out[:, kept] = white
+        return out
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Do some numbers agree with what all others, the prior and the instrument predict of them?
+
+    Attributes:
+        name: of a measurement, or of one of its blocks.
+        chi_square: of the numbers about their prediction from all others.
+        degrees: of freedom.
+        chance: probability of so large a chi-square if everything is as stated.
+    """
+
+    name: str
+    chi_square: float
+    degrees: int
+    chance: float
+
+    @classmethod
+    def of(cls, name: str, chi_square: float, degrees: int) -> Agreement:
+        """Chance of a chi-square; of no degrees of freedom nothing is told."""
+        chance = float(chance_beyond(chi_square, degrees)) if degrees else 1.0
+        return cls(name, float(chi_square), degrees, chance)
+
+    def holds(self, looks: int = 1, false_alarm: float = FALSE_ALARM) -> bool:
+        """Whether it agrees, as one of so many that are tested together."""
+        return not self.degrees or self.chi_square <= float(limit_of(false_alarm / max(1, looks), self.degrees))
+
+
+@shows("prior.labels", "measurements", "whole")
+@dataclass(frozen=True, eq=False)
+class StateEstimate:
+    """The state after the measurements.
+
+    Attributes:
+        prior: before them.
+        groups: the measurements.
+        unit: u, (U,), the estimate in the prior's independent units.
+        root: posterior covariance of u is root root', (U, U).
+        slope: whitened derivatives of all measurements by u at the estimate, (R, U).
+        residual: whitened, (R,).
+        whole: chi-square of everything together.
+        measurements: of each measurement, as all others predict it.
+        blocks: of each block of each measurement, likewise: name of the measurement -> agreements.
+        left_out: blocks that were left out since they contradict all else: (measurement, block, agreement then).
+        steps: Gauss-Newton steps that were taken.
+        settled: change of the predicted measurements by the last step, in standard deviations.
+    """
+
+    prior: StatePrior
+    groups: tuple[MeasuredGroup, ...]
+    unit: Array
+    root: Array
+    slope: Array
+    residual: Array
+    whole: Agreement
+    measurements: tuple[Agreement, ...]
+    blocks: dict[str, tuple[Agreement, ...]] = field(default_factory=dict)
+    left_out: tuple[tuple[str, str, Agreement], ...] = ()
+    steps: int = 0
+    settled: float = 0.0
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last step changed the predicted measurements by less than ``SETTLED``."""
+        return self.settled < SETTLED
+
+    @cached_property
+    def mean(self) -> Array:
+        """(M,) SI."""
+        return np.asarray(self.prior.mean + self.prior.root @ self.unit)
+
+    @cached_property
+    def spread(self) -> Array:
+        """(M, U): the posterior covariance is spread spread', SI."""
+        return np.asarray(self.prior.root @ self.root)
+
+    @property
+    def covariance(self) -> Array:
+        """(M, M) SI."""
+        return np.asarray(self.spread @ self.spread.T)
+
+    @property
+    def sigma(self) -> Array:
+        """(M,) SI."""
+        return np.asarray(np.sqrt(np.sum(self.spread**2, axis=1)))
+
+    @property
+    def variance_factor(self) -> float:
+        """Chi-square over its degrees of freedom where everything together contradicts what is stated, else 1."""
+        return 1.0 if self.whole.holds() else self.whole.chi_square / self.whole.degrees
+
+    def draw(self, rng: np.random.Generator, count: int) -> Array:
+        """Random states of the posterior, (count, M), SI; wider where the measurements contradict what is stated.
+
+        Args:
+            rng: their source.
+            count: how many.
+        """
+        unit = rng.standard_normal((count, self.root.shape[1])) * np.sqrt(self.variance_factor)
+        return np.asarray(self.mean + unit @ self.spread.T)
+
+
+def estimate_state(
+    prior: StatePrior,
+    groups: Sequence[MeasuredGroup],
+    predict: Predict,
+    slope: Slope,
+    start: Array | None = None,
+    false_alarm: float = FALSE_ALARM,
+) -> StateEstimate:
+    """Estimate a state.
+
+    A block of numbers that contradicts everything else at the chance of a false alarm, shared among all blocks, is left
+    out and the estimate is made again (data snooping: Baarda, A testing procedure for use in geodetic networks, 1968).
+
+    Args:
+        prior: what is known before.
+        groups: measurements, in the order of the predictions.
+        predict: states -> what the measurements would read.
+        slope: one state -> derivatives of that.
+        start: state from which the steps go, (M,), SI; the prior's mean by default.
+        false_alarm: chance that a measurement as stated is left out or called a contradiction.
+
+    Raises:
+        UndeterminedError: no number, a covariance that is none, or no light at the prior's mean.
+    """
+    if not groups:
+        raise UndeterminedError("nothing was measured")
+    unit = np.zeros(prior.root.shape[1])
+    if start is not None:
+        unit = np.linalg.lstsq(prior.root, start - prior.mean, rcond=None)[0]
+    out: dict[str, list[str]] = {}
+    left_out: list[tuple[str, str, Agreement]] = []
+    count = len({(g.name, b) for g in groups for b in g.blocks})
+    while True:
+        found = _settle(prior, groups, predict, slope, unit, out)
+        unit = found.unit
+        worst = min(
+            ((one.chance, group.name, one) for group in groups for one in found.blocks[group.name]),
+            key=lambda entry: (entry[0], -entry[2].chi_square),
+            default=None,
+        )
+        if worst is None or worst[2].holds(count, false_alarm):
+            break
+        _, name, agreement = worst
+        own = next(group for group in groups if group.name == name)
+        blocks = len(set(own.blocks))
+        if len(out.get(name, ())) + 1 > _MOST_LEFT_OUT * blocks:
+            break
+        out.setdefault(name, []).append(agreement.name)
+        left_out.append((name, agreement.name, agreement))
+    fields = {key: getattr(found, key) for key in found.__dataclass_fields__}
+    return StateEstimate(**fields | {"left_out": tuple(left_out)})
+
+
+def _settle(
+    prior: StatePrior,
+    groups: Sequence[MeasuredGroup],
+    predict: Predict,
+    slope: Slope,
+    unit: Array,
+    out: dict[str, list[str]],
+) -> StateEstimate:
+    """Gauss-Newton steps from one estimate to the next, without what is left out."""
+    whiteners = [group.whitener(out.get(group.name, ())) for group in groups]
+    values = np.concatenate([group.values for group in groups])
+
+    def whitened(rows: Array) -> Array:
+        """Of numbers (D, ...) the whitened ones (R, ...)."""
+        ends = np.cumsum([0, *(len(group.values) for group in groups)])
+        return np.concatenate([w @ rows[a:b] for w, a, b in zip(whiteners, ends[:-1], ends[1:], strict=True)])
+
+    def residual_at(u: Array) -> Array:
+        return whitened(values - predict((prior.mean + prior.root @ u)[None])[0])
+
+    residual = residual_at(unit)
+    if not np.all(np.isfinite(residual)) and np.any(unit):
+        unit = np.zeros_like(unit)
+        residual = residual_at(unit)
+    if not np.all(np.isfinite(residual)):
+        raise UndeterminedError("the instrument has no light where the prior expects it")
+    moved, steps = np.inf, 0
+    while True:
+        table = whitened(slope(prior.mean + prior.root @ unit) @ prior.root)
+        normal = np.eye(len(unit)) + table.T @ table
+        if moved < SETTLED or steps >= MOST_STEPS:
+            break
+        step = np.linalg.solve(normal, table.T @ residual - unit)
+        cost = residual @ residual + unit @ unit
+        share = 1.0
+        while True:
+            trial = unit + share * step
+            ahead = residual_at(trial)
+            good = bool(np.all(np.isfinite(ahead))) and ahead @ ahead + trial @ trial <= cost * (1.0 + 1e-12)
+            if good or share < _SHORTEST:
+                break
+            share *= 0.5
+        steps += 1
+        moved = float(np.max(np.abs(table @ step), initial=0.0))
+        if not good:
+            # no way down along the step: the estimate stands, and what is left of the step says how well
+            moved = moved if moved < SETTLED else max(moved, SETTLED)
+            break
+        unit, residual = trial, ahead
+        moved = max(moved * share, 0.0) if share == 1.0 else np.inf
+    return _judged(prior, groups, whiteners, unit, table, residual, steps, moved)
+
+
+def _judged(
+    prior: StatePrior,
+    groups: Sequence[MeasuredGroup],
+    whiteners: Sequence[Array],
+    unit: Array,
+    table: Array,
+    residual: Array,
+    steps: int,
+    moved: float,
+) -> StateEstimate:
+    """Posterior covariance and all tests at an estimate."""
+    values, vectors = np.linalg.eigh(table.T @ table)
+    root = vectors / np.sqrt(1.0 + np.clip(values, 0.0, None))
+    left = table @ root
+    # to the first order this is the residual's inverse marginal covariance, times the residual about the prior's mean
+    total = float(residual @ residual + unit @ unit)
+    measurements, blocks = [], {}
+    start = 0
+    for group, white in zip(groups, whiteners, strict=True):
+        rows = slice(start, start + len(white))
+        start += len(white)
+        own, spread = residual[rows], np.eye(len(white)) - left[rows] @ left[rows].T
+        measurements.append(_agreement(group.name, own, spread, np.eye(len(white))))
+        each = []
+        for block in dict.fromkeys(group.blocks):
+            which = white[:, [name == block for name in group.blocks]]
+            if np.any(which):
+                each.append(_agreement(block, own, spread, which))
+        blocks[group.name] = tuple(each)
+    whole = Agreement.of("all", total, len(residual))
+    return StateEstimate(
+        prior, tuple(groups), unit, root, table, residual, whole, tuple(measurements), blocks, (), steps, moved
+    )
+
+
+def _agreement(name: str, residual: Array, spread: Array, rows: Array) -> Agreement:
+    """Chi-square of what a mean shift of some numbers, rows (R, K), would take off the whole.
+
+    The same as the chi-square of these numbers about their prediction from all others.
+    """
+    scale = np.linalg.norm(rows, axis=0)
+    rows = rows[:, scale > 0.0] / scale[scale > 0.0]
+    if not rows.size:
+        return Agreement.of(name, 0.0, 0)
+    pull, stiff = rows.T @ residual, rows.T @ spread @ rows
+    values, vectors = np.linalg.eigh(stiff)
+    held = values > _NO_RANK * max(1.0, float(values[-1]))
+    parts = (vectors.T @ pull)[held]
+    return Agreement.of(name, float(np.sum(parts**2 / values[held])), int(np.sum(held)))

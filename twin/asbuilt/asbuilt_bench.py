@@ -1,0 +1,295 @@
+"""One instrument with its prior, what was measured on it and what is asked of it: predictions by exact traces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from functools import cached_property
+
+import numpy as np
+
+from analysis.instrument_state.next_move import Actuators
+from analysis.instrument_state.state_estimate import MeasuredGroup, StateEstimate, estimate_state
+from analysis.measurement_error import MeasurementError
+from optics.geometry.tree import State
+from optics.numerics.backend import Backend
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
+from scenes.models.disturbances import StatedMotions, motions_of_spec
+from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
+from scenes.specs.tolerance import MeritSpec, ToleranceBudgetSpec, ToleranceSetup
+from scenes.yaml.errors import names_text, unknown
+from twin.asbuilt.measured_kinds import KINDS, MeasuredKind, Site, View
+from twin.asbuilt.parameters import Parameters
+from twin.camera.varied_beams import VariedBeams
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.truth import line_points
+from twin.tolerance.tolerance_bench import ToleranceBench
+
+STEP = 0.05
+"""Step of the derivatives, in standard deviations of the prior: central differences of the exact trace, whose error is
+of the square of this times the curvature over a standard deviation."""
+
+
+class AsBuiltBench(Site):
+    """An instrument on which a state is estimated.
+
+    Args:
+        setup: what was measured, and the instrument as designed.
+        backend: where to trace.
+
+    Attributes:
+        test: the file.
+        camera: that is judged.
+        parameters: that are estimated.
+        kinds: measurements, in their order.
+        afters: of each the last move that had been made.
+        merits: bench of what is asked.
+
+    Raises:
+        InputError: names that do not exist, a prior of nothing, or a camera without light.
+    """
+
+    def __init__(self, setup: AsBuiltSetup, backend: Backend) -> None:
+        self.setup, self.backend, self.test = setup, backend, setup.test
+        self.experiment = MonitorExperiment(setup.base, backend)
+        self.camera = self._camera_name()
+        self.line = line_points(self.experiment.instrument, self.camera)
+        stated = self.experiment.stated
+        if stated is None or not stated.components:
+            allowed = "a disturbances file with standard deviations greater than zero, as `assembled`"
+            raise self.test.error("nothing is expected to move", ("prior",), found=self.test.prior, allowed=allowed)
+        self.stated: StatedMotions = stated
+        self.parameters = Parameters.of(self.test, stated, self.experiment.instrument, self.experiment.thermal)
+        self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
+        self.kinds = self._kinds(self.test.measurements, "measurements")
+        self.afters = tuple(one.after for _, _, one in self.test.measurements.every())
+        self.merits = self.bench(dict(self.test.merits), ("merits",))
+
+    def _camera_name(self) -> str:
+        names = tuple(self.experiment.instrument.cameras)
+        if self.test.camera is None and len(names) > 1:
+            raise self.test.error("the instrument has several cameras", ("camera",), allowed=names_text(names))
+        if self.test.camera is not None and self.test.camera not in names:
+            raise self.test.error(unknown("no such camera", self.test.camera, names), ("camera",))
+        return self.test.camera or names[0]
+
+    def _kinds(self, measured: MeasurementsSpec, where: str) -> tuple[MeasuredKind, ...]:
+        return tuple(KINDS[kind](self, name, one, (where, kind, name)) for kind, name, one in measured.every())
+
+    @cached_property
+    def candidates(self) -> tuple[MeasuredKind, ...]:
+        """Measurements that could be made."""
+        return self._kinds(self.test.candidates, "candidates")
+
+    def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
+        """Beams of fields, traced once for all that have the same. Raises as ``VariedBeams``."""
+        if fields not in self._beams:
+            self._beams[fields] = VariedBeams(self.merit_optics, np.array(fields))
+        return self._beams[fields]
+
+    @cached_property
+    def merit_optics(self):  # type: ignore[no-untyped-def]
+        """The camera as designed."""
+        from twin.camera.camera_optics import CameraOptics
+
+        return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
+
+    def bench(self, merits: Mapping[str, MeritSpec], key: tuple[str, ...]) -> ToleranceBench:
+        """A bench on which merits are tried."""
+        del key
+        budget = ToleranceBudgetSpec.model_construct(
+            instrument=self.test.instrument,
+            camera=self.camera,
+            tolerances=FrozenMap(),
+            compensators=FrozenMap(),
+            merits=FrozenMap(merits),
+            allocation=None,
+        ).with_source(self.test.source)
+        return ToleranceBench(ToleranceSetup.model_construct(test=budget, base=self.setup.base), self.backend)
+
+    # predictions
+
+    def view(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> View:
+        """States of parameters (S, K) after a move."""
+        states: Sequence[State] = self.parameters.states(values, after, further)
+        return View(values, states, lambda bodies: self.parameters.temperatures(values, bodies))
+
+    def predict(self, values: np.ndarray) -> np.ndarray:
+        """What all measurements would read without errors, (S, D); NaN where the light of a state is lost."""
+        return np.concatenate(self._predicted(values, self.kinds, self.afters), axis=1)
+
+    def _predicted(
+        self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
+    ) -> list[np.ndarray]:
+        try:
+            views = {after: self.view(values, after) for after in afters}
+            return [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
+        except PhysicalError:
+            if len(values) == 1:
+                return [np.full((1, len(kind.labels)), np.nan) for kind in kinds]
+        half = len(values) // 2
+        both = [self._predicted(part, kinds, afters) for part in (values[:half], values[half:])]
+        return [np.concatenate(parts) for parts in zip(*both, strict=True)]
+
+    def slope(
+        self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
+    ) -> np.ndarray:
+        """Derivatives (D, K) of the predictions at parameters (K,), by central differences of the exact trace."""
+        kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
+        sigma = self.parameters.prior.sigma
+        steps = STEP * sigma
+        moved = np.concatenate([values + np.diag(steps), values - np.diag(steps)])
+        predicted = np.concatenate(self._predicted(moved, kinds, afters), axis=1)
+        ahead, behind = predicted[: len(steps)], predicted[len(steps) :]
+        return np.asarray(((ahead - behind) / (2.0 * steps[:, None])).T)
+
+    # the estimate
+
+    def groups(self, data: Sequence[np.ndarray]) -> tuple[MeasuredGroup, ...]:
+        """The measurements with their numbers."""
+        return tuple(kind.group(values) for kind, values in zip(self.kinds, data, strict=True))
+
+    def data(self) -> tuple[np.ndarray, ...]:
+        """What the files hold. Raises InputError: a file that cannot be read, or holds something else."""
+        return tuple(kind.read() for kind in self.kinds)
+
+    def estimate(self, data: Sequence[np.ndarray], start: np.ndarray | None = None) -> StateEstimate:
+        """Estimate the parameters.
+
+        Args:
+            data: numbers of each measurement.
+            start: parameters from which the steps go.
+
+        Raises:
+            InputError: measurements whose errors or light cannot be.
+        """
+        try:
+            return estimate_state(self.parameters.prior, self.groups(data), self.predict, self.slope, start)
+        except MeasurementError as error:
+            raise self.test.error(str(error), ("measurements",)) from error
+
+    # a drawn instrument
+
+    @cached_property
+    def drawn_motions(self) -> StatedMotions:
+        """What a simulated instrument is drawn from."""
+        if self.setup.drawn is None:
+            return self.stated
+        return motions_of_spec(self.setup.drawn, self.experiment.instrument)
+
+    def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
+        """Parameters (K,) of an instrument of the prior; of components that ``simulate`` states otherwise by that.
+
+        Args:
+            rng: source of random numbers.
+            law: ``normal`` or ``uniform`` with the same covariance.
+        """
+        prior = self.parameters.prior
+        covariance = prior.covariance.copy()
+        if self.setup.drawn is not None:
+            own = {one.name: k for k, one in enumerate(self.drawn_motions.components)}
+            strange = sorted(set(own) - set(prior.labels))
+            if strange:
+                raise self.test.error(
+                    "the instrument moves as the prior does not", ("simulate", "prior"), found=names_text(strange[:3])
+                )
+            where = [k for k, name in enumerate(prior.labels) if name in own]
+            which = [own[prior.labels[k]] for k in where]
+            count = len(self.stated.components)
+            covariance[:count, :count] = 0.0
+            covariance[np.ix_(where, where)] = self.drawn_motions.covariance[np.ix_(which, which)]
+        root = type(prior).of(prior.labels, covariance).root
+        half = np.sqrt(3.0)
+        shape = root.shape[1]
+        unit = rng.standard_normal(shape) if law == "normal" else rng.uniform(-half, half, shape)
+        return np.asarray(root @ unit)
+
+    def measured(self, true: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+        """What measurements of an instrument of parameters (K,) read, with their errors.
+
+        Raises:
+            PhysicalError: its light is lost.
+        """
+        return tuple(
+            kind.drawn(kind.predict(self.view(true[None], after))[0], rng)
+            for kind, after in zip(self.kinds, self.afters, strict=True)
+        )
+
+    def after_move(self, name: str, by: np.ndarray, again: Sequence[str]) -> AsBuiltBench:
+        """The bench with one move more, and with measurements that are made again after it.
+
+        Args:
+            name: of the move.
+            by: how far each actuator is meant to go, (C,), SI.
+            again: names of the measurements.
+        """
+        other = copy(self)
+        other.parameters = self.parameters.with_move(name, by, self.test)
+        more = []
+        for kind in self.kinds:
+            if kind.name in again:
+                made = copy(kind)
+                made.name = f"{kind.name} after {name}"
+                more.append(made)
+        other.kinds = (*self.kinds, *more)
+        other.afters = (*self.afters, *[name] * len(more))
+        vars(other).pop("actuators", None)
+        return other
+
+    # merits and moves
+
+    @property
+    def last(self) -> str | None:
+        """Name of the last move that was made."""
+        return self.parameters.moves[-1] if self.parameters.moves else None
+
+    def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
+        """Parts of the merits, (S, P), of parameters (S, K); NaN where the light is lost."""
+        try:
+            return self.merits.parts_of(self.parameters.states(values, after, further))
+        except PhysicalError:
+            if len(values) == 1:
+                return np.full((1, self.merits.parts), np.nan)
+        half = len(values) // 2
+        few = (None, None) if further is None else (further, further)
+        if further is not None and further.ndim == 2:
+            few = (further[:half], further[half:])
+        pair = zip((values[:half], values[half:]), few, strict=True)
+        return np.concatenate([self.merit_parts(part, after, own) for part, own in pair])
+
+    def merit_numbers(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
+        """Numbers (S, R) whose squares sum to what a move makes least: of each merit the mean square over its fields
+        or points, in units of its requirement. Raises PhysicalError: the light of some state is lost.
+        """
+        return self.merits.numbers_of(self.parameters.states(values, after, further))
+
+    @cached_property
+    def actuators(self) -> Actuators:
+        """Limits, steps and errors of the next move: what the moves have left of each range."""
+        specs = tuple(self.test.actuators.values())
+        moved = np.sum(self.parameters.wanted, axis=0) if self.parameters.moves else np.zeros(len(specs))
+        ranges = np.array([one.range_si for one in specs])
+        return Actuators(
+            tuple(self.test.actuators),
+            np.minimum(0.0, -ranges - moved),
+            np.maximum(0.0, ranges - moved),
+            np.array([one.step_si for one in specs]),
+            np.array([one.move_error for one in specs]),
+            np.array([one.accuracy_si for one in specs]),
+        )
+
+    def merit_slopes(self, values: np.ndarray, after: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers of the merit (R,) at parameters (K,), and derivatives by parameters (R, K) and actuators (R, C)."""
+        sigma = self.parameters.prior.sigma
+        steps, count = STEP * sigma, len(self.parameters.names)
+        every = np.concatenate([values[None], values + np.diag(steps), values - np.diag(steps)])
+        found = self.merit_numbers(every, after)
+        own = ((found[1 : 1 + len(steps)] - found[1 + len(steps) :]) / (2.0 * steps[:, None])).T
+        ranges = np.array([one.range_si or 1.0 for one in self.test.actuators.values()])
+        moves = 1e-2 * np.diag(ranges)
+        if not count:
+            return found[0], own, np.zeros((found.shape[1], 0))
+        pushed = self.merit_numbers(np.repeat(values[None], 2 * count, axis=0), after, np.concatenate([moves, -moves]))
+        by_actuators = ((pushed[:count] - pushed[count:]) / (2.0 * 1e-2 * ranges[:, None])).T
+        return found[0], own, by_actuators

@@ -1,0 +1,321 @@
+"""Report of an instrument as built: verdict, merits before and after, what is known and what is not, the next move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses, shown
+from twin.asbuilt.built_instrument import instrument_text, posterior_text
+from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, shown_unit
+from twin.run.report import Report, Section, answer
+from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, gridded, look, new_figure, plain_axes, to_svg
+from twin.tolerance.tolerance_run import merit_unit
+
+_MOST_COMBINATIONS = 12
+_FEW = 3
+
+
+def asbuilt_report(run: AsBuiltRun) -> Report:
+    """Report of an instrument as built."""
+    with look("asbuilt"):
+        along = to_svg(_along_figure(run))
+        known = to_svg(_known_figure(run))
+    told, more = answer(_verdict(run), _known_words(run), *_move_words(run))
+    sections = (
+        Section(
+            "The camera",
+            (
+                "Wavefront error along the line, as drawn and as built. Bands hold the middle 68 and 95 % of what is "
+                "possible: before the measurements, under the prior alone, and with them.",
+            ),
+            (SvgFigure("along", "Wavefront error over the field", "", along), _range_table(run)),
+            name="camera",
+        ),
+        Section(
+            "What is known",
+            (
+                "Combinations of motions, the best known first, in standard deviations of the prior: 1 before the "
+                "measurements. A combination that the measurements do not tell keeps its 1, and what it may do to the "
+                "camera stands in the table of merits.",
+            ),
+            (SvgFigure("known", "What the measurements know", "", known), _known_table(run)),
+            name="known",
+        ),
+        Section(
+            "Measurements",
+            ("Each measurement against what all others, the prior and the traced instrument predict of it.",),
+            (_measured_table(run),),
+            name="measurements",
+        ),
+        *_move_sections(run),
+        Section(
+            "Motions",
+            ("Each motion by itself. Most are known in combinations alone.",),
+            (_motion_table(run),),
+            closed=True,
+            name="motions",
+        ),
+        Section(
+            "The instrument that results",
+            (
+                "`instrument.yaml` is the instrument as built, which every command takes as its instrument; "
+                "`posterior.yaml` beside it is what is still unknown of it, as its disturbances.",
+            ),
+            (
+                CameraFile("instrument", "Instrument", "", instrument_text(run)),
+                CameraFile("posterior", "Posterior", "", posterior_text(run)),
+            ),
+            closed=True,
+            name="instrument",
+        ),
+    )
+    kinds = [f"{kind.name} ({len(kind.labels)} numbers)" for kind in run.bench.kinds]
+    facts = (
+        ("instrument", run.setup.test.instrument),
+        ("camera", run.bench.camera),
+        ("prior", f"{run.setup.test.prior}: {len(run.bench.parameters.components)} motions"),
+        ("measurements", ", ".join(kinds)),
+        ("moves made", ", ".join(run.bench.parameters.moves) or "none"),
+        ("truth", "drawn by the program" if run.true is not None else "not known"),
+    )
+    title = f"{run.bench.camera} as built"
+    return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
+
+
+def _verdict(run: AsBuiltRun) -> str:
+    parts = [f"{one.merit.name} with {_percent(one.meets)}" for one in run.standings]
+    return f"Probability that {run.bench.camera}, as built, meets its requirements: {', '.join(parts)}"
+
+
+def _known_words(run: AsBuiltRun) -> str:
+    known = sum(one.known for one in run.known)
+    agreement = run.found.whole
+    fits = "fit" if agreement.holds() else "do not fit"
+    return (
+        f"The measurements tell {known} of {len(run.known)} combinations of motions and {fits} the prior and their "
+        f"errors (chi-square {agreement.chi_square:.0f} of {agreement.degrees})"
+    )
+
+
+def _move_words(run: AsBuiltRun) -> list[str]:
+    step = run.advice
+    if step is None:
+        return []
+    moves = {name: amount for name, amount in moves_plain(run, step.move.amounts).items() if not _is_nothing(run, name)}
+    if not moves:
+        return ["No move of the actuators would improve the expected merit"]
+    text = ", ".join(f"{name} by {_short(amount)}" for name, amount in moves.items())
+    out = [
+        f"Next move: {text}; the expected merit falls from {step.before:.3g} to {step.after:.3g}, of which "
+        f"{step.ignorance:.3g} is what is not known and could be mended"
+    ]
+    worth = sorted(step.worth.items(), key=lambda item: -item[1])[:_FEW]
+    if worth:
+        text = ", ".join(f"{name} {value:.3g}" for name, value in worth)
+        out.append(f"One more measurement before the move would lower it further, by {text}")
+    return out
+
+
+def _is_nothing(run: AsBuiltRun, name: str) -> bool:
+    assert run.advice is not None
+    return bool(run.advice.move.amounts[run.bench.parameters.names.index(name)] == 0.0)
+
+
+def _short(amount: str | float) -> str:
+    """An amount in words with four digits."""
+    if isinstance(amount, str):
+        number, _, unit = amount.partition(" ")
+        return f"{float(number):.4g} {unit}"
+    return f"{amount:.4g}"
+
+
+def _head(one: Standing) -> str:
+    unit = merit_unit(one.merit)[0]
+    return f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name
+
+
+def _cell(value: float, one: Standing) -> Cell:
+    found = shown(value, one.merit)
+    if found is None:
+        return None
+    spread = shown(one.now[3], one.merit) or 0.0
+    places = 3 if abs(spread) < 10.0 else 1
+    return OwnDecimals(found, places)
+
+
+def _between(values: Sequence[float], one: Standing) -> str:
+    if not len(values):
+        return ""
+    low, middle, high = (shown(values[k], one.merit) for k in (1, 2, 3))
+    if low is None or middle is None or high is None:
+        return "no light"
+    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
+def _summary(run: AsBuiltRun) -> Table:
+    rows: list[list[Cell]] = []
+    moved, drawn = run.advice is not None, run.true is not None
+    for one in run.standings:
+        spec = one.merit.spec
+        sign = "at least" if spec.more_is_better else "at most"
+        row: list[Cell] = [
+            _head(one),
+            f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g}",
+            _cell(one.designed, one),
+            _between(one.before, one),
+            _between(one.now, one),
+            _percent(one.meets),
+        ]
+        row += [_between(one.moved, one), _percent(one.meets_moved)] if moved else []
+        rows.append(row + ([_cell(one.true, one)] if drawn else []))
+    heads = ["merit", "asked", "designed", "prior", "as built", "meets"]
+    heads += ["after the next move", "meets then"] if moved else []
+    heads += ["true"] if drawn else []
+    caption = (
+        "Median and the middle 68 % of what is possible, by exact traces of states drawn from the prior and from the "
+        "posterior distribution."
+    )
+    return Table("merits", "Merits", caption, heads, rows)
+
+
+def _range_table(run: AsBuiltRun) -> Table:
+    designed, bands = run.along
+    rows: list[list[Cell]] = [
+        [field[0], float(designed[f]), *(float(bands[b, q, f]) for b in (0, 1) for q in (1, 2, 3))]
+        for f, field in enumerate(ALONG)
+    ]
+    heads = ("field", "designed", *(text for _ in range(2) for text in ("16 %", "50 %", "84 %")))
+    over = (("", 2), ("prior", 3), ("as built", 3))
+    caption = "Rms wavefront error, waves. Field: share of half the line."
+    return Table("field", "Wavefront error along the line", caption, heads, rows, (1, *[4] * 7), over=over)
+
+
+def _known_table(run: AsBuiltRun) -> Table:
+    factor = np.sqrt(run.found.variance_factor)
+    rows: list[list[Cell]] = [
+        [one.name, one.value, min(1.0, one.sigma * factor), "known" if one.known else "not known"]
+        for one in run.known[:_MOST_COMBINATIONS]
+    ]
+    heads = ("combination", "estimate", "sigma", "")
+    caption = "Weights and values are in standard deviations of the prior."
+    return Table("combinations", "Combinations", caption, heads, rows, (None, 3, 3, None))
+
+
+def _measured_table(run: AsBuiltRun) -> Table:
+    count = len(run.found.measurements)
+    rows: list[list[Cell]] = []
+    for kind, one in zip(run.bench.kinds, run.found.measurements, strict=True):
+        left = [block for name, block, _ in run.found.left_out if name == one.name]
+        rows.append(
+            [
+                one.name,
+                kind.kind,
+                len(kind.labels),
+                one.chi_square,
+                one.degrees,
+                one.chance,
+                "agrees" if one.holds(count) else "contradicts",
+                ", ".join(left),
+            ]
+        )
+    heads = ("measurement", "kind", "numbers", "chi-square", "degrees", "chance", "", "left out")
+    caption = "Chance: of so large a chi-square if everything is as stated."
+    return Table("measurements", "Agreement", caption, heads, rows, (None, None, None, 1, None, 4, None, None))
+
+
+def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
+    step = run.advice
+    if step is None:
+        return ()
+    bench = run.bench
+    moves = moves_plain(run, step.move.amounts)
+    made = bench.parameters.moved(run.found.mean[None], bench.last)[0]
+    done = moves_plain(run, made)
+    rows: list[list[Cell]] = [
+        [name, one.motion, _short(done[name]), _short(moves[name]), str(one.range), str(one.step or "")]
+        for name, one in run.setup.test.actuators.items()
+    ]
+    heads = ("actuator", "motion", "stands at", "move by", "range", "step")
+    caption = "Stands at: what all moves so far have come to, as estimated."
+    tables = [Table("move", "Next move", caption, heads, rows)]
+    if step.worth:
+        worth: list[list[Cell]] = [
+            [name, value] for name, value in sorted(step.worth.items(), key=lambda item: -item[1])
+        ]
+        caption = "By how much the expected merit after the move would be lower if this were measured before it."
+        tables.append(Table("worth", "Worth of a measurement", caption, ("measurement", "worth"), worth, (None, 4)))
+    told = responses(run)
+    if told:
+        lines: list[list[Cell]] = [[name, one["response"], one["sigma"]] for name, one in told.items()]
+        caption = "Of what was traced, from the moves that were made and measured."
+        heads = ("actuator", "response", "sigma")
+        tables.append(Table("responses", "Responses of the actuators", caption, heads, lines, (None, 3, 3)))
+    text = (
+        f"The move makes the expected sum of squares of all merits least, each in units of its requirement: "
+        f"{step.before:.3g} before and {step.after:.3g} after it, over states of the posterior and the errors of the "
+        f"move, by exact traces. {step.ignorance:.3g} of it could be mended if the state were known.",
+    )
+    if not step.move.searched:
+        text = (*text, "Not all whole steps were tried: a better move may exist.")
+    return (Section("The next move", text, tuple(tables), name="move"),)
+
+
+def _motion_table(run: AsBuiltRun) -> Table:
+    every = motions(run)
+    rows: list[list[Cell]] = [
+        [
+            one["motion"],
+            one["unit"],
+            one["prior_sigma"],
+            one["value"],
+            one["sigma"],
+            *([one["true"]] if "true" in one else []),
+        ]
+        for one in every
+    ]
+    heads = ("motion", "unit", "prior sigma", "estimate", "sigma", *(["true"] if run.true is not None else []))
+    return Table("motions", "Motions", "", heads, rows, (None, None, *[3] * (len(heads) - 2)))
+
+
+def _along_figure(run: AsBuiltRun) -> Figure:
+    designed, bands = run.along
+    x = np.array([field[0] for field in ALONG])
+    figure = new_figure(2.9)
+    ax = figure.subplots()
+    for band, colour, label in ((bands[0], GREY, "prior"), (bands[1], BLUE, "as built")):
+        ax.fill_between(x, band[0], band[4], color=colour, alpha=0.15, lw=0)
+        ax.fill_between(x, band[1], band[3], color=colour, alpha=0.25, lw=0)
+        ax.plot(x, band[2], color=colour, lw=1.6, label=label)
+    ax.plot(x, designed, color=INK, lw=1.0, ls="--", label="designed")
+    limits = [one.merit.spec.requirement for one in run.standings if one.merit.spec.kind == "wavefront"]
+    if limits:
+        ax.axhline(limits[0], color=VERMILION, lw=1.0, label="asked")
+    ax.set_yscale("log")
+    ax.set_xlabel("field along the line")
+    ax.set_ylabel("rms wavefront error [waves]")
+    ax.legend(loc="best", ncols=2)
+    gridded(ax)
+    return figure
+
+
+def _known_figure(run: AsBuiltRun) -> Figure:
+    sigma = np.array([one.sigma for one in run.known])
+    figure = new_figure(2.2)
+    ax = figure.subplots()
+    number = np.arange(1, len(sigma) + 1)
+    known = np.array([one.known for one in run.known])
+    for which, colour, label in ((known, BLUE, "known"), (~known, ORANGE, "not known")):
+        ax.bar(number[which], sigma[which], 0.8, color=colour, label=label)
+    ax.set_xlabel("combination")
+    ax.set_ylabel("sigma over prior")
+    ax.set_ylim(0.0, 1.05)
+    ax.legend(loc="upper left")
+    plain_axes(ax)
+    return figure

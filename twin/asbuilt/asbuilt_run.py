@@ -1,0 +1,364 @@
+"""The state of one instrument, estimated: what is known and what is not, what follows for the camera, what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from analysis.instrument_state.known_combinations import Combination, combinations
+from analysis.instrument_state.state_estimate import FALSE_ALARM, Agreement, StateEstimate
+from optics.numerics.backend import Backend
+from optics.numerics.physical_error import PhysicalError
+from scenes.specs.asbuilt import AsBuiltSetup
+from scenes.specs.tolerance import MeritSpec, amount_text
+from twin.asbuilt.asbuilt_bench import AsBuiltBench
+from twin.asbuilt.next_step import Advice, advice
+from twin.run.procedure import Advance, silent
+from twin.run.quantity import Quantity, Record
+from twin.run.random_streams import stream
+from twin.tolerance.merits import Merit
+from twin.tolerance.tolerance_run import merit_unit
+
+LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
+"""Quantiles that are told."""
+WORST_FACTOR = 9.0
+"""Chi-square over degrees of freedom beyond which measurements contradict each other: three standard deviations on the
+average."""
+_INSTRUMENT, _POSTERIOR, _PRIOR, _MOVE, _MADE = range(5)
+"""Random streams."""
+ALONG = tuple((float(x), 0.0) for x in np.linspace(-1.0, 1.0, 11))
+"""Fields over which the wavefront is shown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """One merit of the instrument.
+
+    Attributes:
+        merit: the merit.
+        designed: of the instrument as drawn, SI.
+        before: quantiles ``LEVELS`` under the prior alone, SI.
+        now: the same with the measurements.
+        meets: probability that it meets the requirement.
+        moved: quantiles after the next move; empty where nothing can be moved.
+        meets_moved: probability then; NaN likewise.
+        true: of a drawn instrument, SI; NaN for a real one.
+    """
+
+    merit: Merit
+    designed: float
+    before: tuple[float, ...]
+    now: tuple[float, ...]
+    meets: float
+    moved: tuple[float, ...]
+    meets_moved: float
+    true: float
+
+
+@dataclass(frozen=True, eq=False)
+class AsBuiltRun:
+    """An instrument as it was built.
+
+    Attributes:
+        setup: what was measured.
+        bench: the instrument.
+        data: numbers of each measurement.
+        found: the state.
+        known: combinations of motions, the best known first.
+        standings: of the merits.
+        along: rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior and
+            with the measurements, (2, 5, F).
+        advice: the next move; None where nothing can be moved.
+        true: parameters of a drawn instrument; None of a real one.
+        warnings: what the user should know.
+    """
+
+    setup: AsBuiltSetup
+    bench: AsBuiltBench
+    data: tuple[np.ndarray, ...]
+    found: StateEstimate
+    known: tuple[Combination, ...]
+    standings: tuple[Standing, ...]
+    along: tuple[np.ndarray, np.ndarray]
+    advice: Advice | None
+    true: np.ndarray | None
+    warnings: tuple[str, ...]
+
+
+def run_asbuilt(
+    setup: AsBuiltSetup, backend: Backend, seed: int | None = None, advance: Advance = silent
+) -> AsBuiltRun:
+    """Estimate the state of an instrument and what follows from it.
+
+    Args:
+        setup: what was measured.
+        backend: where to trace.
+        seed: of the draws; the file's own by default.
+        advance: shows how far it is.
+
+    Raises:
+        InputError: names that do not exist, files without data, or measurements that contradict each other.
+    """
+    test = setup.test
+    seed = test.seed if seed is None else seed
+    advance("state", 0, 4)
+    bench = AsBuiltBench(setup, backend)
+    true = None
+    if test.simulate is None:
+        data = bench.data()
+    else:
+        rng = _random(test.simulate.seed, _INSTRUMENT)
+        true = bench.draw(rng, test.simulate.law)
+        try:
+            data = bench.measured(true, rng)
+        except PhysicalError as error:
+            allowed = "another seed, or smaller standard deviations"
+            raise test.error(f"the drawn instrument has no light: {error}", ("simulate",), allowed=allowed) from error
+    found = bench.estimate(data)
+    require_agreement(bench, found)
+    advance("state", 1, 4)
+    draws = found.draw(_random(seed, _POSTERIOR), test.draws)
+    prior = bench.parameters.prior
+    blind = prior.mean + _random(seed, _PRIOR).standard_normal((test.draws, prior.root.shape[1])) @ prior.root.T
+    last = bench.last
+    step = advice(bench, found, draws, _random(seed, _MOVE)) if bench.parameters.names else None
+    advance("state", 2, 4)
+    moved = None
+    if step is not None:
+        rng = _random(seed, _MADE)
+        made = np.stack([bench.actuators.made(step.move.amounts, rng) for _ in draws])
+        moved = bench.merit_parts(draws, last, made)
+    parts = (bench.merit_parts(blind, last), bench.merit_parts(draws, last), moved)
+    truth = None if true is None else bench.merit_parts(true[None], last)[0]
+    nominal = bench.merit_parts(np.zeros((1, len(prior.mean))), None)[0]
+    standings = tuple(_standing(one, nominal, parts, truth) for one in bench.merits.merits)
+    advance("state", 3, 4)
+    along = _along(bench, blind, draws)
+    advance("state", 4, 4)
+    return AsBuiltRun(
+        setup, bench, data, found, combinations(found), standings, along, step, true, tuple(_warnings(found, parts[1]))
+    )
+
+
+def _random(seed: int, number: int) -> np.random.Generator:
+    return np.random.default_rng(stream(seed, number))
+
+
+def require_agreement(bench: AsBuiltBench, found: StateEstimate) -> None:
+    """Refuse an estimate that has not settled, or of measurements that contradict each other.
+
+    Raises:
+        InputError: names the measurement that agrees least with all others.
+    """
+    test = bench.test
+    if not found.converged:
+        problem = f"the estimate has not settled after {found.steps} steps: one more changes the predicted readings by "
+        allowed = "a prior with smaller standard deviations, or a measurement of positions that brings it nearer"
+        raise test.error(f"{problem}{found.settled:.2g} of their errors", ("measurements",), allowed=allowed)
+    if found.whole.chi_square <= WORST_FACTOR * max(1, found.whole.degrees):
+        return
+    worst = min(found.measurements, key=lambda one: (one.chance, -one.chi_square / max(1, one.degrees)))
+    key = next(kind.key for kind in bench.kinds if kind.name == worst.name)
+    ratio = np.sqrt(found.whole.chi_square / found.whole.degrees)
+    raise test.error(
+        f"the measurements contradict each other: they miss what the instrument can do by {ratio:.0f} standard "
+        "deviations on the average, this one most",
+        key,
+        allowed="its true standard deviation, fields, sign and orientation; `camtwin asbuilt-check` tries orientations",
+    )
+
+
+def _quantiles(values: np.ndarray) -> tuple[float, ...]:
+    known = values[np.isfinite(values)]
+    return tuple(np.quantile(known, LEVELS).tolist()) if len(known) else (np.nan,) * len(LEVELS)
+
+
+def _standing(
+    merit: Merit, nominal: np.ndarray, parts: Sequence[np.ndarray | None], truth: np.ndarray | None
+) -> Standing:
+    before, now, moved = (None if part is None else merit.values(part) for part in parts)
+    assert before is not None
+    assert now is not None
+    return Standing(
+        merit,
+        float(merit.values(nominal)),
+        _quantiles(before),
+        _quantiles(now),
+        float(np.mean(merit.passes(now))),
+        () if moved is None else _quantiles(moved),
+        np.nan if moved is None else float(np.mean(merit.passes(moved))),
+        np.nan if truth is None else float(merit.values(truth)),
+    )
+
+
+def _along(bench: AsBuiltBench, blind: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rms wavefront error along the line, of the design, and quantiles under the prior and the posterior."""
+    field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)}, ("merits",))
+
+    def rms(values: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(np.sqrt(np.maximum(field.parts_of(bench.parameters.states(values, bench.last)), 0.0)))
+        except PhysicalError:
+            if len(values) == 1:
+                return np.full((1, len(ALONG)), np.nan)
+        half = len(values) // 2
+        return np.concatenate([rms(values[:half]), rms(values[half:])])
+
+    designed = np.sqrt(np.maximum(field.parts_of([{}])[0], 0.0))
+    return designed, np.stack([np.nanquantile(rms(values), LEVELS, axis=0) for values in (blind, draws)])
+
+
+def _warnings(found: StateEstimate, now: np.ndarray) -> list[str]:
+    out = []
+    for name, block, agreement in found.left_out:
+        out.append(
+            f"{name}: {block} contradicts all other measurements (chi-square {agreement.chi_square:.0f} of "
+            f"{agreement.degrees}) and is left out"
+        )
+    if not found.whole.holds():
+        factor = np.sqrt(found.variance_factor)
+        out.append(
+            f"all measurements together do not agree with the prior and their errors (chi-square "
+            f"{found.whole.chi_square:.0f} of {found.whole.degrees}); all sigmas are {factor:.2g} times larger for it"
+        )
+    for one in found.measurements:
+        if not one.holds(len(found.measurements)):
+            out.append(
+                f"{one.name} does not agree with what all others predict of it: chi-square {one.chi_square:.0f} of "
+                f"{one.degrees}"
+            )
+    lost = int(np.sum(~np.all(np.isfinite(now), axis=1)))
+    if lost:
+        out.append(f"{lost} of {len(now)} states of the posterior have no light; they count as failed")
+    return out
+
+
+# numbers
+
+
+def shown(value: float, merit: Merit) -> float | None:
+    """A value in the merit's unit; None for none."""
+    return float(value / merit_unit(merit)[1]) if np.isfinite(value) else None
+
+
+def _row(values: Sequence[float], merit: Merit) -> dict[str, float | None] | None:
+    if not len(values):
+        return None
+    return {f"p{100 * level:g}": shown(value, merit) for level, value in zip(LEVELS, values, strict=True)}
+
+
+def _standing_plain(one: Standing) -> dict[str, Any]:
+    merit = one.merit
+    out = {
+        "kind": merit.spec.kind,
+        "unit": merit_unit(merit)[0],
+        "requirement": shown(merit.spec.requirement, merit),
+        "designed": shown(one.designed, merit),
+        "prior": _row(one.before, merit),
+        "as_built": _row(one.now, merit),
+        "meets": one.meets,
+        "after_move": _row(one.moved, merit),
+        "meets_after_move": None if np.isnan(one.meets_moved) else one.meets_moved,
+    }
+    return out if np.isnan(one.true) else {**out, "true": shown(one.true, merit)}
+
+
+def _agreement_plain(one: Agreement) -> dict[str, Any]:
+    return {"chi_square": one.chi_square, "degrees": one.degrees, "chance": one.chance}
+
+
+def _measured_plain(run: AsBuiltRun) -> dict[str, Any]:
+    out = {}
+    count = len(run.found.measurements)
+    for kind, one in zip(run.bench.kinds, run.found.measurements, strict=True):
+        out[one.name] = {
+            "kind": kind.kind,
+            "numbers": len(kind.labels),
+            **_agreement_plain(one),
+            "agrees": one.holds(count),
+            "left_out": [block for name, block, _ in run.found.left_out if name == one.name],
+        }
+    return out
+
+
+def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
+    """Each motion of the prior with its estimate, in units for people."""
+    out = []
+    factor = np.sqrt(run.found.variance_factor)
+    for k, one in enumerate(run.bench.parameters.components):
+        size = one.unit_size
+        row = {
+            "motion": one.name,
+            "unit": one.unit,
+            "prior_sigma": one.sigma / size,
+            "value": float(run.found.mean[k]) / size,
+            "sigma": float(run.found.sigma[k]) * factor / size,
+        }
+        out.append(row if run.true is None else {**row, "true": float(run.true[k]) / size})
+    return out
+
+
+def _known_plain(run: AsBuiltRun) -> list[dict[str, Any]]:
+    factor = np.sqrt(run.found.variance_factor)
+    return [
+        {"combination": one.name, "value": one.value, "sigma": min(1.0, one.sigma * factor), "known": one.known}
+        for one in run.known
+    ]
+
+
+def moves_plain(run: AsBuiltRun, amounts: np.ndarray) -> dict[str, Any]:
+    """Amounts of the actuators (C,) as files have them."""
+    kinds = [number.kind for number in run.bench.parameters.actuators]
+    names = run.bench.parameters.names
+    return {name: amount_text(float(a), kind) for name, a, kind in zip(names, amounts, kinds, strict=True)}
+
+
+def _advice_plain(run: AsBuiltRun) -> dict[str, Any] | None:
+    step = run.advice
+    if step is None:
+        return None
+    return {
+        "move": moves_plain(run, step.move.amounts),
+        "searched": step.move.searched,
+        "merit_before": step.before,
+        "merit_after": step.after,
+        "merit_of_ignorance": step.ignorance,
+        "worth": dict(step.worth),
+    }
+
+
+def responses(run: AsBuiltRun) -> dict[str, Any] | None:
+    """Response of each actuator that is in doubt over the traced one, with its standard deviation; None for none."""
+    start = len(run.bench.parameters.components)
+    names = [run.bench.parameters.names[k] for k in run.bench.parameters.gains]
+    if not names:
+        return None
+    own = slice(start, start + len(names))
+    mean, sigma = run.found.mean[own], run.found.sigma[own] * np.sqrt(run.found.variance_factor)
+    return {
+        name: {"response": 1.0 + float(m), "sigma": float(s)} for name, m, s in zip(names, mean, sigma, strict=True)
+    }
+
+
+ASBUILT: Record[AsBuiltRun] = Record(
+    "asbuilt.json: the state of one instrument.",
+    Quantity("instrument", lambda run: run.setup.test.instrument),
+    Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
+    Quantity("whole", lambda run: _agreement_plain(run.found.whole), "chi-square of all together"),
+    Quantity("false_alarm", lambda run: FALSE_ALARM, "chance that what is as stated is called a contradiction"),
+    Quantity("measurements", _measured_plain, "each as all others predict it"),
+    Quantity("motions", motions, "each motion of the prior: its estimate and standard deviations"),
+    Quantity("combinations", _known_plain, "in standard deviations of the prior, the best known first"),
+    Quantity(
+        "merits",
+        lambda run: {one.merit.name: _standing_plain(one) for one in run.standings},
+        "each in its unit, with quantiles in percent",
+    ),
+    Quantity("next_move", _advice_plain, "of the actuators", where_known=True),
+    Quantity("responses", responses, "of the actuators over the traced ones", where_known=True),
+    Quantity("steps", lambda run: run.found.steps, "Gauss-Newton steps"),
+    Quantity("settled", lambda run: run.found.settled, "change of the readings by the last step, over their errors"),
+)

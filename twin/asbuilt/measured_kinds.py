@@ -1,0 +1,533 @@
+"""Kinds of measurement: what each reads of an instrument in a state, its errors, and its data.
+
+A new kind is a class here, an entry of ``KINDS`` and its keys in ``scenes.specs.asbuilt.MeasurementsSpec``.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from analysis.instrument_state.state_estimate import MeasuredGroup
+from analysis.units import ARCSEC
+from optics.geometry.tree import State
+from optics.numerics.frozen_map import FrozenMap
+from optics.numerics.physical_error import PhysicalError
+from optics.raytrace.line_of_sight import line_tangents
+from scenes.specs import asbuilt as specs
+from scenes.specs.motion_text import node_named
+from scenes.specs.tolerance import MeritSpec
+from scenes.yaml.errors import InputError, Problem
+from twin.camera.varied_beams import VariedBeams
+from twin.tolerance.tolerance_bench import ToleranceBench
+
+UNKNOWN_FOCUS = 50e-6
+"""Standard deviation of where a free focus of a drawn measurement stands, metres; results do not depend on it."""
+UNKNOWN_ZERO = 20.0 * ARCSEC
+"""Likewise of the zero of angles, radians."""
+UNKNOWN_FRAME = 100e-6
+"""Likewise of the frame of a measuring machine, metres and radians."""
+_LINE_DEGREE = 7
+"""Degree of the polynomial in the tangent that follows the places of images along a line to 1e-10 m."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """States at the time of a measurement.
+
+    Attributes:
+        values: parameters, (S, K).
+        states: the instrument, S.
+        warmth: bodies -> temperatures above nominal, (S, bodies).
+    """
+
+    values: np.ndarray
+    states: Sequence[State]
+    warmth: Any
+
+
+class Site(ABC):
+    """What a kind of measurement may know: the instrument, and nothing of its state."""
+
+    test: specs.AsBuiltSpec
+    experiment: Any
+    camera: str
+
+    @abstractmethod
+    def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
+        """Beams of fields, traced once for all that have the same."""
+
+    @abstractmethod
+    def bench(self, merits: Mapping[str, MeritSpec], key: tuple[str, ...]) -> ToleranceBench:
+        """A bench on which merits are tried; ``key`` is where the file says them."""
+
+
+class MeasuredKind(ABC):
+    """One measurement.
+
+    Args:
+        site: the instrument.
+        name: of the measurement.
+        spec: what the file says of it.
+        key: where.
+
+    Attributes:
+        labels: of its numbers, (D,).
+        blocks: what one gross error would spoil together, (D,).
+    """
+
+    kind: ClassVar[str]
+    shown: ClassVar[tuple[str, float]]
+    """Unit of its numbers for people, and its size in SI."""
+
+    def __init__(self, site: Site, name: str, spec: Any, key: tuple[str, ...]) -> None:
+        self.site, self.name, self.spec, self.key = site, name, spec, key
+        try:
+            self.prepare()
+        except PhysicalError as error:
+            raise site.test.error(str(error) or "the light is lost", key) from error
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Work out what does not change from state to state."""
+
+    labels: tuple[str, ...]
+    blocks: tuple[str, ...]
+
+    @abstractmethod
+    def predict(self, view: View) -> np.ndarray:
+        """What it would read without errors, (S, D). Raises PhysicalError: the light of some state is lost."""
+
+    @abstractmethod
+    def covariance(self) -> np.ndarray:
+        """Of its errors, (D, D)."""
+
+    def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Columns (D, B), standard deviations (B,), infinite where free, and those of drawn ones (B,)."""
+        return np.zeros((len(self.labels), 0)), np.zeros(0), np.zeros(0)
+
+    @abstractmethod
+    def read(self) -> np.ndarray:
+        """The data, (D,), SI. Raises InputError: a file that does not hold them."""
+
+    def group(self, values: np.ndarray) -> MeasuredGroup:
+        """The measurement with numbers (D,) for the estimate."""
+        columns, sigmas, _ = self.biases()
+        used = sigmas > 0.0
+        return MeasuredGroup(
+            self.name, self.kind, self.labels, values, self.covariance(), columns[:, used], sigmas[used], self.blocks
+        )
+
+    def drawn(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Numbers (D,) with random errors and biases."""
+        columns, _, typical = self.biases()
+        noise = np.linalg.cholesky(self.covariance()) @ rng.standard_normal(len(true))
+        return np.asarray(true + noise + columns @ (typical * rng.standard_normal(len(typical))))
+
+    def file(self, key: str, value: str, what: str) -> Path:
+        """A file that the measurement names."""
+        return Path(self.spec.file_at((key,), value, Path(self.site.test.source.file).parent, what))
+
+    def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
+        """An error at a key of the measurement."""
+        return InputError(self.spec.issue(Problem(text, found, allowed), (key,)))
+
+
+def field_text(field: tuple[float, float]) -> str:
+    """A field as tables have it."""
+    return f"({field[0]:g}, {field[1]:g})"
+
+
+class WavefrontReadings(MeasuredKind):
+    """Zernike terms of wavefronts at fields, metres rms, orthonormal over the light."""
+
+    kind = "wavefronts"
+    shown = ("nm", 1e-9)
+
+    def prepare(self) -> None:
+        """Beams, and matrices from optical paths to terms."""
+        spec = self.spec
+        self.beams = self.site.beams(spec.fields)
+        terms = spec.numbers
+        self.rows = self.beams.zernike_rows(terms[-1])[:, terms[0] - 1 :]
+        self.labels = tuple(f"{field_text(field)} Z{j}" for field in spec.fields for j in terms)
+        self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in terms)
+
+    def predict(self, view: View) -> np.ndarray:
+        """Terms, field after field."""
+        paths, _ = self.beams.paths(view.states)
+        return np.asarray(np.einsum("ftn,sfn->sft", self.rows, paths).reshape(len(view.states), -1))
+
+    def covariance(self) -> np.ndarray:
+        """Alike for all terms."""
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
+
+    def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The interferometer's focus at each field, and a reference error of each term that all fields share."""
+        fields, terms, _ = self.rows.shape
+        columns, sigmas, typical = [], [], []
+        free = self.spec.focus == specs.FREE
+        if free or self.spec.focus > 0.0:
+            shift = np.einsum("ftn,fn->ft", self.rows, self.beams.defocus)
+            for f in range(fields):
+                column = np.zeros((fields, terms))
+                column[f] = shift[f]
+                columns.append(column.ravel())
+            sigmas += [np.inf if free else self.spec.focus] * fields
+            typical += [UNKNOWN_FOCUS if free else self.spec.focus] * fields
+        if self.spec.common > 0.0:
+            columns += list(np.tile(np.eye(terms), (1, fields)))
+            sigmas += [self.spec.common] * terms
+            typical += [self.spec.common] * terms
+        table = np.stack(columns, axis=-1) if columns else np.zeros((len(self.labels), 0))
+        return table, np.array(sigmas), np.array(typical)
+
+    def read(self) -> np.ndarray:
+        """Coefficients of files."""
+        from twin.asbuilt.wavefront_files import read_coefficients
+
+        return np.asarray(read_coefficients(self).ravel())
+
+
+class FocusReadings(MeasuredKind):
+    """Best focus at fields, metres downstream of the line CCD."""
+
+    kind = "focus"
+    shown = ("um", 1e-6)
+
+    def prepare(self) -> None:
+        """Beams, and rows from optical paths to best focus."""
+        self.fields = self.spec.fields if self.spec.fields is not None else self._from_file[0]
+        self.beams = self.site.beams(self.fields)
+        self.rows = self.beams.focus_rows()
+        self.labels = tuple(field_text(field) for field in self.fields)
+        self.blocks = tuple(f"field {text}" for text in self.labels)
+
+    def predict(self, view: View) -> np.ndarray:
+        """Of each field."""
+        paths, _ = self.beams.paths(view.states)
+        return np.asarray(np.einsum("fn,sfn->sf", self.rows, paths))
+
+    def covariance(self) -> np.ndarray:
+        """With the error that all have in common."""
+        count = len(self.labels)
+        return np.asarray(self.spec.sigma**2 * np.eye(count) + self.spec.common**2)
+
+    def read(self) -> np.ndarray:
+        """Values of the file of the test, or of focus.json."""
+        return np.array(self.spec.values if self.spec.values is not None else self._from_file[1])
+
+    @cached_property
+    def _from_file(self) -> tuple[tuple[tuple[float, float], ...], tuple[float, ...]]:
+        path = self.file("file", self.spec.file, "a focus.json")
+        data = read_json(self, path)
+        try:
+            rounds = data["rounds"]
+            own = rounds[-1]
+            places, values = own["field"], own["vertex_um"]
+            fields = tuple((float(place), 0.0) for place in places)
+            return fields, tuple(1e-6 * float(value) for value in values)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise self.wrong(
+                f"no best foci in it ({error!r})", "file", "the focus.json of a run of twin.lab focus", str(path)
+            ) from error
+
+
+class MtfReadings(MeasuredKind):
+    """MTF of the optics at fields: of each along the line and along the track."""
+
+    kind = "mtf"
+    shown = ("", 1.0)
+
+    def prepare(self) -> None:
+        """A bench with this MTF as its merit."""
+        spec = self.spec
+        asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
+        self.tried = self.site.bench({self.name: asked}, self.key)
+        self.labels = tuple(f"{field_text(field)} {way}" for field in spec.fields for way in ("line", "track"))
+        self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
+
+    def predict(self, view: View) -> np.ndarray:
+        """Of each field and direction."""
+        return self.tried.parts_of(view.states)
+
+    def covariance(self) -> np.ndarray:
+        """Alike for all."""
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
+
+    def read(self) -> np.ndarray:
+        """Values of the file of the test."""
+        return np.stack([self.spec.along_line, self.spec.along_track], axis=-1).ravel()
+
+
+class DistortionReadings(MeasuredKind):
+    """Places of images along the line at known angles, metres."""
+
+    kind = "distortion"
+    shown = ("um", 1e-6)
+
+    def prepare(self) -> None:
+        """Angles, and where the designed camera images them."""
+        site = self.site
+        self.axes = site.experiment.instrument.camera_axes(site.camera)
+        self.number = list(site.experiment.instrument.cameras).index(site.camera)
+        self.line = site.line  # type: ignore[attr-defined]
+        nominal = self._tangents([{}])[0]
+        if self.spec.file is None:
+            half = self.line[-1]
+            self.tangents = np.interp(np.array(self.spec.fields) * half, self.line, nominal)
+            self.sigmas = np.full(len(self.tangents), self.spec.sigma)
+        else:
+            angles, self.values, sigmas = self._from_file
+            self.tangents = np.tan(angles)
+            self.sigmas = sigmas if self.spec.sigma is None else np.full(len(angles), self.spec.sigma)
+            if np.max(np.abs(self.tangents)) > 1.02 * np.max(np.abs(nominal)):
+                raise self.wrong(
+                    "angles beyond the camera's field",
+                    "file",
+                    f"at most {np.degrees(np.arctan(np.max(np.abs(nominal)))):.3f} deg",
+                    f"{np.degrees(np.max(np.abs(angles))):.3f} deg",
+                )
+        self.labels = tuple(f"{np.degrees(np.arctan(t)):+.4f} deg" for t in self.tangents)
+        self.blocks = tuple(f"angle {text}" for text in self.labels)
+        self.focal = float(np.sum(self.line * nominal) / np.sum(nominal**2))
+
+    def _tangents(self, states: Sequence[State]) -> np.ndarray:
+        sight = self.site.experiment.sight.trace(states)[self.number]
+        return line_tangents(sight, self.line, self.axes)[2]
+
+    def predict(self, view: View) -> np.ndarray:
+        """By a polynomial through the points of the line."""
+        seen = self._tangents(view.states)
+        size = np.max(np.abs(seen), axis=1, keepdims=True)
+        table = (seen / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
+        terms = np.linalg.pinv(table) @ self.line[None, :, None]
+        asked = (self.tangents / size)[..., None] ** np.arange(1, _LINE_DEGREE + 1)
+        return np.asarray(np.squeeze(asked @ terms, -1))
+
+    def covariance(self) -> np.ndarray:
+        """Independent."""
+        return np.diag(self.sigmas**2)
+
+    def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The zero of the angles."""
+        return (self.focal * (1.0 + self.tangents**2))[:, None], np.array([np.inf]), np.array([UNKNOWN_ZERO])
+
+    def read(self) -> np.ndarray:
+        """Places of the file."""
+        return np.array(self.values)
+
+    @cached_property
+    def _from_file(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        path = self.file("file", self.spec.file, "a distortion.json")
+        data = read_json(self, path)
+        try:
+            table = data["points"]
+            if isinstance(table, list):
+                table = {name: [row[name] for row in table] for name in table[0]}
+            columns = [table[name] for name in ("field_deg", "position_mm", "distortion_compensated_um_sigma")]
+            angle, place, sigma = (np.array(column, dtype=np.float64) for column in columns)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            raise self.wrong(
+                f"no places in it ({error!r})", "file", "the distortion.json of a run of twin.lab distortion", str(path)
+            ) from error
+        return np.radians(angle), 1e-3 * place, 1e-6 * sigma
+
+
+class SpotReadings(MeasuredKind):
+    """Spots of the monitor against where the design has them, pixels."""
+
+    kind = "spots"
+    shown = ("px", 1.0)
+
+    def prepare(self) -> None:
+        """The monitor's beams."""
+        experiment = self.site.experiment
+        if not experiment.monitored:
+            raise InputError(
+                self.spec.issue(
+                    Problem("the instrument has no monitor", None, "an instrument with one, as gf7_pair"), ()
+                )
+            )
+        self.path = experiment.path.coarse
+        channels = self.path.channels
+        self.labels = tuple(f"{c.camera} {c.name} {way}" for c in channels for way in ("row", "column"))
+        self.blocks = tuple(f"{c.camera} {c.name}" for c in channels for _ in range(2))
+        self.nominal = self._places([{}])[0]
+
+    def _places(self, states: Sequence[State]) -> np.ndarray:
+        path = self.path
+        mean = np.einsum("n,bnk->bk", path.nodes.share, path.rays(list(states)).position[..., 1::-1]) / path.pitch
+        return np.asarray(np.swapaxes(mean.reshape(len(path.channels), len(states), 2), 0, 1)).reshape(len(states), -1)
+
+    def predict(self, view: View) -> np.ndarray:
+        """Energy centroids, as means of rays."""
+        return self._places(view.states) - self.nominal
+
+    def covariance(self) -> np.ndarray:
+        """Alike for all."""
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
+
+    def read(self) -> np.ndarray:
+        """Places of the CSV file, less those of the design."""
+        path = self.file("file", self.spec.file, "a CSV file")
+        middle = 0.5 * (np.array(self.site.experiment.path.shape) - 1.0)
+        found: dict[tuple[str, str], tuple[float, float]] = {}
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = csv.DictReader(line for line in stream if not line.startswith("#"))
+            for row in rows:
+                try:
+                    found[row["camera"], row["channel"]] = (float(row["row_px"]), float(row["column_px"]))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise self.wrong(
+                        f"line {rows.line_num}: not a spot ({error!r})",
+                        "file",
+                        "columns camera, channel, row_px, column_px",
+                        str(path),
+                    ) from error
+        out = []
+        for channel in self.path.channels:
+            if (channel.camera, channel.name) not in found:
+                raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
+            out.append(np.array(found[channel.camera, channel.name]) - middle)
+        return np.concatenate(out) - self.nominal
+
+
+class SightReadings(MeasuredKind):
+    """Turns of the line of sight, radians, and the change of the principal distance, metres."""
+
+    kind = "sight"
+    shown = ("", 1.0)
+
+    def prepare(self) -> None:
+        """Which of them were measured."""
+        names = ("alpha", "beta", "gamma", "principal_distance")
+        self.which = [names.index(name) for name in self.spec.measured]
+        self.labels = self.blocks = self.spec.measured
+
+    def predict(self, view: View) -> np.ndarray:
+        """By exact chief rays."""
+        truth = self.site.experiment.sight.truth(list(view.states))
+        return np.asarray(truth.vector(self.site.camera)[:, self.which])
+
+    def covariance(self) -> np.ndarray:
+        """With the correlation that is stated."""
+        sigma = np.array([getattr(self.spec, f"sigma_{name}") for name in self.spec.measured])
+        rows = self.spec.correlation
+        return np.asarray(np.diag(sigma**2) if rows is None else np.array(rows) * np.outer(sigma, sigma))
+
+    def read(self) -> np.ndarray:
+        """Values of the file of the test."""
+        return np.array([getattr(self.spec, name) for name in self.spec.measured])
+
+
+class TemperatureReadings(MeasuredKind):
+    """Temperatures of bodies above nominal, kelvin."""
+
+    kind = "temperatures"
+    shown = ("K", 1.0)
+
+    def prepare(self) -> None:
+        """Full names of the bodies."""
+        self.bodies = named_bodies(self)
+        self.labels = self.blocks = self.bodies
+
+    def predict(self, view: View) -> np.ndarray:
+        """Of the state's own temperatures."""
+        return np.asarray(view.warmth(self.bodies))
+
+    def covariance(self) -> np.ndarray:
+        """With the error that all have in common."""
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)) + self.spec.common**2)
+
+    def read(self) -> np.ndarray:
+        """Values of the file of the test."""
+        return np.array(self.spec.values)
+
+
+class PositionReadings(MeasuredKind):
+    """Displacements of bodies' origins in the axes of the base, metres."""
+
+    kind = "positions"
+    shown = ("um", 1e-6)
+
+    def prepare(self) -> None:
+        """Where the bodies stand by the drawing."""
+        self.bodies = named_bodies(self)
+        self.labels = tuple(f"{body} {axis}" for body in self.bodies for axis in "xyz")
+        self.blocks = tuple(body for body in self.bodies for _ in range(3))
+        self.nominal = self._places([{}])[0]
+
+    def _places(self, states: Sequence[State]) -> np.ndarray:
+        placed = self.site.experiment.instrument.assembly.place(states)
+        root = placed.index[self.bodies[0].split("/")[0]]
+        away = np.stack([placed.translation[:, placed.index[body]] for body in self.bodies], axis=1)
+        away = away - placed.translation[:, root, None]
+        return np.asarray(np.einsum("sji,sbj->sbi", placed.rotation[:, root], away).real)
+
+    def predict(self, view: View) -> np.ndarray:
+        """Against the drawing."""
+        return np.asarray((self._places(view.states) - self.nominal).reshape(len(view.states), -1))
+
+    def covariance(self) -> np.ndarray:
+        """Alike for all."""
+        return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
+
+    def biases(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Shift and turn of the measuring machine's frame."""
+        if self.spec.frame != specs.FREE:
+            return super().biases()
+        shifts = np.tile(np.eye(3), (len(self.bodies), 1))
+        turns = np.stack([np.cross(axis, self.nominal).ravel() for axis in np.eye(3)], axis=-1)
+        columns = np.concatenate([shifts, turns], axis=1)
+        return columns, np.full(6, np.inf), np.full(6, UNKNOWN_FRAME)
+
+    def read(self) -> np.ndarray:
+        """Values of the file of the test."""
+        return np.array(self.spec.values).ravel()
+
+
+KINDS: Mapping[str, type[MeasuredKind]] = FrozenMap(
+    {
+        one.kind: one
+        for one in (
+            WavefrontReadings,
+            FocusReadings,
+            MtfReadings,
+            DistortionReadings,
+            SpotReadings,
+            SightReadings,
+            TemperatureReadings,
+            PositionReadings,
+        )
+    }
+)
+"""Key of ``measurements`` -> its class."""
+
+
+def named_bodies(one: MeasuredKind) -> tuple[str, ...]:
+    """Full paths of the bodies that a measurement names. Raises InputError: no such body, or several."""
+    nodes = one.site.experiment.instrument.nodes
+    out = []
+    for k, name in enumerate(one.spec.bodies):
+        try:
+            out.append(node_named(name, nodes))
+        except Problem as problem:
+            raise InputError(one.spec.issue(problem, ("bodies", k))) from None
+    return tuple(out)
+
+
+def read_json(one: MeasuredKind, path: Path) -> Any:
+    """Contents of a JSON file. Raises InputError: it is none."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise one.wrong(f"not a JSON file ({error})", "file", found=str(path)) from error

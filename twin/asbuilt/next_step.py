@@ -1,0 +1,226 @@
+"""The next move of an instrument and its worth: expected merits under the posterior, and simulated alignments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from analysis.instrument_state.next_move import NextMove, best_move, measurement_worth, truncated_move
+from analysis.instrument_state.state_estimate import StateEstimate
+from optics.numerics.physical_error import PhysicalError
+from twin.asbuilt.asbuilt_bench import AsBuiltBench
+
+MOST_ROUNDS = 3
+"""Times that a move is sought about the state that the last one leads to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """What to do next.
+
+    Attributes:
+        move: of the actuators.
+        before, after: expected merit without a move and after it: the mean over the posterior of the sum of squares of
+            all merits in units of their requirements, by exact traces.
+        ignorance: the part of it that is due to what is not known of the state and could be mended if it were.
+        worth: name of a measurement that could be made -> by how much it is expected to lower the merit after the move
+            that follows from it.
+    """
+
+    move: NextMove
+    before: float
+    after: float
+    ignorance: float
+    worth: dict[str, float]
+
+
+def wanted_move(bench: AsBuiltBench, mean: np.ndarray, after: str | None) -> NextMove:
+    """The move that makes the expected merit least, about where it leads to.
+
+    Args:
+        bench: with actuators.
+        mean: parameters as estimated, (K,).
+        after: name of the last move that was made.
+
+    Raises:
+        PhysicalError: the light of the estimated state is lost.
+    """
+    actuators = bench.actuators
+    amounts = np.zeros(len(actuators.names))
+    found = None
+    for _ in range(MOST_ROUNDS):
+        residual, slope = _about(bench, mean, after, amounts)
+        # the merit at no move, as it looks from where the last search led to
+        found = best_move(residual - slope @ amounts, slope, actuators)
+        if np.array_equal(found.amounts, amounts):
+            break
+        amounts = found.amounts
+    assert found is not None
+    return found
+
+
+def _about(
+    bench: AsBuiltBench, mean: np.ndarray, after: str | None, amounts: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the merit (R,) after a move, and their derivatives by the actuators (R, C)."""
+    count = len(amounts)
+    ranges = np.array([one.range_si or 1.0 for one in bench.test.actuators.values()])
+    steps = 1e-2 * np.diag(ranges)
+    moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
+    found = bench.merit_numbers(np.repeat(mean[None], len(moves), axis=0), after, moves)
+    return found[0], ((found[1 : 1 + count] - found[1 + count :]) / (2e-2 * ranges[:, None])).T
+
+
+def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
+    """The next move, its effect over the posterior, and what measurements would be worth before it.
+
+    Args:
+        bench: with actuators.
+        found: the state.
+        draws: states of the posterior, (S, K).
+        rng: source of the errors of the move.
+
+    Raises:
+        PhysicalError: the light of the estimated state is lost.
+    """
+    after = bench.last
+    move = wanted_move(bench, found.mean, after)
+    made = np.stack([bench.actuators.made(move.amounts, rng) for _ in draws])
+    both = [float(np.mean(expected(bench, draws, after, own))) for own in (None, made)]
+    _, by_state, by_actuators = bench.merit_slopes(found.mean, after)
+    unit_slope = by_state @ found.prior.root
+    candidates = {}
+    for kind in bench.candidates:
+        rows = bench.slope(found.mean, [kind], [after])
+        white = kind.group(np.zeros(len(kind.labels))).whitener()
+        candidates[kind.name] = white @ rows @ found.prior.root
+    everything = {"": np.linalg.pinv(found.root) * 1e6}
+    worth = measurement_worth(found.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
+    ignorance = worth.pop("")
+    return Advice(move, both[0], both[1], ignorance, worth)
+
+
+def expected(
+    bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
+) -> np.ndarray:
+    """Merits of states (S,), the sum of squares in units of the requirements; NaN where the light is lost."""
+    try:
+        return np.asarray(np.sum(bench.merit_numbers(values, after, further) ** 2, axis=1))
+    except PhysicalError:
+        if len(values) == 1:
+            return np.full(1, np.nan)
+    half = len(values) // 2
+    parts: Sequence[np.ndarray | None] = (None, None)
+    if further is not None:
+        parts = (further[:half], further[half:]) if further.ndim == 2 else (further, further)
+    pair = zip((values[:half], values[half:]), parts, strict=True)
+    return np.concatenate([expected(bench, own, after, part) for own, part in pair])
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A drawn instrument that was measured and moved several times.
+
+    Attributes:
+        merits: true merit before the first move and after each, (J + 1,).
+        perfect: mean merit that perfect knowledge of the state before each move would have reached in as many moves,
+            with the same ranges, steps and errors.
+        classic: true merit after each move by the truncated pseudo-inverse on the same instrument, (J + 1,).
+        estimates: the states as estimated before each move.
+    """
+
+    merits: np.ndarray
+    perfect: float
+    classic: np.ndarray
+    estimates: tuple[StateEstimate, ...]
+
+
+def align(
+    bench: AsBuiltBench,
+    true: np.ndarray,
+    moves: int,
+    rng: np.random.Generator,
+    again: Sequence[str],
+    kept: int | None = None,
+    trials: int = 3,
+) -> Alignment:
+    """Measure, estimate and move a drawn instrument.
+
+    Args:
+        bench: before the first move.
+        true: parameters of the instrument, (K,).
+        moves: how often it is moved.
+        rng: source of all errors.
+        again: measurements that are made again after each move.
+        kept: singular values of the classic move beside it; None for none.
+        trials: alignments with perfect knowledge that are averaged.
+
+    Raises:
+        PhysicalError: the light is lost.
+    """
+    own, state = bench, true
+    data = list(bench.measured(true, rng))
+    merits = [float(expected(bench, true[None], None)[0])]
+    estimates = []
+    start = None
+    for number in range(moves):
+        found = own.estimate(data, start)
+        estimates.append(found)
+        move = wanted_move(own, found.mean, own.last)
+        made = own.actuators.made(move.amounts, rng)
+        own = own.after_move(f"move{number + 1}", move.amounts, again)
+        moved = move.amounts != 0.0
+        state = np.concatenate([state, (made - move.amounts)[moved]])
+        start = np.concatenate([found.mean, np.zeros(int(np.sum(moved)))])
+        merits.append(float(expected(own, state[None], own.last)[0]))
+        fresh = own.kinds[len(data) :]
+        view = own.view(state[None], own.last)
+        data += [kind.drawn(kind.predict(view)[0], rng) for kind in fresh]
+    perfect = float(np.mean([_knowing(bench, true, moves, rng) for _ in range(trials)]))
+    classic = np.array([]) if kept is None else _classic(bench, true, moves, rng, kept)
+    return Alignment(np.array(merits), perfect, classic, tuple(estimates))
+
+
+def _knowing(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.Generator) -> float:
+    """True merit of an instrument whose state is known exactly before each move."""
+    own, state = bench, true
+    for number in range(moves):
+        move = wanted_move(own, state, own.last)
+        made = own.actuators.made(move.amounts, rng)
+        own = own.after_move(f"move{number + 1}", move.amounts, ())
+        state = np.concatenate([state, (made - move.amounts)[move.amounts != 0.0]])
+    return float(expected(own, state[None], own.last)[0])
+
+
+def _classic(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.Generator, kept: int) -> np.ndarray:
+    """True merits of an instrument moved by the truncated pseudo-inverse of its measured numbers."""
+    total = np.zeros(len(bench.actuators.names))
+    merits = [float(expected(bench, true[None], None)[0])]
+    ranges = np.array([one.range_si or 1.0 for one in bench.test.actuators.values()])
+    steps = 1e-2 * np.diag(ranges)
+    nominal = np.repeat(np.zeros_like(true)[None], 2 * len(ranges), axis=0)
+    view = bench.view(nominal, None, np.concatenate([steps, -steps]))
+    whiteners = [kind.group(np.zeros(len(kind.labels))).whitener() for kind in bench.kinds]
+    moved = np.concatenate(
+        [kind.predict(view) @ white.T for kind, white in zip(bench.kinds, whiteners, strict=True)], axis=1
+    )
+    count = len(ranges)
+    slope = ((moved[:count] - moved[count:]) / (2e-2 * ranges[:, None])).T
+    zero = bench.view(np.zeros_like(true)[None], None)
+    for _ in range(moves):
+        now = bench.view(true[None], None, total)
+        off = np.concatenate(
+            [
+                white @ (kind.drawn(kind.predict(now)[0], rng) - kind.predict(zero)[0])
+                for kind, white in zip(bench.kinds, whiteners, strict=True)
+            ]
+        )
+        left = replace(
+            bench.actuators, low=bench.actuators.low - total, high=np.maximum(bench.actuators.high - total, 0.0)
+        )
+        wanted = truncated_move(off, slope, left, kept)
+        total = total + bench.actuators.made(wanted, rng)
+        merits.append(float(expected(bench, true[None], None, total)[0]))
+    return np.array(merits)
