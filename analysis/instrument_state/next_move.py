@@ -44,11 +44,16 @@ class Actuators:
     relative: Array
     absolute: Array
 
-    def made(self, wanted: Array, rng: np.random.Generator) -> Array:
-        """What moves (C,) come to with random errors; an actuator that is not moved makes none."""
-        error = rng.standard_normal((2, len(wanted)))
+    def made(self, wanted: Array, errors: Array) -> Array:
+        """What moves (..., C) come to with random errors; an actuator that is not moved makes none.
+
+        Args:
+            wanted: the moves.
+            errors: standard normal, (..., 2, C): of the share and of the amount.
+        """
         moved = wanted != 0.0
-        return np.asarray(wanted * (1.0 + self.relative * error[0]) + moved * self.absolute * error[1])
+        share, amount = errors[..., 0, :], errors[..., 1, :]
+        return np.asarray(wanted * (1.0 + self.relative * share) + moved * self.absolute * amount)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from scenes.specs.course import noll
 from scenes.yaml.errors import Problem, names_text, nearest, shown, unknown
 from scenes.yaml.units import split_quantity
 
-__all__ = ["FORMS", "key_below", "meant", "motion_of", "node_named", "perturbation_in_words", "put"]
+__all__ = ["FORMS", "key_below", "meant", "motion_of", "node_named", "perturbation_in_words", "put", "short_name"]
 
 AXES = {"x": 0, "y": 1, "z": 2}
 KINDS = {
@@ -67,6 +67,18 @@ def node_named(name: str, nodes: Iterable[str]) -> str:
     if found:
         raise Problem("several nodes are called so", shown(name), names_text(found))
     raise unknown("no such node", name, sorted(nodes))
+
+
+def short_name(path: str, nodes: Iterable[str]) -> str:
+    """The last parts of a body's path, as many as tell it from all others.
+
+    Args:
+        path: of the body.
+        nodes: paths of all bodies.
+    """
+    parts, every = path.split("/"), tuple(nodes)
+    tails = ("/".join(parts[-count:]) for count in range(1, len(parts) + 1))
+    return next((tail for tail in tails if meant(tail, every) == [path]), path)
 
 
 def motion_of(text: str) -> tuple[str, str, str, str, str]:

@@ -189,14 +189,15 @@ class AsBuiltBench(Site):
         covariance = prior.covariance.copy()
         if self.setup.drawn is not None:
             own = {one.name: k for k, one in enumerate(self.drawn_motions.components)}
-            strange = sorted(set(own) - set(prior.labels))
+            names = [one.name for one in self.stated.components]
+            strange = sorted(set(own) - set(names))
             if strange:
                 raise self.test.error(
                     "the instrument moves as the prior does not", ("simulate", "prior"), found=names_text(strange[:3])
                 )
-            where = [k for k, name in enumerate(prior.labels) if name in own]
-            which = [own[prior.labels[k]] for k in where]
-            count = len(self.stated.components)
+            where = [k for k, name in enumerate(names) if name in own]
+            which = [own[names[k]] for k in where]
+            count = len(names)
             covariance[:count, :count] = 0.0
             covariance[np.ix_(where, where)] = self.drawn_motions.covariance[np.ix_(which, which)]
         root = type(prior).of(prior.labels, covariance).root

@@ -11,7 +11,19 @@ from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves
 from twin.asbuilt.built_instrument import instrument_text, posterior_text
 from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, shown_unit
 from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, gridded, look, new_figure, plain_axes, to_svg
+from twin.run.svg import (
+    BLUE,
+    GREY,
+    INK,
+    ORANGE,
+    VERMILION,
+    gridded,
+    look,
+    new_figure,
+    plain_axes,
+    shared_legend,
+    to_svg,
+)
 from twin.tolerance.tolerance_run import merit_unit
 
 _MOST_COMBINATIONS = 12
@@ -298,9 +310,10 @@ def _along_figure(run: AsBuiltRun) -> Figure:
     if limits:
         ax.axhline(limits[0], color=VERMILION, lw=1.0, label="asked")
     ax.set_yscale("log")
+    ax.set_ylim(0.5 * float(np.min(designed)))
     ax.set_xlabel("field along the line")
     ax.set_ylabel("rms wavefront error [waves]")
-    ax.legend(loc="best", ncols=2)
+    shared_legend(figure, ax)
     gridded(ax)
     return figure
 

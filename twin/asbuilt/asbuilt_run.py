@@ -128,8 +128,8 @@ def run_asbuilt(
     advance("state", 2, 4)
     moved = None
     if step is not None:
-        rng = _random(seed, _MADE)
-        made = np.stack([bench.actuators.made(step.move.amounts, rng) for _ in draws])
+        errors = _random(seed, _MADE).standard_normal((len(draws), 2, len(step.move.amounts)))
+        made = bench.actuators.made(step.move.amounts, errors)
         moved = bench.merit_parts(draws, last, made)
     parts = (bench.merit_parts(blind, last), bench.merit_parts(draws, last), moved)
     truth = None if true is None else bench.merit_parts(true[None], last)[0]
@@ -291,7 +291,7 @@ def motions(run: AsBuiltRun) -> list[dict[str, Any]]:
     for k, one in enumerate(run.bench.parameters.components):
         size = one.unit_size
         row = {
-            "motion": one.name,
+            "motion": run.bench.parameters.words[k],
             "unit": one.unit,
             "prior_sigma": one.sigma / size,
             "value": float(run.found.mean[k]) / size,

@@ -87,7 +87,7 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
     """
     after = bench.last
     move = wanted_move(bench, found.mean, after)
-    made = np.stack([bench.actuators.made(move.amounts, rng) for _ in draws])
+    made = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
     both = [float(np.mean(expected(bench, draws, after, own))) for own in (None, made)]
     _, by_state, by_actuators = bench.merit_slopes(found.mean, after)
     unit_slope = by_state @ found.prior.root
@@ -125,8 +125,8 @@ class Alignment:
 
     Attributes:
         merits: true merit before the first move and after each, (J + 1,).
-        perfect: mean merit that perfect knowledge of the state before each move would have reached in as many moves,
-            with the same ranges, steps and errors.
+        perfect: true merit that perfect knowledge of the state before each move reaches in as many moves, with the
+            same ranges, steps and errors.
         classic: true merit after each move by the truncated pseudo-inverse on the same instrument, (J + 1,).
         estimates: the states as estimated before each move.
     """
@@ -144,7 +144,6 @@ def align(
     rng: np.random.Generator,
     again: Sequence[str],
     kept: int | None = None,
-    trials: int = 3,
 ) -> Alignment:
     """Measure, estimate and move a drawn instrument.
 
@@ -155,11 +154,11 @@ def align(
         rng: source of all errors.
         again: measurements that are made again after each move.
         kept: singular values of the classic move beside it; None for none.
-        trials: alignments with perfect knowledge that are averaged.
 
     Raises:
         PhysicalError: the light is lost.
     """
+    errors = rng.standard_normal((moves, 2, len(bench.actuators.names)))
     own, state = bench, true
     data = list(bench.measured(true, rng))
     merits = [float(expected(bench, true[None], None)[0])]
@@ -169,32 +168,32 @@ def align(
         found = own.estimate(data, start)
         estimates.append(found)
         move = wanted_move(own, found.mean, own.last)
-        made = own.actuators.made(move.amounts, rng)
-        own = own.after_move(f"move{number + 1}", move.amounts, again)
-        moved = move.amounts != 0.0
-        state = np.concatenate([state, (made - move.amounts)[moved]])
-        start = np.concatenate([found.mean, np.zeros(int(np.sum(moved)))])
+        own, state = _made(own, state, move, f"move{number + 1}", errors[number], again)
+        start = np.concatenate([found.mean, np.zeros(len(state) - len(found.mean))])
         merits.append(float(expected(own, state[None], own.last)[0]))
-        fresh = own.kinds[len(data) :]
         view = own.view(state[None], own.last)
-        data += [kind.drawn(kind.predict(view)[0], rng) for kind in fresh]
-    perfect = float(np.mean([_knowing(bench, true, moves, rng) for _ in range(trials)]))
-    classic = np.array([]) if kept is None else _classic(bench, true, moves, rng, kept)
+        data += [kind.drawn(kind.predict(view)[0], rng) for kind in own.kinds[len(data) :]]
+    knowing, known = bench, true
+    for number in range(moves):
+        move = wanted_move(knowing, known, knowing.last)
+        knowing, known = _made(knowing, known, move, f"move{number + 1}", errors[number], ())
+    perfect = float(expected(knowing, known[None], knowing.last)[0])
+    classic = np.array([]) if kept is None else _classic(bench, true, errors, rng, kept)
     return Alignment(np.array(merits), perfect, classic, tuple(estimates))
 
 
-def _knowing(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.Generator) -> float:
-    """True merit of an instrument whose state is known exactly before each move."""
-    own, state = bench, true
-    for number in range(moves):
-        move = wanted_move(own, state, own.last)
-        made = own.actuators.made(move.amounts, rng)
-        own = own.after_move(f"move{number + 1}", move.amounts, ())
-        state = np.concatenate([state, (made - move.amounts)[move.amounts != 0.0]])
-    return float(expected(own, state[None], own.last)[0])
+def _made(
+    bench: AsBuiltBench, state: np.ndarray, move: NextMove, name: str, errors: np.ndarray, again: Sequence[str]
+) -> tuple[AsBuiltBench, np.ndarray]:
+    """The bench after a move, and the parameters of the instrument with the errors that were made."""
+    made = bench.actuators.made(move.amounts, errors)
+    moved = move.amounts != 0.0
+    return bench.after_move(name, move.amounts, again), np.concatenate([state, (made - move.amounts)[moved]])
 
 
-def _classic(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.Generator, kept: int) -> np.ndarray:
+def _classic(
+    bench: AsBuiltBench, true: np.ndarray, errors: np.ndarray, rng: np.random.Generator, kept: int
+) -> np.ndarray:
     """True merits of an instrument moved by the truncated pseudo-inverse of its measured numbers."""
     total = np.zeros(len(bench.actuators.names))
     merits = [float(expected(bench, true[None], None)[0])]
@@ -209,7 +208,7 @@ def _classic(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.G
     count = len(ranges)
     slope = ((moved[:count] - moved[count:]) / (2e-2 * ranges[:, None])).T
     zero = bench.view(np.zeros_like(true)[None], None)
-    for _ in range(moves):
+    for own in errors:
         now = bench.view(true[None], None, total)
         off = np.concatenate(
             [
@@ -221,6 +220,6 @@ def _classic(bench: AsBuiltBench, true: np.ndarray, moves: int, rng: np.random.G
             bench.actuators, low=bench.actuators.low - total, high=np.maximum(bench.actuators.high - total, 0.0)
         )
         wanted = truncated_move(off, slope, left, kept)
-        total = total + bench.actuators.made(wanted, rng)
+        total = total + bench.actuators.made(wanted, own)
         merits.append(float(expected(bench, true[None], None, total)[0]))
     return np.array(merits)

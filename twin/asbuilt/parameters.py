@@ -20,6 +20,7 @@ from scenes.models.disturbances import HEAT, Component, StatedMotions
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.asbuilt import AsBuiltSpec
+from scenes.specs.motion_text import short_name
 from scenes.specs.tolerance import amount_si
 from twin.tolerance.variations import BodyMove, VariedNumber, actuator_number, heat_moves, states_of
 
@@ -30,6 +31,7 @@ class Parameters:
 
     Attributes:
         stated: the prior's components, M.
+        words: what each is called, with the shortest name of its body, (M,).
         numbers: what one SI unit of each component does.
         actuators: what one SI unit of each actuator does, C.
         names: of the actuators.
@@ -42,6 +44,7 @@ class Parameters:
     """
 
     stated: StatedMotions
+    words: tuple[str, ...]
     numbers: tuple[VariedNumber, ...]
     actuators: tuple[VariedNumber, ...]
     names: tuple[str, ...]
@@ -72,6 +75,7 @@ class Parameters:
         gains = tuple(k for k, one in enumerate(test.actuators.values()) if one.response > 0.0)
         return cls(
             stated,
+            tuple(f"{short_name(one.body, instrument.nodes)} {one.what}" for one in stated.components),
             component_numbers(stated.components, instrument, thermal),
             actuators,
             names,
@@ -111,7 +115,7 @@ class Parameters:
     def labels(self) -> tuple[str, ...]:
         """Names of all parameters."""
         return (
-            *(component.name for component in self.components),
+            *self.words,
             *(f"response of {self.names[k]}" for k in self.gains),
             *(f"error of {self.moves[j]} {self.names[k]}" for j, k in self.errors),
         )

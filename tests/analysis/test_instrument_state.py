@@ -1,0 +1,338 @@
+"""The state of an instrument from measurements of several kinds, and the next move, on linear and curved models."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.stats import binom, chi2, kstest
+
+from analysis.instrument_state.known_combinations import combinations
+from analysis.instrument_state.next_move import Actuators, best_move, measurement_worth, truncated_move
+from analysis.instrument_state.state_estimate import (
+    MeasuredGroup,
+    StateEstimate,
+    StatePrior,
+    estimate_state,
+)
+from analysis.measurement_error import UndeterminedError
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+
+M = 7
+
+
+def random_prior(rng: np.random.Generator, count: int = M) -> StatePrior:
+    """Sigmas over three orders of magnitude, with correlations."""
+    root = rng.normal(size=(count, count)) * 10.0 ** rng.uniform(-6, -3, (count, 1))
+    return StatePrior.of([f"motion {k}" for k in range(count)], root @ root.T)
+
+
+def random_group(
+    rng: np.random.Generator, name: str, count: int, biases: int = 0, free: bool = False, blocks: int = 1
+) -> MeasuredGroup:
+    spread = rng.normal(size=(count, count)) + 2.0 * np.eye(count)
+    sigmas = np.full(biases, np.inf) if free else rng.uniform(0.5, 3.0, biases)
+    return MeasuredGroup(
+        name,
+        "numbers",
+        tuple(f"number {k}" for k in range(count)),
+        np.zeros(count),
+        spread @ spread.T,
+        rng.normal(size=(count, biases)),
+        sigmas,
+        tuple(f"block {k * blocks // count}" for k in range(count)),
+    )
+
+
+class Linear:
+    """A linear instrument with groups of measurements."""
+
+    def __init__(self, rng: np.random.Generator, prior: StatePrior, groups: list[MeasuredGroup]) -> None:
+        self.rng, self.prior, self.groups = rng, prior, groups
+        count = sum(len(group.values) for group in groups)
+        self.table = rng.normal(size=(count, len(prior.mean))) / prior.sigma * 3.0
+
+    def predict(self, states: np.ndarray) -> np.ndarray:
+        return np.asarray(states @ self.table.T)
+
+    def slope(self, state: np.ndarray) -> np.ndarray:
+        return self.table
+
+    def drawn(self) -> tuple[np.ndarray, list[MeasuredGroup]]:
+        """A state of the prior, and what is measured of it."""
+        state = self.prior.mean + self.prior.root @ self.rng.standard_normal(self.prior.root.shape[1])
+        values = self.predict(state[None])[0]
+        out, start = [], 0
+        for group in self.groups:
+            own = slice(start, start + len(group.values))
+            start += len(group.values)
+            noise = np.linalg.cholesky(group.covariance) @ self.rng.standard_normal(len(group.values))
+            size = np.where(np.isinf(group.bias_sigmas), 50.0, group.bias_sigmas)
+            noise = noise + group.biases @ (size * self.rng.standard_normal(len(size)))
+            out.append(group.with_values(values[own] + noise))
+        return state, out
+
+    def estimate(self, groups: list[MeasuredGroup]) -> StateEstimate:
+        return estimate_state(self.prior, groups, self.predict, self.slope)
+
+
+def closed_form(
+    prior: StatePrior, table: np.ndarray, group: MeasuredGroup, free: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of a linear normal model, biases by a covariance; free ones with a standard deviation."""
+    sigma = np.where(np.isinf(group.bias_sigmas), free, group.bias_sigmas)
+    spread = group.covariance + (group.biases * sigma**2) @ group.biases.T
+    whole = table @ prior.covariance @ table.T + spread
+    gain = prior.covariance @ table.T @ np.linalg.inv(whole)
+    return gain @ group.values, prior.covariance - gain @ table @ prior.covariance
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_linear_models_have_the_closed_form(free: bool) -> None:
+    """A free bias is the limit of a large standard deviation, which is 1e4 of the errors here: 1e-8 of the variances
+    are left of it.
+    """
+    rng = np.random.default_rng(3)
+    model = Linear(rng, random_prior(rng), [random_group(rng, "one", 12, 2, free)])
+    _, groups = model.drawn()
+    found = model.estimate(groups)
+    mean, covariance = closed_form(model.prior, model.table, groups[0], 1e4)
+    scale = model.prior.sigma
+    np.testing.assert_allclose(found.mean / scale, mean / scale, atol=1e-6 if free else 1e-10)
+    np.testing.assert_allclose(
+        found.covariance / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-6
+    )
+    assert found.converged
+
+
+def test_spots_alone_are_the_monitors_posterior() -> None:
+    """One group of spots on a linear instrument is the best linear unbiased prediction of the monitor, to 1e-9."""
+    rng = np.random.default_rng(5)
+    prior = random_prior(rng)
+    spots, parameters = rng.normal(size=(8, M)) / prior.sigma, rng.normal(size=(4, M)) / prior.sigma
+    safe = prior.sigma
+    stated = Disturbances(
+        "stated",
+        prior.labels,
+        prior.labels,
+        ("cause",) * M,
+        safe,
+        ("um",) * M,
+        spots * safe,
+        parameters * safe,
+        prior.covariance / np.outer(safe, safe),
+        (TimeLaw(white=True),) * M,
+    )
+    noise = 0.01 * np.eye(8) + 0.003
+    shift = rng.normal(size=8)
+    group = MeasuredGroup("spots", "spots", ("x",) * 8, shift, noise, np.zeros((8, 0)), np.zeros(0), tuple("aabbccdd"))
+    found = estimate_state(prior, [group], lambda x: x @ spots.T, lambda x: spots, false_alarm=1e-300)
+    wanted = stated.best_gain(noise) @ shift
+    np.testing.assert_allclose(parameters @ found.mean, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    total = stated.misfit(stated.best_gain(noise)) + stated.best_gain(noise) @ noise @ stated.best_gain(noise).T
+    own = parameters @ found.covariance @ parameters.T
+    np.testing.assert_allclose(own, total, atol=1e-9 * np.abs(total).max())
+
+
+def test_chi_squares_and_coverage_are_those_of_the_model() -> None:
+    """Of 400 drawn instruments the chi-square of all together, of each measurement about its prediction by all others
+    and of each block is distributed as it is said, and standardised errors are normal (each tested at 1e-3).
+    """
+    rng = np.random.default_rng(7)
+    groups = [random_group(rng, "one", 9, 1, True, 3), random_group(rng, "two", 5, 1), random_group(rng, "three", 4)]
+    model = Linear(rng, random_prior(rng), groups)
+    whole, single, block, errors, out = [], [], [], [], 0
+    for _ in range(400):
+        state, measured = model.drawn()
+        found = model.estimate(measured)
+        out += bool(found.left_out)
+        whole.append(chi2.cdf(found.whole.chi_square, found.whole.degrees))
+        single.append(chi2.cdf(found.measurements[0].chi_square, found.measurements[0].degrees))
+        block.append(chi2.cdf(found.blocks["one"][1].chi_square, found.blocks["one"][1].degrees))
+        direction = model.table[3]
+        error = direction @ (state - found.mean)
+        errors.append(error / np.sqrt(direction @ found.covariance @ direction))
+    for values in (whole, single, block):
+        assert kstest(values, "uniform").pvalue > 1e-3
+    assert kstest(errors, "norm").pvalue > 1e-3
+    # a false alarm in a thousand instruments
+    assert out <= binom.ppf(1.0 - 1e-4, 400, 1e-3)
+
+
+def test_a_gross_error_is_left_out() -> None:
+    """A block that is far off leaves the estimate as if it had not been measured, and is named."""
+    rng = np.random.default_rng(11)
+    model = Linear(rng, random_prior(rng), [random_group(rng, "one", 24, 0, False, 8), random_group(rng, "two", 8)])
+    _, groups = model.drawn()
+    clean = model.estimate(groups)
+    assert not clean.left_out
+    values = groups[0].values.copy()
+    values[6:9] += 300.0
+    found = model.estimate([groups[0].with_values(values), groups[1]])
+    assert [(name, block) for name, block, _ in found.left_out] == [("one", "block 2")]
+    kept = np.array([block != "block 2" for block in groups[0].blocks])
+    rows = np.concatenate([kept, np.ones(8, dtype=bool)])
+    fewer = MeasuredGroup(
+        "one",
+        "numbers",
+        tuple(np.array(groups[0].labels)[kept]),
+        groups[0].values[kept],
+        groups[0].covariance[np.ix_(kept, kept)],
+        groups[0].biases[kept],
+        groups[0].bias_sigmas,
+        tuple(np.array(groups[0].blocks)[kept]),
+    )
+    table = model.table[rows]
+    other = estimate_state(model.prior, [fewer, groups[1]], lambda x: x @ table.T, lambda x: table)
+    np.testing.assert_allclose(found.mean / model.prior.sigma, other.mean / model.prior.sigma, atol=1e-9)
+
+
+def test_order_and_units_do_not_matter_and_more_data_never_hurt() -> None:
+    """Groups in another order, numbers in another unit: the same estimate. A group more: no variance grows."""
+    rng = np.random.default_rng(13)
+    groups = [random_group(rng, "one", 6, 1, True), random_group(rng, "two", 5)]
+    model = Linear(rng, random_prior(rng), groups)
+    _, measured = model.drawn()
+    found = model.estimate(measured)
+    turned = np.concatenate([model.table[6:], model.table[:6] * 1e6])
+    one = measured[0]
+    scaled = MeasuredGroup(
+        "one", "numbers", one.labels, 1e6 * one.values, 1e12 * one.covariance, one.biases, one.bias_sigmas, one.blocks
+    )
+    other = estimate_state(model.prior, [measured[1], scaled], lambda x: x @ turned.T, lambda x: turned)
+    scale = model.prior.sigma
+    np.testing.assert_allclose(found.mean / scale, other.mean / scale, atol=1e-9)
+    np.testing.assert_allclose(found.sigma / scale, other.sigma / scale, atol=1e-9)
+    table = model.table[6:]
+    few = estimate_state(model.prior, [measured[1]], lambda x: x @ table.T, lambda x: table)
+    gain = (few.covariance - found.covariance) / np.outer(scale, scale)
+    assert np.linalg.eigvalsh(gain)[0] > -1e-9
+
+
+def test_a_curved_instrument_settles_at_the_mode() -> None:
+    """Of a model with squares the estimate is where the derivative of the cost by every motion vanishes."""
+    rng = np.random.default_rng(17)
+    prior = StatePrior.of("abc", np.diag([1.0, 4.0, 0.25]))
+    table, bent = rng.normal(size=(9, 3)), 0.15 * rng.normal(size=(9, 3))
+
+    def predict(x: np.ndarray) -> np.ndarray:
+        return np.asarray(x @ table.T + (x**2) @ bent.T)
+
+    def slope(x: np.ndarray) -> np.ndarray:
+        return np.asarray(table + 2.0 * bent * x)
+
+    true = np.array([0.8, -1.5, 0.4])
+    values = predict(true[None])[0] + 0.05 * rng.standard_normal(9)
+    empty = np.zeros((9, 0)), np.zeros(0)
+    group = MeasuredGroup("one", "numbers", ("n",) * 9, values, 0.05**2 * np.eye(9), *empty, tuple("abcdefghi"))
+    found = estimate_state(prior, [group], predict, slope)
+    assert found.converged
+    left = (values - predict(found.mean[None])[0]) / 0.05**2
+    pull = slope(found.mean).T @ left - np.linalg.solve(prior.covariance, found.mean)
+    assert np.all(np.abs(pull) * found.sigma < 0.01)
+    assert np.all(np.abs(found.mean - true) < 4.5 * found.sigma)
+
+
+def test_nothing_and_impossible_errors_are_refused() -> None:
+    """No measurement, a covariance that is none, and an instrument without light have messages of their own."""
+    prior = StatePrior.of("ab", np.eye(2))
+    with pytest.raises(UndeterminedError, match="nothing was measured"):
+        estimate_state(prior, [], lambda x: x, lambda x: np.eye(2))
+    bad = MeasuredGroup(
+        "one",
+        "n",
+        ("a", "b"),
+        np.zeros(2),
+        np.array([[1.0, 2.0], [2.0, 1.0]]),
+        np.zeros((2, 0)),
+        np.zeros(0),
+        ("a", "b"),
+    )
+    with pytest.raises(UndeterminedError, match="one: its covariance is not positive definite"):
+        estimate_state(prior, [bad], lambda x: x, lambda x: np.eye(2))
+    good = MeasuredGroup("one", "n", ("a", "b"), np.zeros(2), np.eye(2), np.zeros((2, 0)), np.zeros(0), ("a", "b"))
+    with pytest.raises(UndeterminedError, match="no light"):
+        estimate_state(prior, [good], lambda x: x * np.nan, lambda x: np.eye(2))
+
+
+def test_combinations_are_independent_and_keep_their_prior_where_nothing_is_measured() -> None:
+    """Values of combinations in drawn states have unit variance and no correlation before, their sigma after."""
+    rng = np.random.default_rng(19)
+    model = Linear(rng, random_prior(rng), [random_group(rng, "one", 3)])
+    _, groups = model.drawn()
+    found = model.estimate(groups)
+    known = combinations(found)
+    assert [one.known for one in known[3:]] == [False] * 4
+    np.testing.assert_allclose([one.sigma for one in known[3:]], 1.0, atol=1e-9)
+    scale = model.prior.sigma
+    rows = np.stack([one.weights for one in known]) / scale
+    np.testing.assert_allclose(rows @ model.prior.covariance @ rows.T, np.eye(M), atol=1e-8)
+    np.testing.assert_allclose(rows @ found.covariance @ rows.T, np.diag([one.sigma**2 for one in known]), atol=1e-8)
+    np.testing.assert_allclose(rows @ found.mean, [one.value for one in known], atol=1e-8)
+
+
+def actuators(count: int, step: float = 0.5, reach: float = 2.0, relative: float = 0.02) -> Actuators:
+    ends = np.full(count, reach)
+    return Actuators(
+        tuple("abcdef"[:count]), -ends, ends, np.full(count, step), np.full(count, relative), np.full(count, 0.03)
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_best_move_is_the_best_of_all(seed: int) -> None:
+    """Branch and bound against every whole step of three actuators, two of which do nearly the same."""
+    rng = np.random.default_rng(seed)
+    slope = rng.normal(size=(6, 3))
+    slope[:, 2] = slope[:, 1] + 0.05 * rng.normal(size=6)
+    residual = 3.0 * rng.normal(size=6)
+    parts = actuators(3)
+    found = best_move(residual, slope, parts)
+    length = np.linalg.norm(slope, axis=0)
+
+    def cost(move: np.ndarray) -> float:
+        left = residual + slope @ move
+        spread = (parts.relative * move) ** 2 + (move != 0.0) * parts.absolute**2
+        return float(left @ left + spread @ length**2)
+
+    best = min(cost(0.5 * np.array(n)) for n in product(range(-4, 5), repeat=3))
+    assert found.searched
+    # what a fixed error of any move costs is not searched for
+    assert cost(found.amounts) <= best * (1.0 + 2e-3) + 3 * 0.03**2 * np.sum(length**2)
+    assert found.expected == pytest.approx(cost(found.amounts))
+    np.testing.assert_allclose(found.amounts, 0.5 * np.round(found.amounts / 0.5), atol=1e-12)
+
+
+def test_no_range_no_move_and_free_amounts_solve_the_equations() -> None:
+    """An actuator of no range stays; without steps, limits and errors the move is that of least squares."""
+    rng = np.random.default_rng(2)
+    slope, residual = rng.normal(size=(6, 2)), rng.normal(size=6)
+    still = Actuators(("a", "b"), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2))
+    assert not np.any(best_move(residual, slope, still).amounts)
+    wide = Actuators(("a", "b"), np.full(2, -99.0), np.full(2, 99.0), np.zeros(2), np.zeros(2), np.zeros(2))
+    found = best_move(residual, slope, wide).amounts
+    np.testing.assert_allclose(found, np.linalg.lstsq(slope, -residual, rcond=None)[0], atol=1e-9)
+    np.testing.assert_allclose(truncated_move(residual, slope, wide, 2), found, atol=1e-9)
+
+
+def test_the_worth_of_a_measurement_is_what_it_saves() -> None:
+    """Against drawn states: the merit after the move that follows from the estimate with and without it."""
+    rng = np.random.default_rng(23)
+    units, response = 5, rng.normal(size=(8, 2))
+    slope = rng.normal(size=(8, units))
+    old, new = 2.0 * rng.normal(size=(3, units)), 3.0 * rng.normal(size=(2, units))
+    covariance = np.linalg.inv(np.eye(units) + old.T @ old)
+    root = np.linalg.cholesky(covariance)
+    free = Actuators(("a", "b"), np.full(2, -1e3), np.full(2, 1e3), np.zeros(2), np.zeros(2), np.zeros(2))
+    worth = measurement_worth(root, slope, free, response, {"new": new})["new"]
+    states = rng.standard_normal((4000, units)) @ root.T
+    after = np.linalg.inv(np.linalg.inv(covariance) + new.T @ new)
+    read = states @ new.T + rng.standard_normal((4000, 2))
+    guess = read @ (after @ new.T).T
+    undo = response @ np.linalg.pinv(response)
+
+    def merit(mean: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sum((states @ slope.T - mean @ slope.T @ undo.T) ** 2, axis=1))
+
+    saved = merit(np.zeros_like(states)) - merit(guess)
+    assert abs(np.mean(saved) - worth) < 4.5 * np.std(saved) / np.sqrt(len(saved))
