@@ -19,14 +19,14 @@ from scipy.fft import fftfreq, irfft2, next_fast_len, rfft2
 
 from analysis.measurement_error import UndeterminedError
 from analysis.wavefront_maps.wavefront_map import Array, MapError, WavefrontMap
-from analysis.wavefront_maps.zernike_terms import circle_terms
+from analysis.wavefront_maps.zernike_terms import circle_terms, noll_to_nm
 
 HELD = 1e-6
 """Share of a term that has to be left beside those before it; below it the light does not tell them apart."""
-_CHUNK = 100_000
+_CHUNK = 50_000
 """Pixels at a time, so that large maps take little memory."""
-_BINS = 96
-"""Cells across the map in which correlated noise is looked at: terms are smooth over them."""
+_BINS = 64
+"""Fewest cells across the pupil in which correlated noise is looked at: terms are smooth over them."""
 _FEWEST_PAIRS, _ROUNDS, _SETTLED = 1e-3, 25, 0.01
 """Share of pairs of points below which a distance is not looked at; rounds of the noise; change that ends them."""
 _TRIES, _NEAR = 400, 1.5
@@ -255,7 +255,8 @@ def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], fac
     (1 - P) C (1 - P) with the projection P onto the terms; what they have taken out is put back until nothing changes.
     Beyond the distance at which C is lost in its own noise it counts as zero.
     """
-    weight, mean, x, y = _cells(residual, pupil)
+    cells = max(_BINS, 6 * noll_to_nm(terms[-1])[0])
+    weight, mean, x, y = _cells(residual, pupil, cells)
     used, share = weight > 0.0, np.sum(weight)
     columns = np.zeros((len(terms), *weight.shape))
     columns[:, used] = np.linalg.solve(factor.T, circle_terms(terms, x[used], y[used]).T)
@@ -300,9 +301,9 @@ def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], fac
     return (turn * np.maximum(size, white)) @ turn.T
 
 
-def _cells(residual: Array, pupil: Pupil) -> tuple[Array, Array, Array, Array]:
+def _cells(residual: Array, pupil: Pupil, across: int) -> tuple[Array, Array, Array, Array]:
     """Cells of the map: share of their pixels that were fitted, mean of these, x and y of their middle on the disk."""
-    step = max(1, math.ceil(2.0 * pupil.radius / _BINS))
+    step = max(1, math.ceil(2.0 * pupil.radius / across))
     rows, columns = np.nonzero(np.isfinite(residual))
     top, left = rows.min(), columns.min()
     at = ((rows - top) // step, (columns - left) // step)

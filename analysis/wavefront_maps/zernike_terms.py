@@ -98,15 +98,17 @@ def circle_terms(terms: Any, x: Any, y: Any) -> Array:
         y: likewise.
     """
     point, square = np.asarray(x) + 1j * np.asarray(y), np.square(x) + np.square(y)
-    columns, powers = [], {0: np.ones_like(point)}
-    for n, m in (noll_to_nm(int(index)) for index in terms):
+    columns = np.empty((*point.shape, len(terms)))
+    powers: dict[int, NDArray[np.complex128]] = {}
+    for k, (n, m) in enumerate(noll_to_nm(int(index)) for index in terms):
         order = abs(m)
         if order not in powers:
             powers[order] = point**order
         turning = powers[order].imag if m < 0 else powers[order].real
+        # the radial polynomial, without the power of the radius that stands in the turning part
         radial = eval_jacobi((n - order) // 2, 0, order, 2.0 * square - 1.0)
-        columns.append(edge_value(n, m) * radial * turning)
-    return np.stack(columns, axis=-1)
+        np.multiply(edge_value(n, m) * radial, turning, out=columns[..., k])
+    return columns
 
 
 def orthonormal(basis: Array, weight: Array) -> tuple[Array, Array]:
