@@ -125,6 +125,27 @@ def fits_time(path: Path) -> datetime | None:
     return None
 
 
+def fits_cards(path: Path, number: int) -> dict[str, Any]:
+    """Keys and values of the header of the unit that holds a plane.
+
+    Args:
+        path: of the file.
+        number: of the plane.
+
+    Raises:
+        ImageError: a header that cannot be read.
+    """
+    try:
+        with _opened(path) as units:
+            header = _planes(units)[number][0].header
+            return {str(key): header[key] for key in header if key}
+    except ImageError:
+        raise
+    # what astropy finds wrong with a spoilt card cannot be foreseen
+    except Exception as error:
+        raise ImageError(f"{path} cannot be read as an image: its header is damaged") from error
+
+
 def fits_planes(path: Path, pages: Iterable[int]) -> Iterator[NDArray[Any]]:
     """Planes (rows, columns) of physical values.
 

@@ -1,0 +1,188 @@
+"""Tables of Zernike coefficients in the orders and units of other programs, read as Noll's of unit rms in metres.
+
+A table is CSV text of one of two forms. A long one has a column with indices and one with coefficients; a wide one has
+a row for each field and a column for each term, ``Z4``, ``Z5``..., beside columns with other texts, which are kept.
+Lines ``# order: fringe``, ``# normalised: peak``, ``# unit: waves`` and ``# wavelength: 632.8 nm`` say what they mean;
+a unit may also stand in the head of the columns, as in ``Z4 [nm]``.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from analysis.wavefront_maps.text_grids import statements, text_of, unit_agreed
+from analysis.wavefront_maps.wavefront_map import Array, MapError, agreed, length_from, metres_per
+from analysis.wavefront_maps.zernike_terms import ORDERS, edge_value, nm_to_noll
+
+ORDER_NAMES = {"noll": "noll", "fringe": "fringe", "ansi": "ansi", "osa": "ansi", "osa/ansi": "ansi"}
+NORMALISATIONS = {"rms": True, "peak": False}
+"""Whether terms have unit rms over the disk; those of unit peak reach 1 at the edge."""
+_INDEX = ("index", "j", "term")
+_COEFFICIENT = ("coefficient", "value", "c")
+_TERM = re.compile(r"[zZ]\s?_?(\d{1,4})")
+_HEAD = re.compile(r"([^\[\]]*?)\s*(?:\[([^\[\]]*)\])?")
+_DELIMITERS = ",;\t"
+_MOST_CHARACTERS = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class ZernikeTable:
+    """Coefficients of one or more wavefronts.
+
+    Attributes:
+        terms: Noll's indices, ascending, (Z,).
+        coefficients: metres of terms of unit rms over the disk, (F, Z); the file's sign.
+        others: other columns of a wide table, name -> texts, (F,) each.
+        wavelength: metres, None where neither file nor user says.
+        notes: how the table was understood, whole sentences.
+    """
+
+    terms: tuple[int, ...]
+    coefficients: Array
+    others: Mapping[str, tuple[str, ...]]
+    wavelength: float | None
+    notes: tuple[str, ...]
+
+
+def read_zernikes(
+    path: Path,
+    *,
+    order: str | None = None,
+    normalised: str | None = None,
+    unit: str | None = None,
+    wavelength: float | None = None,
+) -> ZernikeTable:
+    """Coefficients of a table.
+
+    Args:
+        path: of the file.
+        order: ``noll``, ``fringe`` or ``ansi``, where the file does not say.
+        normalised: ``rms`` or ``peak``, likewise.
+        unit: m, mm, um, nm or waves, likewise.
+        wavelength: metres, likewise.
+
+    Raises:
+        MapError: no such table, a meaning that is missing or stated in two ways, with what to write.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MapError(f"{path} is no file" if path.exists() else f"there is no file {path}")
+    try:
+        text = text_of(path)
+    except OSError as error:
+        raise MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
+    if len(text) > _MOST_CHARACTERS:
+        raise MapError(f"{path} is too long for a table of Zernike coefficients: {len(text)} characters")
+    said = statements(path, text, ("order", "normalised", "unit", "wavelength"))
+    order = _one(path, "order", order, said.get("order"), ORDER_NAMES)
+    scaled = NORMALISATIONS[
+        _one(path, "normalised", normalised, said.get("normalised"), {n: n for n in NORMALISATIONS})
+    ]
+    found = length_from(path, said["wavelength"], "wavelength") if "wavelength" in said else None
+    wavelength = agreed(path, "wavelength", wavelength, found)
+    indices, table, others, in_head = _table(path, text)
+    written = {one for one in (said.get("unit"), *in_head) if one}
+    if len(written) > 1:
+        raise MapError(f"{path} states more than one unit: {', '.join(sorted(written))[:60]}")
+    named = unit_agreed(path, unit, written.pop() if written else None, "a line '# unit: nm'")
+    metres = metres_per(path, named, wavelength)
+    terms, scales = [], []
+    for index in indices:
+        try:
+            n, m = ORDERS[order](index)
+        except ValueError as error:
+            raise MapError(f"{path}: {error}") from None
+        terms.append(nm_to_noll(n, m))
+        scales.append(metres if scaled else metres / edge_value(n, m))
+    sequence = np.argsort(terms)
+    if len(set(terms)) != len(terms):
+        twice = next(index for index in indices if indices.count(index) > 1)
+        raise MapError(f"{path} has term {twice} more than once")
+    coefficients = table * np.array(scales)
+    if not np.isfinite(coefficients).all():
+        raise MapError(f"{path}: a coefficient is not a finite number")
+    size = "unit rms" if scaled else "unit peak"
+    return ZernikeTable(
+        terms=tuple(terms[k] for k in sequence),
+        coefficients=coefficients[:, sequence],
+        others=others,
+        wavelength=wavelength,
+        notes=(f"{len(terms)} terms in the order {order}, of {size}, in {named}.",),
+    )
+
+
+def _one(path: Path, key: str, stated: str | None, found: str | None, known: Mapping[str, str]) -> str:
+    """What file or user say of a key, by its name here."""
+    names = set()
+    for one in (stated, found):
+        if one is not None:
+            if one.strip().lower() not in known:
+                raise MapError(f"{path}: {key} is {one[:40]!r}; {', '.join(dict.fromkeys(known.values()))} are known")
+            names.add(known[one.strip().lower()])
+    if not names:
+        first = next(iter(known))
+        raise MapError(
+            f"{path} does not say its {key}: state it, or add a line '# {key}: {first}' ({', '.join(known)})"
+        )
+    if len(names) > 1:
+        raise MapError(f"{path} says {key} {found}, stated is {stated}: take the statement away")
+    return names.pop()
+
+
+def _table(path: Path, text: str) -> tuple[list[int], Array, dict[str, tuple[str, ...]], set[str | None]]:
+    """Indices (Z,), coefficients (F, Z), other columns, and the units in the heads of the coefficients."""
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"]
+    if not lines:
+        raise MapError(f"{path} holds no table")
+    delimiter = next((one for one in _DELIMITERS if one in lines[0][1]), ",")
+    try:
+        rows = [(n, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]) for n, line in lines]
+    except csv.Error as error:
+        raise MapError(f"{path} is no table: {error}") from error
+    matches = [_HEAD.fullmatch(cell) for cell in rows[0][1]]
+    heads = [(m[1].strip(), m[2]) if m else ("", None) for m in matches]
+    body = rows[1:]
+    for n, cells in body:
+        if len(cells) != len(heads):
+            raise MapError(f"{path}, line {n}: {len(cells)} cells, the head of the table has {len(heads)}")
+    if not body:
+        raise MapError(f"{path} holds no row below the head of its table")
+    names = [name.lower() for name, _ in heads]
+    at_index = [k for k, name in enumerate(names) if name in _INDEX]
+    at_value = [k for k, name in enumerate(names) if name in _COEFFICIENT]
+    if len(at_index) == 1 and len(at_value) == 1:
+        indices = [_whole(path, n, cells[at_index[0]]) for n, cells in body]
+        values = [_real(path, n, cells[at_value[0]]) for n, cells in body]
+        return indices, np.array([values]), {}, {heads[at_value[0]][1]}
+    wide = {k: match for k, name in enumerate(names) if (match := _TERM.fullmatch(name))}
+    if not wide:
+        raise MapError(
+            f"{path}, line {rows[0][0]}: the head names neither terms (Z4, Z5) nor the columns index and coefficient"
+        )
+    table = np.array([[_real(path, n, cells[k]) for k in wide] for n, cells in body])
+    others = {rows[0][1][k]: tuple(cells[k] for _, cells in body) for k in range(len(heads)) if k not in wide}
+    return [int(match[1]) for match in wide.values()], table, others, {heads[k][1] for k in wide}
+
+
+def _whole(path: Path, line: int, cell: str) -> int:
+    match = _TERM.fullmatch(cell) or re.fullmatch(r"([0-9]{1,4})", cell)
+    if match is None:
+        raise MapError(f"{path}, line {line}: {cell[:40]!r} is no index of a term")
+    return int(match[1])
+
+
+def _real(path: Path, line: int, cell: str) -> float:
+    try:
+        value = float(cell.replace("_", "?"))
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise MapError(f"{path}, line {line}: {cell[:40]!r} is no coefficient")
+    return value

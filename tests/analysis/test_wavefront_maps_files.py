@@ -1,0 +1,338 @@
+"""Files of wavefronts: the same map whatever the format, a real interferogram as prysm reads it, and spoilt files."""
+
+import hashlib
+import math
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from analysis.wavefront_maps.map_files import MapError, read_map
+from analysis.wavefront_maps.zernike_table import read_zernikes
+from tests.analysis import wavefront_files as write
+
+WAVE = write.wave()
+
+
+def same(found: np.ndarray, expected: np.ndarray, step: float) -> None:
+    """Equal but for the rounding of a file that keeps whole steps."""
+    assert found.shape == expected.shape
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+    assert np.nanmax(np.abs(found - expected)) <= 0.5 * step + 1e-21
+
+
+@pytest.mark.parametrize("form", [1, 2, 3])
+@pytest.mark.parametrize("resolution", [0, 1, 2])
+def test_metropro_of_every_form(tmp_path, form, resolution):
+    path = tmp_path / "a.bin"
+    write.metropro(path, WAVE, form, frames=form, resolution=resolution, obliquity=1.25)
+    found = read_map(path)
+    same(found.values, WAVE, 0.5 * 1.25 * 632.8e-9 / (4096, 32768, 131072)[resolution])
+    assert found.spacing == pytest.approx(1e-4, rel=1e-7)
+    assert found.wavelength == pytest.approx(632.8e-9, rel=1e-7)
+    assert (found.scale_factor, found.obliquity, found.what) == (0.5, 1.25, None)
+    assert "0.5 waves per fringe" in found.notes[0]
+
+
+def test_what_the_header_of_metropro_says(tmp_path):
+    path = tmp_path / "a.dat"
+    write.metropro(path, WAVE, sign=1, codev=1, spacing=0.0)
+    found = read_map(path)
+    assert found.what == "surface"
+    assert math.isnan(found.spacing)
+    assert any("sign of the data is inverted" in note for note in found.notes)
+
+
+def test_a_real_interferogram_is_read_as_prysm_reads_it(tmp_path):
+    """Frozen of prysm.io.read_zygo_dat (2026, whose rows grow upwards) of the original file: its phase in nanometres as
+    bytes. From our metres, the stored counts come back as whole numbers, and they give its bytes to the last bit.
+    """
+    found = read_map(write.real_file(tmp_path))
+    one = float(np.float32(6.327999813038332e-07)) * 0.5 / 32768
+    counts = np.rint(found.values / one)
+    np.testing.assert_array_equal(found.values, counts * one)
+    assert hashlib.sha256((counts * (one * 1e9)).tobytes()).hexdigest() == (
+        "3d8b5ad927f26494a6d56700019e4e01f6ce67bae08ffedc9521d6abbab9682c"
+    )
+    assert found.values.shape == (432, 425)
+    assert np.isnan(found.values).sum() == 47241
+    assert found.spacing == 0.00011792420264100656
+    # two orders of multiplication differ by a rounding
+    for place, nanometres in (((216, 212), -30.512206129762465), ((100, 150), -12.93872032084864)):
+        assert found.values[place] * 1e9 == pytest.approx(nanometres, rel=4e-16)
+
+
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("unit", ["Fringes", "NanoMeters"])
+def test_datx(tmp_path, unit, old):
+    path = tmp_path / "a.dat"
+    write.datx(path, WAVE, unit, old)
+    found = read_map(path)
+    np.testing.assert_allclose(found.values, WAVE, rtol=1e-15, atol=0)
+    assert (found.spacing, found.wavelength, found.kind) == (2e-4, 632.8e-9, "Zygo datx")
+    assert found.scale_factor == (0.5 if unit == "Fringes" else 1.0)
+
+
+def test_datx_without_a_wavelength_takes_the_stated_one(tmp_path):
+    path = tmp_path / "a.datx"
+    write.datx(path, WAVE, Wavelength=None)
+    with pytest.raises(MapError, match="state the wavelength"):
+        read_map(path)
+    found = read_map(path, wavelength=632.8e-9)
+    np.testing.assert_allclose(found.values, WAVE, rtol=1e-15, atol=0)
+
+
+def test_the_first_of_several_surfaces_is_read_and_said(tmp_path):
+    path = tmp_path / "a.datx"
+    write.datx(path, WAVE)
+    with h5py.File(path, "a") as file:
+        file.copy("Data/Surface/{A1}", "Data/Surface/{A0}")
+        file["Data/Surface/{A0}"][...] = 0.25
+    found = read_map(path)
+    assert found.values[3, 3] == pytest.approx(0.25 * 0.5 * 0.97 * 632.8e-9)
+    assert any("2 surfaces" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("kind", ["WFR", "SUR"])
+def test_codev(tmp_path, kind):
+    path = tmp_path / "a.txt"
+    write.codev(path, WAVE, kind, "NNB NDA -32768", "! a comment\n")
+    found = read_map(path)
+    same(found.values, WAVE, 0.6328e-6 / 2000)
+    assert found.what == {"WFR": "wavefront", "SUR": "surface"}[kind]
+    assert math.isnan(found.spacing)
+    assert found.notes == ()
+    write.codev(path, WAVE, kind, "")
+    without = read_map(path)
+    np.testing.assert_array_equal(without.values, found.values)
+    assert "-32768" in without.notes[0]
+
+
+def test_codev_as_prysm_writes_and_reads_it(tmp_path):
+    """Frozen of prysm.io.write_codev_gridint and read_codev_gridint (2026), nanometres, rows growing upwards."""
+    path = tmp_path / "a.int"
+    path.write_text(
+        "CV GRD generated by prysm\nGRD 4 4 WFR WVL 1.0 SSZ 236414.1414141414 NDA -32768\n\n"
+        + "-18133\n-32768\n3830\n-32767\n14161\n30923\n5154\n-23334\n"
+        + "21490\n2080\n-10450\n-14847\n-32768\n-25036\n-4705\n7944\n"
+    )
+    nan = math.nan
+    by_prysm = [
+        [nan, -105.8989104892117, -19.901516769920956, 33.602050843836786],
+        [90.8998077333903, 8.798120059816279, -44.202093569750055, -62.800811792352064],
+        [59.89912411877804, 130.8001281777398, 21.80072634052553, -98.6996795556505],
+        [-76.70014954069643, nan, 16.2003845332194, -138.6],
+    ]
+    np.testing.assert_allclose(read_map(path).values * 1e9, by_prysm, rtol=5e-16, atol=0)
+
+
+@pytest.mark.parametrize("flag", [0, 1, 2, 3])
+def test_zemax(tmp_path, flag):
+    path = tmp_path / "a.txt"
+    write.zemax(path, WAVE, flag)
+    found = read_map(path)
+    np.testing.assert_allclose(found.values, WAVE, rtol=1e-14, atol=0)
+    assert found.spacing == pytest.approx(2e-4, rel=1e-14)
+    assert found.what == "surface"
+
+
+def test_zemax_without_flags_derivatives_or_shift(tmp_path):
+    full = write.wave(lit=False)
+    for width, header in ((4, "0 0"), (5, ""), (1, "0 0"), (5, "0.5 0")):
+        write.zemax(tmp_path / "a.dat", full, 0, width, header)
+        found = read_map(tmp_path / "a.dat")
+        np.testing.assert_allclose(found.values, full, rtol=1e-14, atol=0)
+        assert any("shift" in note for note in found.notes) == (header == "0.5 0")
+    # OpticStudio may write UTF-16
+    text = (tmp_path / "a.dat").read_text()
+    (tmp_path / "b.dat").write_bytes(text.encode("utf-16"))
+    np.testing.assert_allclose(read_map(tmp_path / "b.dat").values, full, rtol=1e-14, atol=0)
+
+
+def test_fits_with_its_own_or_a_stated_unit(tmp_path):
+    path = tmp_path / "a.fits"
+    write.fits_map(path, WAVE)
+    found = read_map(path)
+    np.testing.assert_allclose(found.values, WAVE, rtol=1e-15, atol=0)
+    assert (found.spacing, found.wavelength) == (3e-3, None)
+    write.fits_map(path, WAVE, "microns")
+    np.testing.assert_allclose(read_map(path).values, WAVE * 1e3, rtol=1e-15, atol=0)
+    with pytest.raises(MapError, match="says unit microns, stated is nm"):
+        read_map(path, unit="nm")
+    write.fits_map(path, WAVE, None)
+    with pytest.raises(MapError, match="does not say its unit"):
+        read_map(path)
+    np.testing.assert_allclose(read_map(path, unit="nm").values, WAVE, rtol=1e-15, atol=0)
+    with pytest.raises(MapError, match="of which wavelength"):
+        read_map(path, unit="waves")
+    found = read_map(path, unit="waves", wavelength=5e-7)
+    np.testing.assert_allclose(found.values, WAVE * 500.0, rtol=1e-14, atol=0)
+    assert found.wavelength == 5e-7
+
+
+def test_a_scale_in_arcsec_is_no_spacing(tmp_path):
+    path = tmp_path / "a.fits"
+    write.fits_map(path, WAVE, PIXUNIT="arcsecond")
+    assert math.isnan(read_map(path).spacing)
+
+
+def test_a_cube_of_fits_needs_a_page(tmp_path):
+    path = tmp_path / "a.fits"
+    fits.PrimaryHDU(np.stack([WAVE, 2.0 * WAVE])).writeto(path)
+    with pytest.raises(MapError, match="has 2 images"):
+        read_map(path, unit="m")
+    np.testing.assert_array_equal(read_map(path, unit="m", page=1).values, 2.0 * WAVE)
+    with pytest.raises(MapError, match="page 2 does not exist"):
+        read_map(path, unit="m", page=2)
+
+
+def test_a_text_table(tmp_path):
+    path = tmp_path / "a.csv"
+    write.table(path, WAVE)
+    found = read_map(path)
+    np.testing.assert_allclose(found.values, WAVE, rtol=1e-15, atol=0)
+    assert (found.spacing, found.what, found.wavelength) == (pytest.approx(2e-4), "surface", None)
+    write.table(path, WAVE, "# wavelength = 632.8 nm\n# any other text\n# unit: waves\n")
+    np.testing.assert_allclose(read_map(path).values, WAVE * 632.8, rtol=1e-14, atol=0)
+    path.write_text("# unit: um\n1 2 3\n4 nan 6\n")
+    np.testing.assert_array_equal(read_map(path).values * 1e6, [[4, math.nan, 6], [1, 2, 3]])
+
+
+def test_a_table_that_begins_like_zemax_is_a_table(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("# unit: nm\n" + "5 5 1 1 0\n" * 6)
+    assert read_map(path).values.shape == (6, 5)
+
+
+def test_metropro_needs_no_other_package():
+    """Astropy and h5py are imported for their own files."""
+    code = "import sys, analysis.wavefront_maps.map_files; print({'astropy', 'h5py'} & set(sys.modules))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "set()"
+
+
+BAD = {
+    "transmission": (lambda p: write.codev(p, WAVE, "FIL"), "transmissions"),
+    "neither": (lambda p: write.codev(p, WAVE, "NNB"), "neither WFR"),
+    "pixels": (lambda p: write.codev(p, WAVE, "SUR", "XSC 1.2"), "not square"),
+    "word": (lambda p: write.codev(p, WAVE, "SUR", "FOO 3"), "line 2: 'FOO' is not understood"),
+    "value": (lambda p: write.codev(p, WAVE, "SUR", "NDA x"), "line 2: 1 number"),
+    "wavelength": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2\n1 2 3 4\n"), "WVL"),
+    "size": (lambda p: p.write_text("t\nGRD 2 0 SUR SSZ 2 WVL 1\n1 2 3 4\n"), "grid of 2 x 0"),
+    "short": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2 3\n"), "has 3 points"),
+    "zernikes": (lambda p: p.write_text("t\nZFR 2 SUR SSZ 2 WVL 1\n1 2\n"), "Zernike terms"),
+    "letters": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2\n3 o\n"), "line 4: 'o' is no number"),
+    "steps": (lambda p: p.write_text("5 5 1 2 0 0 0\n" + "1 0 0 0 0\n" * 25), "no square pixels"),
+    "flag": (lambda p: p.write_text("5 5 1 1 7 0 0\n" + "1 0 0 0 0\n" * 25), "unit flag 7"),
+    "points": (lambda p: p.write_text("5 5 1 1 0 0 0\n" + "1 0 0 0 0\n" * 24), "has 24 points"),
+    "phase": (lambda p: write.metropro(p, np.zeros((0, 0))), "no phase map"),
+    "scale": (lambda p: write.metropro(p, WAVE, scale=0.0), "scale factor 0"),
+    "dark": (lambda p: write.metropro(p, WAVE * np.nan), "no measured point"),
+    "cut": (lambda p: (write.metropro(p, WAVE), p.write_bytes(p.read_bytes()[:-9])), "cut off"),
+    "other hdf5": (lambda p: h5py.File(p, "w").close(), "no .datx file"),
+    "no unit": (lambda p: write.datx(p, WAVE, Unit=None), "does not say the unit"),
+    "no factor": (lambda p: write.datx(p, WAVE, **{"Interferometric Scale Factor": None}), "no usable"),
+    "table unit": (lambda p: write.table(p, WAVE, ""), "does not say its unit"),
+    "furlongs": (lambda p: write.table(p, WAVE, "# unit: furlong\n"), "no unit 'furlong'"),
+    "twice": (lambda p: write.table(p, WAVE, "# unit: nm\n# unit: nm\n"), "line 2: unit is stated a second time"),
+    "ragged": (lambda p: p.write_text("# unit: nm\n1 2\n1 2\n1 2 3\n"), "line 4: a map has"),
+    "binary": (lambda p: p.write_bytes(b"\0\1\2"), "no file of a wavefront that is known"),
+    "empty": (lambda p: p.write_bytes(b""), "is empty"),
+    "folder": (lambda p: p.mkdir(), "is a folder"),
+    "nothing": (lambda p: None, "there is no file"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_told_with_their_name(tmp_path, case):
+    path = tmp_path / "map.file"
+    make, told = BAD[case]
+    make(path)
+    with pytest.raises(MapError) as error:
+        read_map(path)
+    assert "\n" not in str(error.value)
+    assert str(path) in str(error.value)
+    assert told in str(error.value)
+
+
+def test_statements_that_are_not_needed_are_refused(tmp_path):
+    path = tmp_path / "a.dat"
+    write.metropro(path, WAVE)
+    with pytest.raises(MapError, match="take the statement of unit"):
+        read_map(path, unit="nm")
+    with pytest.raises(MapError, match="page 1 was named"):
+        read_map(path, page=1)
+    with pytest.raises(MapError, match="says wavelength"):
+        read_map(path, wavelength=5e-7)
+
+
+def spoil(data: bytes, seed: int, head: int) -> bytes:
+    """Bytes changed, cut, repeated or put in; three of four times where the header is."""
+    rng = np.random.default_rng(seed)
+    out = bytearray(data)
+    for _ in range(rng.integers(1, 4)):
+        if not out:
+            break
+        place = int(rng.integers(min(head, len(out)) if rng.random() < 0.75 else len(out)))
+        match rng.integers(6):
+            case 0:
+                out[place] = int(rng.integers(256))
+            case 1:
+                out[place] ^= 1 << int(rng.integers(8))
+            case 2:
+                del out[place : place + int(rng.integers(1, 40))]
+            case 3:
+                del out[place:]
+            case 4:
+                out[place:place] = out[place : place + int(rng.integers(1, 40))]
+            case 5:
+                nasty = [b"nan", b"-1", b"1e400", b"\xff\xff\xff\xff", b"\x00\x00", b"9" * 12, b"\n", b",", b"#", b"'"]
+                out[place : place + 4] = nasty[rng.integers(len(nasty))]
+    return bytes(out)
+
+
+def read_spoilt(kind: str, seeds: range, folder: Path) -> tuple[int, int]:
+    """How many of the spoilt files were read and refused; anything else fails."""
+    path, spoilt = folder / "whole", folder / "spoilt"
+    if kind == "zernikes":
+        write.zernikes(path)
+    else:
+        write.WRITERS[kind](path, WAVE)
+    whole, told = path.read_bytes(), []
+    head = {"dat": 834, "datx": 4000, "fits": 600}.get(kind, 120)
+    for seed in seeds:
+        spoilt.write_bytes(spoil(whole, seed, head))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                if kind == "zernikes":
+                    numbers = read_zernikes(spoilt).coefficients
+                else:
+                    numbers = read_map(spoilt).values
+                assert np.isfinite(numbers).any(), seed
+            except MapError as error:
+                told.append(str(error))
+    wrong = [text for text in told if "\n" in text or str(spoilt) not in text]
+    assert wrong == []
+    return len(seeds) - len(told), len(told)
+
+
+KINDS = [*write.WRITERS, "zernikes"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_spoilt_files_are_read_or_refused_in_one_sentence(kind, tmp_path):
+    read_spoilt(kind, range(12), tmp_path)
+
+
+@pytest.mark.second
+@pytest.mark.parametrize("kind", KINDS)
+def test_500_spoilt_files(kind, tmp_path):
+    read, refused = read_spoilt(kind, range(100, 600), tmp_path)
+    assert read > 10
+    assert refused > 50
