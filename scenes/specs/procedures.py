@@ -424,5 +424,23 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.asbuilt scenes/examples/asbuilt_gf7.yaml`
     """,
     ),
+    "asbuilt check": Procedure(
+        "orientation",
+        setup="scenes.specs.asbuilt:AsBuiltSetup",
+        resolve="scenes.specs.asbuilt:resolve_asbuilt",
+        run="twin.asbuilt.orientation_check:run_check",
+        numbers="twin.asbuilt.orientation_check:ORIENTATION",
+        report="twin.asbuilt.orientation_check:check_report",
+        judged=False,
+        about="""
+    Tell which way round measured wavefronts lie: eight orientations and two signs are tried against what the prior and
+    the moves that were made predict, and those that the data do not tell apart are named together.
+
+    orientation.json holds all readings with their chi-squares. Exit codes: 0 the stated reading stands, 3 another one
+    does, 4 none explains the wavefronts.
+
+    Example: `python -m twin.asbuilt check scenes/examples/asbuilt_gf7.yaml`
+    """,
+    ),
 }
 """Name of the command after ``twin.`` -> the test. A test is its own modules and one entry here."""

@@ -1,0 +1,95 @@
+"""Coefficients of measured wavefronts from the files that a measurement names, and which way round they lie."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.measurement_error import MeasurementError
+from analysis.wavefront_maps.map_files import read_map
+from analysis.wavefront_maps.orientation import Orientation
+from analysis.wavefront_maps.pupil_fit import fit_map
+from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
+from analysis.wavefront_maps.zernike_table import read_zernikes
+
+if TYPE_CHECKING:
+    from twin.asbuilt.measured_kinds import WavefrontReadings
+
+TABLES = (".csv", ".tsv")
+"""Suffixes of tables of coefficients; all other files are maps."""
+
+
+def stated_orientation(one: WavefrontReadings) -> Orientation:
+    """How the file of the test says that maps and coefficients lie. Raises InputError: no such orientation."""
+    try:
+        return Orientation.named(one.spec.orientation, one.spec.sign)
+    except ValueError as error:
+        raise one.wrong(str(error), "orientation", found=one.spec.orientation) from error
+
+
+def read_coefficients(one: WavefrontReadings, orientation: Orientation | None = None) -> np.ndarray:
+    """Zernike terms of every field, metres rms of the wavefront in single pass, (F, T).
+
+    Args:
+        one: the measurement.
+        orientation: how its files lie; as it says by default.
+
+    Raises:
+        InputError: a file that is none of a wavefront, has other fields or terms, or too little light.
+    """
+    lies = stated_orientation(one) if orientation is None else orientation
+    spec, terms = one.spec, tuple(one.spec.numbers)
+    if spec.zernikes is not None:
+        table = _of_table(one, "zernikes", spec.zernikes, len(spec.fields))
+    else:
+        table = np.stack([_of_map(one, k, name, lies) for k, name in enumerate(spec.maps)])
+    if spec.reference is not None and Path(spec.reference).suffix.lower() in TABLES:
+        table = table - _of_table(one, "reference", spec.reference, 1)
+    if spec.zernikes is not None:
+        try:
+            table = lies.coefficients(table, terms)
+        except MapError as error:
+            raise one.wrong(str(error), "terms") from error
+    return np.asarray(table * (0.5 if spec.double_pass else 1.0))
+
+
+def _of_table(one: WavefrontReadings, key: str, name: str, fields: int) -> np.ndarray:
+    path = one.file(key, name, "a CSV file of coefficients")
+    try:
+        found = read_zernikes(path, wavelength=one.beams.wavelength)
+    except MeasurementError as error:
+        raise one.wrong(str(error), key) from error
+    wanted = tuple(one.spec.numbers)
+    missing = [f"Z{j}" for j in wanted if j not in found.terms]
+    if missing:
+        allowed = f"Z{found.terms[0]} to Z{found.terms[-1]} as the table has them"
+        raise one.wrong(f"the table has no {', '.join(missing[:4])}", key, allowed, str(path))
+    if len(found.coefficients) != fields:
+        text = f"{len(found.coefficients)} wavefronts in the table, {fields} fields in the test"
+        raise one.wrong(text, key, "one row for each field, in their order", str(path))
+    return np.asarray(found.coefficients[:, [found.terms.index(j) for j in wanted]])
+
+
+def _of_map(one: WavefrontReadings, number: int, name: str, lies: Orientation) -> np.ndarray:
+    spec = one.spec
+    path = one.file("maps", name, "a file of a wavefront")
+    try:
+        measured = read_map(path, wavelength=one.beams.wavelength)
+        if spec.reference is not None and Path(spec.reference).suffix.lower() not in TABLES:
+            measured = _less(measured, read_map(one.file("reference", spec.reference, "a map")), one)
+        last = spec.numbers[-1]
+        fitted = fit_map(lies.apply(measured), tuple(range(1, last + 1)))
+    except MeasurementError as error:
+        raise one.wrong(f"map {number + 1}: {error}", "maps") from error
+    return np.asarray(fitted.parts[spec.numbers[0] - 1 :])
+
+
+def _less(measured: WavefrontMap, reference: WavefrontMap, one: WavefrontReadings) -> WavefrontMap:
+    """A map without the error of the reference surface."""
+    if measured.values.shape != reference.values.shape:
+        found = f"{reference.values.shape} points, the maps {measured.values.shape}"
+        raise one.wrong("the reference has another number of points than the maps", "reference", "the same", found)
+    return replace(measured, values=measured.values - reference.values)
