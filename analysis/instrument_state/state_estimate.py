@@ -57,7 +57,13 @@ class StatePrior:
 
     @classmethod
     def of(cls, labels: Sequence[str], covariance: Array, mean: Array | None = None) -> StatePrior:
-        """Prior of a covariance (M, M), SI, positive semidefinite, and a mean (M,), zero by default."""
+        """Prior of a covariance.
+
+        Args:
+            labels: names of the motions, (M,).
+            covariance: (M, M), SI, positive semidefinite.
+            mean: (M,), SI; zero by default.
+        """
         sigma = np.sqrt(np.diagonal(covariance))
         safe = np.where(sigma > 0.0, sigma, 1.0)
         correlation = covariance / safe / safe[:, None]

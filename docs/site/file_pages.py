@@ -38,6 +38,7 @@ READ_BY = {
     "orbit_check": "`python -m twin.orbit check FILE`",
     "orbit_match": "`python -m twin.orbit match FILE`",
     "tolerance": "`python -m twin.tolerance FILE`",
+    "asbuilt": "`python -m twin.asbuilt FILE`, `python -m twin.asbuilt check FILE`",
     "three_line_camera": "tests in orbit, which name it: `camera: th1`",
     "study": "`python -m twin.study FILE`",
 }

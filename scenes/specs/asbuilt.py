@@ -70,6 +70,7 @@ class WavefrontReadingsSpec(ReadingsSpec):
     """Wavefronts at fields, by an interferometer in single or double pass. Piston and tilt never count.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         fields: shares of the half field, along the line and along the track.
         terms: first and last Zernike term (Noll) that count, `[Z4, Z11]`.
         sigma: standard deviation of each coefficient's noise, rms, metres.
@@ -126,6 +127,7 @@ class FocusReadingsSpec(ReadingsSpec):
     """Best focus at fields, along the light of the designed camera, from the line CCD on downstream.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         fields: as of wavefronts.
         values: of each field, metres.
         sigma: standard deviation of each, metres.
@@ -155,6 +157,7 @@ class MtfReadingsSpec(ReadingsSpec):
     """MTF of the optics at fields, at one frequency.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         fields: as of wavefronts.
         frequency: cycles per mm; that of the pixels (Nyquist) if not given.
         along_line: MTF for lines across the line CCD, of each field.
@@ -187,6 +190,7 @@ class DistortionReadingsSpec(ReadingsSpec):
     the angles is free.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         fields: shares of half the line at which images were taken, where the data are simulated.
         sigma: standard deviation of a place, metres; of a file its own if not given.
         file: the `distortion.json` of a run of `twin.lab distortion`.
@@ -213,6 +217,7 @@ class SpotReadingsSpec(ReadingsSpec):
     """Spots of the instrument's monitor, against where the design has them.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         sigma: standard deviation of each coordinate, pixels.
         file: CSV file with the places: columns camera, channel, row_px, column_px.
     """
@@ -230,6 +235,7 @@ class SightReadingsSpec(ReadingsSpec):
     """Line of sight, roll and principal distance against the design, as of a theodolite or of a calibration in orbit.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         alpha, beta: turns of the line of sight about the camera's Y and X, radians.
         gamma: roll of the line about it, radians.
         principal_distance: its change, metres.
@@ -278,6 +284,7 @@ class TemperatureReadingsSpec(ReadingsSpec):
     """Temperatures of bodies against that at which the instrument is as drawn.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         bodies: paths or short names.
         values: of each body, kelvin.
         sigma: standard deviation of each, kelvin.
@@ -304,6 +311,7 @@ class PositionReadingsSpec(ReadingsSpec):
     """Places of bodies' origins against the drawing, by a laser tracker or a coordinate-measuring machine.
 
     Attributes:
+        after: the last of `moves` that had been made when it was taken; none by default.
         bodies: paths or short names.
         values: displacement of each in the axes of the instrument's base, metres.
         sigma: standard deviation of each coordinate, metres.

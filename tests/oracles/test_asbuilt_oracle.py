@@ -1,4 +1,4 @@
-"""Responses of wavefronts to motions, which estimates of an instrument's state rest on, against other people's software."""
+"""Responses of wavefronts to motions, on which estimates of an instrument's state rest, against batoid's."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ batoid = pytest.importorskip("batoid", reason="batoid not installed (extra `orac
 pytestmark = pytest.mark.oracle
 
 CAMERA = "LSST.LSSTCamera"
-IN_CAMERA = tuple(f"camera/L{k}" for k in range(1, 9)) + ("camera/focal_plane",)
+IN_CAMERA = (*(f"camera/L{k}" for k in range(1, 9)), "camera/focal_plane")
 FIELDS = np.array([(0.0, 0.0), (0.4, 0.0), (0.0, 0.4), (-0.3, 0.3)])
 """Within the part of the field in which nothing but M1's rim and its hole limits the light."""
 SHIFT, TURN = 2e-6, 1e-6

@@ -26,6 +26,7 @@ from scenes.specs import asbuilt as specs
 from scenes.specs.motion_text import node_named
 from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
+from twin.asbuilt.wavefront_files import read_coefficients
 from twin.camera.varied_beams import VariedBeams
 from twin.tolerance.tolerance_bench import ToleranceBench
 
@@ -192,8 +193,6 @@ class WavefrontReadings(MeasuredKind):
 
     def read(self) -> np.ndarray:
         """Coefficients of files."""
-        from twin.asbuilt.wavefront_files import read_coefficients
-
         return np.asarray(read_coefficients(self).ravel())
 
 

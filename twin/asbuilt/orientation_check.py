@@ -164,8 +164,8 @@ def check_report(check: OrientationCheck) -> Report:
     table = Table("readings", "Readings", caption, heads, rows, (None, None, 1, 4, None, None, None))
     facts = (("measurements", ", ".join(check.names)),)
     text = (
-        "Wavefronts of an instrument whose parts may stand to either side of the drawing look alike in several readings. "
-        "A known move of one part that makes coma or astigmatism tells them apart.",
+        "Parts may stand to either side of the drawing, so that wavefronts look alike in several readings. A known "
+        "move of one part that makes coma or astigmatism tells them apart.",
     )
     sections = (Section("How to tell more", text, ()),)
     return Report("Orientation of wavefronts", told, more, facts, table, sections, code=check.code)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,15 +14,32 @@ from analysis.wavefront_maps.orientation import Orientation
 from analysis.wavefront_maps.pupil_fit import fit_map
 from analysis.wavefront_maps.wavefront_map import MapError, WavefrontMap
 from analysis.wavefront_maps.zernike_table import read_zernikes
-
-if TYPE_CHECKING:
-    from twin.asbuilt.measured_kinds import WavefrontReadings
+from scenes.yaml.errors import InputError
+from twin.camera.varied_beams import VariedBeams
 
 TABLES = (".csv", ".tsv")
 """Suffixes of tables of coefficients; all other files are maps."""
 
 
-def stated_orientation(one: WavefrontReadings) -> Orientation:
+class NamesWavefronts(Protocol):
+    """A measurement that names files of wavefronts.
+
+    Attributes:
+        spec: what the test says of it.
+        beams: of its fields.
+    """
+
+    spec: Any
+    beams: VariedBeams
+
+    def file(self, key: str, value: str, what: str) -> Path:
+        """A file that it names at a key. Raises InputError: there is none."""
+
+    def wrong(self, text: str, key: str, allowed: str | None = None, found: str | None = None) -> InputError:
+        """An error at a key of it."""
+
+
+def stated_orientation(one: NamesWavefronts) -> Orientation:
     """How the file of the test says that maps and coefficients lie. Raises InputError: no such orientation."""
     try:
         return Orientation.named(one.spec.orientation, one.spec.sign)
@@ -30,7 +47,7 @@ def stated_orientation(one: WavefrontReadings) -> Orientation:
         raise one.wrong(str(error), "orientation", found=one.spec.orientation) from error
 
 
-def read_coefficients(one: WavefrontReadings, orientation: Orientation | None = None) -> np.ndarray:
+def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = None) -> np.ndarray:
     """Zernike terms of every field, metres rms of the wavefront in single pass, (F, T).
 
     Args:
@@ -56,7 +73,7 @@ def read_coefficients(one: WavefrontReadings, orientation: Orientation | None = 
     return np.asarray(table * (0.5 if spec.double_pass else 1.0))
 
 
-def _of_table(one: WavefrontReadings, key: str, name: str, fields: int) -> np.ndarray:
+def _of_table(one: NamesWavefronts, key: str, name: str, fields: int) -> np.ndarray:
     path = one.file(key, name, "a CSV file of coefficients")
     try:
         found = read_zernikes(path, wavelength=one.beams.wavelength)
@@ -73,7 +90,7 @@ def _of_table(one: WavefrontReadings, key: str, name: str, fields: int) -> np.nd
     return np.asarray(found.coefficients[:, [found.terms.index(j) for j in wanted]])
 
 
-def _of_map(one: WavefrontReadings, number: int, name: str, lies: Orientation) -> np.ndarray:
+def _of_map(one: NamesWavefronts, number: int, name: str, lies: Orientation) -> np.ndarray:
     spec = one.spec
     path = one.file("maps", name, "a file of a wavefront")
     try:
@@ -87,7 +104,7 @@ def _of_map(one: WavefrontReadings, number: int, name: str, lies: Orientation) -
     return np.asarray(fitted.parts[spec.numbers[0] - 1 :])
 
 
-def _less(measured: WavefrontMap, reference: WavefrontMap, one: WavefrontReadings) -> WavefrontMap:
+def _less(measured: WavefrontMap, reference: WavefrontMap, one: NamesWavefronts) -> WavefrontMap:
     """A map without the error of the reference surface."""
     if measured.values.shape != reference.values.shape:
         found = f"{reference.values.shape} points, the maps {measured.values.shape}"

@@ -103,6 +103,14 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "fields": "shares of the half field, along the line (+Y of the focal plane) and along the track (+X)",
             "boresight, roll, principal_distance": "of the line of sight, against the designed camera's",
         },
+        "asbuilt": {
+            "motions": "in the moved body's own nominal axes; turns about its centre, or its origin where it has none",
+            "fields": "shares of the half field, along the line (+Y of the focal plane) and along the track (+X)",
+            "merits": "of the line of sight, against the designed camera's",
+        },
+        "orientation": {
+            "readings": "what has to be done to a map for the stop's axes: x along the line, y along the track",
+        },
         "optics": {
             "fields": "shares of the half field: along the line, positive at the end at +Y of the focal plane (left), "
             "and along the track, positive at its +X",
