@@ -20,8 +20,12 @@ class _Estimate(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments with the subcommand that may have been left out."""
-        named = not args or args[0] in self.commands or args[0].startswith("--help")
-        return list(super().parse_args(ctx, args if named else ["estimate", *args]))
+        return list(super().parse_args(ctx, self.whole(args)))
+
+    def whole(self, args: list[str]) -> list[str]:
+        """Arguments with the subcommand before them, where they begin with none."""
+        named = not args or args[0] in self.commands or args[0] == "--help"
+        return args if named else ["estimate", *args]
 
 
 app = typer.Typer(
