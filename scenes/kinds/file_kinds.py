@@ -9,7 +9,8 @@ from scenes.specs.autocollimators import AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.measured.orbit_data import OrbitDataSpec

@@ -19,7 +19,7 @@ from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
 from scenes.specs.disturbances import CauseSpec, DisturbancesSpec, TimeLawSpec
-from scenes.specs.job import NodeInfo
+from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.units import ANGLE, parse_quantity

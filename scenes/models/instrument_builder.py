@@ -39,7 +39,7 @@ from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec
-from scenes.specs.job import NodeInfo
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import InputError, Issue, unknown
 
 _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light

@@ -14,7 +14,7 @@ from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, SIDES, Channel, InstrumentSpec, prism_of
-from scenes.specs.job import NodeInfo
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import KeyPath
 
 

@@ -10,7 +10,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
-from scenes.specs.job import FigureTerm, PlainPerturbationSpec
+from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
 from scenes.yaml.old_keys import OldKeys

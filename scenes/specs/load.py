@@ -13,7 +13,8 @@ from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
 from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
 from scenes.yaml.input_file import is_file, unusable

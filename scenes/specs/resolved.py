@@ -14,7 +14,8 @@ from scenes.specs.camera import PANCHROMATIC, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, unknown
