@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from scenes.specs.as_built import AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
@@ -33,6 +34,12 @@ FILE_KINDS = (
     FileKind("job", JobSpec, "a job of the monitor", "twin.render"),
     FileKind("measurement", MeasurementSpec, "a measurement of a monitor", "twin.recover"),
     FileKind("instrument", InstrumentSpec, "an instrument", place="a job's `instrument: FILE`"),
+    FileKind(
+        "as_built_instrument",
+        AsBuiltInstrumentSpec,
+        "an instrument as built",
+        place="a job's `instrument: FILE`",
+    ),
     FileKind(
         "camera",
         CameraSpec,

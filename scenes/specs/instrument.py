@@ -14,6 +14,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch
+from scenes.specs.perturbation import AsBuilt
 from scenes.yaml.errors import InputError, KeyPath, Problem, unknown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
@@ -441,6 +442,8 @@ class InstrumentSpec(TitledSpec):
         altitude: of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
         disturbances: what is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of
             one's own.
+        as_built: node -> how it stands and is shaped against all else that the file says, as in a job's `perturb`. What
+            a job perturbs comes on top of it, and changes count from it.
     """
 
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
@@ -451,6 +454,7 @@ class InstrumentSpec(TitledSpec):
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None
+    as_built: AsBuilt | None = None
 
     @model_validator(mode="after")
     def _monitor_is_whole(self) -> InstrumentSpec:
@@ -480,6 +484,11 @@ class InstrumentSpec(TitledSpec):
         """
         site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
         return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
+
+    @property
+    def as_drawn(self) -> InstrumentSpec:
+        """The instrument of the drawing, whatever was built."""
+        return self if self.as_built is None else self.model_copy(update={"as_built": None})
 
     @property
     def autocollimator(self) -> MonitorSpec:

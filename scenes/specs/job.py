@@ -11,6 +11,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
+from scenes.specs.as_built import InstrumentReference
 from scenes.specs.course import (
     CourseSpec,
     read_course,
@@ -28,7 +29,7 @@ from scenes.specs.perturbation import (
 )
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
+from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Seed, Spec, Whole
 from scenes.yaml.units import ANGLE, SCALE
 
 
@@ -198,11 +199,6 @@ def pivot_problem(
     return None
 
 
-def _alone(value: Any) -> Any:
-    """`{camera: my.yaml}` is the camera by itself."""
-    return value["camera"] if isinstance(value, Mapping) and set(value) == {"camera"} else value
-
-
 class JobSpec(Spec):
     """A job.
 
@@ -218,7 +214,7 @@ class JobSpec(Spec):
         analysis: how it is analysed.
     """
 
-    instrument: Annotated[Reference, BeforeValidator(_alone)]
+    instrument: InstrumentReference
     perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.as_built import DESIGN, AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
@@ -16,7 +17,7 @@ from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.error_budget import ErrorBudgetSpec
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
+from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
@@ -73,7 +74,8 @@ def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
 
 
 def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
-    """Read an instrument. The cameras and the detector it names are looked for, not read.
+    """Read an instrument. The cameras and the detector it names are looked for, not read. Of one as built the design
+    is read as well, to which its errors and its paths belong.
 
     Args:
         name_or_path: a name in the library, or a path from the current folder (anything with a slash or ending in
@@ -87,11 +89,37 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
         camera = validate(CameraSpec, text)
         own = path.stem if path.parent == _folder(CAMERAS) else path.name
         return InstrumentSpec.of_camera(camera.name, own).with_source(Source(str(path)))
+    if isinstance(text.data, dict) and DESIGN in text.data:
+        return _as_built(validate(AsBuiltInstrumentSpec, text))
     instrument = validate(InstrumentSpec, text)
     paths_of_cameras(instrument)
     if instrument.monitor is not None:
         path_of_detector(instrument)
     return instrument
+
+
+def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
+    """The instrument that was built to the design of a file."""
+    path = find_named(_folder_of_instrument(spec.design), spec.design, spec, (DESIGN,), (CAMERAS,))
+    data = read_yaml(path).data
+    if isinstance(data, dict) and DESIGN in data:
+        problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
+        allowed = f"the drawing that it names, {its}, and all that departs from it below as_built"
+        raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
+    stated = spec.disturbances
+    if stated is not None and stated != NONE:
+        found = find_named(DISTURBANCES, stated, spec, ("disturbances",))
+        stated = str(found.absolute()) if is_path(stated) else stated
+    return spec.made_of(load_instrument(path), stated)
+
+
+def is_instrument(data: Any) -> bool:
+    """Whether plain data of a file are an instrument's, as drawn or as built."""
+    return isinstance(data, dict) and bool({"cameras", DESIGN} & set(data)) and not _OTHERS & set(data)
+
+
+_OTHERS = {"job", "study", "test", "detector", "camera"}
+"""Keys of a run's config.yaml, and no instrument's."""
 
 
 def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:

@@ -24,7 +24,7 @@ from scenes.specs.course import (
 from scenes.specs.motion_text import meant, node_named, perturbation_in_words
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Name, Spec
+from scenes.yaml.spec import Name, Paths, Spec
 from scenes.yaml.units import LENGTH
 
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
@@ -127,6 +127,26 @@ class NodeInfo:
     def known_pivots(self) -> tuple[str, ...]:
         """Names of its pivots and of the one that every body has."""
         return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
+
+
+BUILT = ("shift", "rotate", "pivot", "figure", "radius", "conic", "index")
+"""Keys of a perturbation that tell how a body was built."""
+
+
+def _standing(value: Mapping[str, PlainPerturbationSpec]) -> Mapping[str, PlainPerturbationSpec]:
+    for path, what in value.items():
+        if what.temperature is not None:
+            problem = "a body as built has no temperature: it stands so at the instrument's own"
+            allowed = f"{names_text(BUILT)}; a temperature below a job's perturb"
+            raise Problem(problem, "temperature", allowed, within=(path, "temperature"))
+        if what.scale:
+            problem = "a body as built has no scale: each of its parts has its own place and shape"
+            raise Problem(problem, "scale", names_text(BUILT), within=(path, "scale"))
+    return value
+
+
+AsBuilt = Annotated[Paths[PlainPerturbationSpec], IN_WORDS, AfterValidator(_standing)]
+"""Node -> how it stands and is shaped against the drawing."""
 
 
 Perturbed = TypeVar("Perturbed", bound=PlainPerturbationSpec)

@@ -144,7 +144,8 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
     """
     text = str(file)
     named = not load.is_path(text) and not Path(text).is_file()
-    if named or ({"mirrors", "cameras"} & set(_keys(file)) and "job" not in _keys(file)):
+    data = None if named else read_yaml(file).data
+    if named or load.is_instrument(data) or (isinstance(data, dict) and "mirrors" in data):
         instrument = load.load_instrument(text if named else Path(text))
         job = JobSpec.model_validate({"instrument": text})
         resolved = _with_instrument(job, instrument)
@@ -153,12 +154,6 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
     if disturbances is None:
         return resolved
     return resolved.model_copy(update={"disturbances": load.load_disturbances(disturbances)})
-
-
-def _keys(file: str | Path) -> tuple[str, ...]:
-    """What a file says something of, at its top."""
-    data = read_yaml(file).data
-    return tuple(data) if isinstance(data, dict) else ()
 
 
 def target_band(camera: CameraSpec) -> str:
@@ -499,7 +494,7 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         return validate(CameraSetup, yaml)
     if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
         return _of_job(resolve(file), text, name)
-    if "cameras" in data and not {"job", "detector", "camera"} & set(data):
+    if load.is_instrument(data):
         return _mounted(load.load_instrument(Path(text)), text, name)
     return _of_run(yaml, name)
 
