@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from optics.geometry.pose import rotation_vector, triple
+from optics.geometry.tree import Motion, State
+from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.models.instrument_model import Instrument
+from scenes.models.monitor_chain import square_facets
 from scenes.specs.perturbation import in_full, perturbation_issues
 from scenes.yaml.errors import InputError
 
@@ -34,3 +38,32 @@ def as_built(drawn: Instrument) -> Instrument:
         raise InputError(*issues)
     state = FrozenMap({path: what.motion() for path, what in named.items()})
     return replace(drawn, assembly=drawn.assembly.standing(state), as_built=state)
+
+
+def squared_facets(instrument: Instrument, backend: Backend) -> State:
+    """How the facets of the central prism have to stand, beyond how they do, for the beams to return to the middle of
+    the area CCDs.
+
+    Those of a drawing do. The facets of an instrument are turned so when its monitor is mounted, after its cameras were
+    aligned: ``compose`` this with ``as_built`` for the file of such an instrument.
+
+    Args:
+        instrument: as built.
+        backend: where to trace.
+
+    Returns:
+        Body path of each facet -> its turn, about its own axes.
+
+    Raises:
+        MisplacedError: a beam misses a mirror or a prism.
+    """
+    tree = instrument.assembly.tree
+    square = square_facets(instrument.assembly, instrument.channels, instrument.cameras, backend).tree
+    return {
+        channel.face_body: Motion(
+            rotate=triple(
+                rotation_vector(tree[channel.face_body].pose.rotation.T @ square[channel.face_body].pose.rotation)
+            )
+        )
+        for channel in instrument.channels
+    }

@@ -157,6 +157,9 @@ def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
         InputError: a file is not there or not valid, or nothing is stated to move.
     """
     start = load_instrument(find_named(INSTRUMENTS, design.instrument, design, ("instrument",)))
+    if start.as_built:
+        problem = f"{start.name} is an instrument as built, and a layout is drawn"
+        raise design.error(problem, ("instrument",), allowed="the drawing that its file names as its design")
     owner: Spec = design
     references = design.disturbances
     if references is None:

@@ -215,3 +215,20 @@ def not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue
     allowed = names_text(sorted(info.allows)) or "nothing"
     why = f": {info.cold}" if action == "temperature" and info.cold else ""
     return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)
+
+
+def in_words(perturb: Mapping[str, PlainPerturbationSpec]) -> str:
+    """Perturbations for people: ``base/gf7/M2 shift (0 um, 0 um, 20 um); ...``."""
+    parts = []
+    for path, what in perturb.items():
+        plain = what.plain()
+        parts.append(f"{path} {', '.join(f'{key} {_short(plain[key])}' for key in what.uses())}")
+    return "; ".join(parts)
+
+
+def _short(value: Any) -> str:
+    """A quantity, or several, as a reader sees them."""
+    if isinstance(value, dict):
+        known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
+        return ", ".join(f"{key} {_short(part)}" for key, part in known.items())
+    return f"({', '.join(map(str, value))})" if isinstance(value, list) else str(value)
