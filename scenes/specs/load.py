@@ -124,7 +124,7 @@ _OTHERS = {"job", "study", "test", "detector", "camera"}
 
 def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
     """Read a disturbances file; arguments and errors as `load_instrument`."""
-    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path)
+    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path).with_tables()
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
@@ -144,7 +144,7 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
             text = "there is no disturbances file that could be changed"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
-    stated = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
+    stated = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
     return stated if asked is None else stated.changed(asked)
 
 
@@ -170,7 +170,7 @@ def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
     stated = {}
     for k, reference in enumerate(references):
         key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
-        stated[reference] = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
+        stated[reference] = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
     sheets = {
         name: load_detector(find_named(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
         for name, one in (design.area_ccds or {}).items()

@@ -8,6 +8,7 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
+from scenes.specs.disturbances import JOINT
 from scenes.specs.perturbation import in_words
 from twin.main_job.monitor_reading import CENTROID_NOTES
 from twin.main_job.render_results import JobRun, RenderRun
@@ -133,6 +134,14 @@ def _stated(run: JobRun) -> Table:
             what.append(f"{len(cause.correlations)} correlations")
         which = f"{len(bodies)}: `{', '.join(cause.bodies)}`"
         rows.append([name.replace("_", " "), which, "; ".join(what), cause.time.text, cause.reason])
+    if (joint := spec.joint) is not None:
+        own = [c for c in motions.components if c.cause == JOINT]
+        for c in own:
+            amount = c.sigma / c.unit_size
+            full.append([JOINT, c.body, c.what, amount, shown_unit(c.unit), joint.time.text, joint.reason])
+        bodies = list(dict.fromkeys(c.body for c in own))
+        which = f"{len(bodies)}: `{', '.join(bodies[:3])}`" + (", ..." if len(bodies) > 3 else "")
+        rows.append([JOINT, which, f"{len(own)} components, one by one", joint.time.text, joint.reason])
     heads = ["cause", "body", "motion", "sigma", "unit", "in time", "reason"]
     return Table(
         "disturbances",
