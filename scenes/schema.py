@@ -24,8 +24,9 @@ from rich.console import Console
 from optics.numerics.backend import BackendUnavailable
 from optics.numerics.llvm import LibraryMissing
 from scenes.kinds.file_kinds import FILE_KINDS
-from scenes.specs.job import ACTIONS, JobSpec, NodeInfo
+from scenes.specs.job import JobSpec
 from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.perturbation import ACTIONS, NodeInfo
 from scenes.specs.resolved import resolve_job
 from scenes.yaml.spec import Spec
 from scenes.yaml.standard_output import to_stdout

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from optics.numerics.backend import load_backend
 from scenes.kinds.file_kinds import read_for
-from scenes.specs.job import ACTIONS
+from scenes.specs.perturbation import ACTIONS
 from scenes.specs.resolved import ResolvedJob, resolve
 from scenes.yaml.standard_output import Terminal, print_json, to_stdout
 from twin.run import cli

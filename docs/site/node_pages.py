@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import twin
 from docs.site.markdown import anchor, code, table
-from scenes.specs.job import NodeInfo
 from scenes.specs.load import INSTRUMENTS, library_names
+from scenes.specs.perturbation import NodeInfo
 
 ACTIONS = ("rotate", "shift", "scale", "figure", "radius", "conic", "index", "temperature")
 """Columns of the tables, as they are written in a job."""

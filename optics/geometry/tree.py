@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -47,6 +47,12 @@ class Body:
     def parent(self) -> str:
         """Path of the parent, empty for a root."""
         return self.path.rpartition("/")[0]
+
+    def moved(self, motion: Motion) -> Body:
+        """The body at rest where a rigid motion takes it."""
+        turn, offset = _affine(motion, self)
+        rotation, translation = self.pose.rotation, self.pose.translation
+        return replace(self, pose=Pose(product(rotation, turn), translation + turned(rotation, offset)))
 
 
 @dataclass(frozen=True)
@@ -164,6 +170,28 @@ class RigidTree:
     def paths(self) -> tuple[str, ...]:
         """All body paths, parents first."""
         return tuple(body.path for body in self.bodies)
+
+    def standing(self, state: State) -> RigidTree:
+        """The tree whose bodies stand by themselves as they do here in a state.
+
+        A state of that tree is one on top of this: ``compose(state, then, bodies)`` places the bodies here where
+        ``then`` places them there.
+
+        Args:
+            state: body path -> rigid motion.
+
+        Raises:
+            KeyError: it names an unknown body or pivot.
+            ValueError: it lets a body grow.
+        """
+        for path, motion in state.items():
+            if path not in self._index:
+                raise KeyError(path)
+            if motion.pivot not in self[path].pivots:
+                raise KeyError(f"{path}: pivot {motion.pivot!r}")
+            if motion.scale or motion.stretch:
+                raise ValueError(f"{path}: a body that has grown is another body, and no other place of it")
+        return RigidTree(tuple(body.moved(state[body.path]) if body.path in state else body for body in self.bodies))
 
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None

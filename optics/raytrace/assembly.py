@@ -145,6 +145,34 @@ class Assembly:
         """A copy in which the element of that name is replaced or added."""
         return replace(self, elements={**self.elements, element.name: element})
 
+    def standing(self, state: State) -> Assembly:
+        """The assembly that is by itself as this one is in a state: poses of bodies, shapes of surfaces and refractive
+        indices of glass bodies.
+
+        States of it come on top, as ``optics.geometry.tree.compose`` has it.
+
+        Args:
+            state: body path -> motion without growth and without gradients of an index.
+
+        Raises:
+            KeyError: it names an unknown body or pivot.
+            ValueError: a motion that no assembly can have by itself, or a figure on a surface that cannot carry it.
+        """
+        for path, motion in state.items():
+            if any(motion.index_gradient):
+                raise ValueError(f"{path}: an assembly has no gradients of refractive indices by itself")
+        return replace(
+            self,
+            tree=self.tree.standing(state),
+            elements={
+                name: replace(element, surface=element.figured(state[element.body]))
+                if element.body in state
+                else element
+                for name, element in self.elements.items()
+            },
+            media={path: index + state[path].index if path in state else index for path, index in self.media.items()},
+        )
+
     def place(
         self, states: Sequence[State] = ({},), step: Sequence[tuple[str, str, int]] | None = None
     ) -> PlacedBodies:

@@ -5,11 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from scenes.specs.as_built import AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorTestSpec
 from scenes.specs.camera import CameraSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.measured.orbit_data import OrbitDataSpec
@@ -33,6 +35,12 @@ FILE_KINDS = (
     FileKind("measurement", MeasurementSpec, "a measurement of a monitor", "twin.recover"),
     FileKind("instrument", InstrumentSpec, "an instrument", place="a job's `instrument: FILE`"),
     FileKind(
+        "as_built_instrument",
+        AsBuiltInstrumentSpec,
+        "an instrument as built",
+        place="a job's `instrument: FILE`",
+    ),
+    FileKind(
         "camera",
         CameraSpec,
         "a camera's prescription",
@@ -40,7 +48,13 @@ FILE_KINDS = (
         "an instrument's `cameras: {NAME: {camera: FILE}}`",
     ),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
-    FileKind("disturbances", DisturbancesSpec, "a list of disturbances", place="a job's `disturbances: FILE`"),
+    FileKind(
+        "disturbances",
+        DisturbancesSpec,
+        "a list of disturbances",
+        place="a job's `disturbances: FILE`",
+        one_of=("causes", "joint"),
+    ),
     FileKind("error_budget", ErrorBudgetSpec, "an error budget", place=_VALIDATED),
     FileKind("principle_experiment", AutocollimatorTestSpec, "a test of two autocollimators", place=_VALIDATED),
     *(

@@ -31,7 +31,7 @@ from optics.waves.imaging import aim_collimated
 from scenes.models.stated_focal_length import TracedFocalLengths, check_focal_length
 from scenes.specs.camera import CameraSpec, MirrorSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
-from scenes.specs.job import NodeInfo, perturbation_issues
+from scenes.specs.perturbation import NodeInfo, perturbation_issues
 from scenes.yaml.errors import InputError
 
 

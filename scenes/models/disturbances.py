@@ -18,14 +18,22 @@ from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.disturbances import CauseSpec, DisturbancesSpec, TimeLawSpec
-from scenes.specs.job import NodeInfo
+from scenes.specs.disturbances import (
+    JOINT,
+    CauseSpec,
+    DisturbancesSpec,
+    JointSpec,
+    TimeLawSpec,
+    component_named,
+)
+from scenes.specs.motion_text import node_named
+from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.units import ANGLE, parse_quantity
 
 AXES = "xyz"
-_INDEFINITE = -1e-9
+INDEFINITE = -1e-9
 """Eigenvalue of a correlation matrix from which on downward it is no rounding."""
 UNITS: Mapping[str, tuple[str, float]] = {
     "shift": ("um", 1e-6),
@@ -42,6 +50,8 @@ UNITS: Mapping[str, tuple[str, float]] = {
 """Kind of component -> the unit in which people read it, and that unit in SI."""
 HEAT = ("temperature", "gradient")
 """Kinds that act through the thermal model."""
+SINGLE = ("scale", "radius", "conic", "index", "temperature")
+"""Kinds of which a body has one component."""
 _NEEDS = {"gradient": "temperature"}
 """What a node must allow, where that is not called as the kind is."""
 
@@ -77,7 +87,7 @@ class Component:
     @property
     def what(self) -> str:
         """Without the body: ``shift z``."""
-        if self.kind in ("scale", "temperature"):
+        if self.kind in SINGLE:
             return self.kind
         return f"{self.kind} {f'Z{self.axis}' if self.kind == 'figure' else AXES[self.axis]}"
 
@@ -169,6 +179,7 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
     Raises:
         InputError: as ``stated_motions``.
     """
+    spec = spec.with_tables()
     where = at or (lambda cause, key, wrong: spec.issue(wrong, ("causes", cause, *key)))
     glass = {solid.path for solid in instrument.solids if solid.transparent}
     components: list[Component] = []
@@ -186,6 +197,12 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
         components += [own[k] for k in moving]
         laws += [cause.time] * len(moving)
         blocks.append(matrix[np.ix_(moving, moving)])
+    if spec.joint is not None:
+        own, matrix, faults = _of_joint(spec, spec.joint, instrument, glass)
+        components += own
+        laws += [spec.joint.time] * len(own)
+        blocks.append(matrix)
+        issues += faults
     if issues:
         raise InputError(*issues)
     return StatedMotions(spec.name, tuple(components), block_diag(*blocks), tuple(laws))
@@ -267,7 +284,10 @@ def _motion(values: Mapping[tuple[str, int], float], pivot: str) -> Motion | Non
         pivot=pivot,
         scale=values.get(("scale", 0), 0.0),
         figure={axis: value for (kind, axis), value in values.items() if kind == "figure"},
+        index=values.get(("index", 0), 0.0),
         index_gradient=three("index_gradient"),
+        radius=values.get(("radius", 0), 0.0),
+        conic=values.get(("conic", 0), 0.0),
     )
 
 
@@ -339,7 +359,7 @@ def _of_cause(
     refused: dict[KeyPath, list[str]] = {}
     for path in bodies:
         info = instrument.nodes[path]
-        pivot = cause.pivot or ("centre" if "centre" in info.pivots else ORIGIN)
+        pivot = cause.pivot or usual_pivot(info)
         if pivot not in (ORIGIN, *info.pivots):
             turned.append(path)
         can = _possible(info, path in glass)
@@ -358,6 +378,51 @@ def _of_cause(
     return components, issues
 
 
+def usual_pivot(info: NodeInfo) -> str:
+    """What a body turns about where a file of disturbances does not say it: its centre if it has one, else its
+    origin.
+    """
+    return "centre" if "centre" in info.pivots else ORIGIN
+
+
+def _of_joint(
+    spec: DisturbancesSpec, joint: JointSpec, instrument: Instrument, glass: set[str]
+) -> tuple[list[Component], np.ndarray, list[Issue]]:
+    """The components that go together and move, their correlations, and what is wrong with them."""
+    components: list[Component] = []
+    issues: list[Issue] = []
+    said: dict[tuple[str, str, int], str] = {}
+    for name, sigma in joint.components.items():
+        node, kind, what, about = component_named(name)
+        axis = noll(what) if kind == "figure" else max(AXES.find(what), 0) if what else 0
+        try:
+            path = node_named(node, instrument.nodes)
+            info = instrument.nodes[path]
+            can = _possible(info, path in glass)
+            if _NEEDS.get(kind, kind) not in can:
+                raise Problem(f"{path} does not allow {kind}", allowed=names_text(sorted(can)) or "nothing")
+            if about and about not in info.known_pivots:
+                raise unknown(f"{path} has no such pivot", about, info.known_pivots)
+            if (path, kind, axis) in said:
+                raise Problem(
+                    "a component is named twice", shown(name), f"once; it is {said[path, kind, axis]} as well"
+                )
+        except Problem as wrong:
+            issues.append(spec.issue(wrong, (JOINT, "components", name)))
+            continue
+        said[path, kind, axis] = name
+        pivot = about or usual_pivot(info)
+        components.append(Component(JOINT, path, kind, axis, pivot, sigma / spec.sigmas))
+    matrix = np.eye(len(joint.components)) if joint.correlation is None else np.array(joint.correlation)
+    if (least := _least(matrix)) < INDEFINITE:
+        text = f"these correlations cannot be: the matrix is not positive definite, an eigenvalue is {least:.3g}"
+        issues.append(spec.issue(Problem(text, allowed="correlations of real quantities"), (JOINT, "correlation")))
+    if issues:
+        return [], np.zeros((0, 0)), issues
+    moving = [k for k, c in enumerate(components) if c.sigma > 0.0]
+    return [components[k] for k in moving], matrix[np.ix_(moving, moving)], []
+
+
 def _some(paths: Sequence[str]) -> str:
     return paths[0] if len(paths) == 1 else f"{paths[0]}, as {len(paths) - 1} more,"
 
@@ -371,8 +436,9 @@ def _sigmas(cause: CauseSpec) -> Iterator[tuple[KeyPath, str, int, float]]:
     for kind in ("shift", "rotate", "index_gradient"):
         for axis, value in enumerate(getattr(cause, kind) or ()):
             yield (kind,), kind, axis, value
-    if cause.scale is not None:
-        yield ("scale",), "scale", 0, cause.scale
+    for kind in ("scale", "radius", "conic"):
+        if (value := getattr(cause, kind)) is not None:
+            yield (kind,), kind, 0, value
     for term, value in (cause.figure or {}).items():
         yield ("figure", term), "figure", noll(term), value
     if cause.temperature is not None:
@@ -394,7 +460,7 @@ def _correlation(
             for j in range(i):
                 if (own[j].kind, own[j].axis) == (one.kind, one.axis):
                     matrix[i, j] = matrix[j, i] = cause.together
-        if _least(matrix) < _INDEFINITE:
+        if _least(matrix) < INDEFINITE:
             count = len({c.body for c in own})
             allowed = f"at least {-1.0 / (count - 1):.4g} between {count} bodies"
             text = "bodies cannot all move against one another so much"
@@ -418,7 +484,7 @@ def _correlation(
                 issues.append(where(name, key, Problem(text, shown(value), "one of them")))
         matrix[np.ix_(at, at)] = np.array(group.table)
     least = _least(matrix)
-    if not issues and least < _INDEFINITE:
+    if not issues and least < INDEFINITE:
         text = (
             "these correlations cannot be, alone or with those before them: the matrix is not positive definite, an "
             f"eigenvalue is {least:.3g}"
@@ -434,7 +500,7 @@ def _first_impossible(cause: CauseSpec, known: Mapping[str, int]) -> int:
     for n, group in enumerate(cause.correlations[:last]):
         at = [known[text] for text in group.between]
         matrix[np.ix_(at, at)] = np.array(group.table)
-        if _least(matrix) < _INDEFINITE:
+        if _least(matrix) < INDEFINITE:
             return n
     return last
 

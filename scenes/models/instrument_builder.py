@@ -21,6 +21,7 @@ from optics.raytrace.assembly import Assembly, Element, Interaction
 from optics.raytrace.reflectors import facet_block
 from optics.raytrace.system import assemble
 from scenes.models import monitor_chain
+from scenes.models.built import as_built
 from scenes.models.camera_model import (
     CameraModel,
     camera_bodies,
@@ -39,7 +40,7 @@ from scenes.models.obstruction import check_beams
 from scenes.specs.baffle import Plate
 from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE, CENTRAL_PRISM, Channel, InstrumentSpec
-from scenes.specs.job import NodeInfo
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import InputError, Issue, unknown
 
 _FLIP = np.diag([-1.0, 1.0, -1.0])  # area CCD in the focal plane: columns along -X, rows along +Y, facing the light
@@ -64,7 +65,8 @@ def build_instrument(
             derivatives of layouts that are at such a limit.
 
     Raises:
-        InputError: prisms or central prism cannot stand as the file says, or the cameras are too different.
+        InputError: prisms or central prism cannot stand as the file says, the cameras are too different, or what was
+            built is not of this instrument.
     """
     try:
         return _build(spec, camera_specs, backend, free_beams, free_bodies)
@@ -148,7 +150,7 @@ def _build(
         assembly = monitor_chain.square_facets(assembly, channels, cameras, backend)
     nodes = _nodes(assembly, cameras, solids)
     lengths = {key: chain.glass for key, chain in chains.items()}
-    instrument = Instrument(
+    drawn = Instrument(
         spec,
         assembly,
         cameras,
@@ -158,12 +160,33 @@ def _build(
         FrozenMap(lengths),
         _baffles(spec, assembly.tree),
     )
-    if free_bodies:
-        check_solids(instrument.assembly, solids)
-        check_clearance(instrument)
-    if free_beams and channels:
-        check_beams(instrument, backend)
+    instrument = as_built(drawn)
+    try:
+        _check_room(instrument, backend, free_beams, free_bodies)
+    except (MisplacedError, InputError) as error:
+        if not instrument.as_built:
+            raise
+        _check_room(drawn, backend, free_beams, free_bodies)
+        raise InputError(_cannot_stand(spec, error)) from error
     return instrument
+
+
+def _check_room(instrument: Instrument, backend: Backend, free_beams: bool, free_bodies: bool) -> None:
+    """Refuse bodies that stand in each other or in beams, as far as that is asked."""
+    if free_bodies:
+        check_solids(instrument.assembly, instrument.solids)
+        check_clearance(instrument)
+    if free_beams and instrument.channels:
+        check_beams(instrument, backend)
+
+
+def _cannot_stand(spec: InstrumentSpec, error: MisplacedError | InputError) -> Issue:
+    """What is wrong with an instrument as built whose drawing could stand."""
+    told = error.issues[0].problem if isinstance(error, InputError) else str(error)
+    first = next(iter((spec.as_built or {}).values()))
+    return first.issue(
+        f"as drawn there is room, and as built {told}", allowed="bodies that stand nearer to the drawing"
+    )
 
 
 def _check_temperature(spec: InstrumentSpec, solids: Sequence[Solid]) -> None:

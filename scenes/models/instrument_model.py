@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from optics.geometry.solid import Solid
-from optics.geometry.tree import PlacedBodies
+from optics.geometry.tree import PlacedBodies, State
+from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import PhysicalError
 from optics.raytrace.assembly import Assembly
 from scenes.models.camera_model import CameraModel
 from scenes.specs.baffle import Plate
 from scenes.specs.instrument import BASE, CENTRAL_KEY, CENTRAL_PRISM, SIDES, Channel, InstrumentSpec, prism_of
-from scenes.specs.job import NodeInfo
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import KeyPath
 
 
@@ -31,6 +32,8 @@ class Instrument:
         solids: the prisms of all channels, camera by camera, and the central prism.
         glass_path: channel key -> prism -> length of the beam inside its glass, one way, metres.
         baffles: black plates that only the path tracer and pictures know.
+        as_built: how it stands and is shaped against the drawing; the assembly has it in it, so that nominal and the
+            state {} are the instrument as built.
     """
 
     spec: InstrumentSpec
@@ -41,6 +44,7 @@ class Instrument:
     solids: tuple[Solid, ...]
     glass_path: Mapping[str, Mapping[str, float]]
     baffles: tuple[Plate, ...] = ()
+    as_built: State = field(default_factory=FrozenMap)
 
     def camera_axes(self, camera: str) -> np.ndarray:
         """Nominal camera X, Y, Z in the base frame as columns, (3, 3)."""

@@ -10,7 +10,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.targets.collimator import Collimator
 from scenes.specs.course import Term, noll
 from scenes.specs.instrument import Frames
-from scenes.specs.job import FigureTerm, PlainPerturbationSpec
+from scenes.specs.perturbation import FigureTerm, PlainPerturbationSpec
 from scenes.specs.turntable import TableAngle, TurntableFiles
 from scenes.yaml.errors import Problem
 from scenes.yaml.old_keys import OldKeys
@@ -43,7 +43,7 @@ class CameraUnderTestSpec(Spec):
     """The camera under test, alone in front of the collimator.
 
     Attributes:
-        camera: prescription, by name or path.
+        camera: prescription, or an instrument as built to one, by name or path.
         as_built: how it departs from the prescription: ``M1``, ``M2`` ... or ``focal_plane`` -> perturbation, as in a
             job; figures of mirrors for the most part.
     """

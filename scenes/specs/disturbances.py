@@ -4,15 +4,19 @@ The estimator `posterior` and the total sigmas of all others rest on this statem
 `disturbances: NAME`, a file of scenes/library/disturbances or of one's own.
 """
 
+import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import Term, moment
+from scenes.specs.motion_text import motion_of
 from scenes.yaml import units
-from scenes.yaml.errors import Problem, names_text, shown, unknown
+from scenes.yaml.csv_table import rows_of
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
 from scenes.yaml.quantity import Quantity, Vector
 from scenes.yaml.spec import Name, Named, Number, Reference, Spec, Text, TitledSpec, short_for
 
@@ -40,6 +44,8 @@ GradientSigma = Annotated[
 ]
 IndexSigma = Annotated[tuple[float, float, float], Vector(_spread(units.PER_LENGTH, "1e-2 1/m"), alike=True)]
 ScaleSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
+RadiusSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
+ConicSigma = Annotated[Number, Field(ge=0.0, le=1.0)]
 FigureSigma = Annotated[float, _spread(units.LENGTH, "100 um")]
 Span = Annotated[float, Quantity(units.MOMENT, above_zero=True, largest="1000000 h")]
 Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
@@ -98,16 +104,31 @@ BodyPatterns = Annotated[
 Reason = Annotated[Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
 TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant"] | TimeLawSpec)]
-MOVES = ("shift", "rotate", "scale", "figure", "temperature", "index_gradient")
+MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature", "index_gradient")
 """Keys of a cause that hold standard deviations."""
+
+
+def _check_matrix(rows: tuple[tuple[float, ...], ...], count: int, within: KeyPath = ()) -> None:
+    """Refuse rows that are no correlation matrix of ``count`` components but for its eigenvalues. Raises Problem."""
+    if len(rows) != count or any(len(row) != count for row in rows):
+        found = f"{len(rows)} rows of {names_text(dict.fromkeys(len(row) for row in rows)) or 'nothing'}"
+        raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=within)
+    for i, row in enumerate(rows):
+        if row[i] != 1.0:
+            problem = "a correlation matrix has ones on its diagonal"
+            raise Problem(problem, f"{row[i]:g}", "1", within=(*within, i, i))
+        for j in range(i):
+            if row[j] != rows[j][i]:
+                found = f"{row[j]:g} and {rows[j][i]:g}"
+                raise Problem("a correlation matrix is symmetric", found, "equal", within=(*within, i, j))
 
 
 class CorrelationSpec(Spec):
     """Components of one cause that move together.
 
     Attributes:
-        between: their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE
-            temperature`, `NODE gradient x`, `NODE index_gradient x`.
+        between: their names: `base/forward/M1 shift z`, `NODE rotate x`, `NODE scale`, `NODE figure Z5`, `NODE radius`,
+            `NODE conic`, `NODE temperature`, `NODE gradient x`, `NODE index_gradient x`.
         correlation: of any two of them.
         matrix: their correlation matrix, in place of one number.
     """
@@ -122,20 +143,8 @@ class CorrelationSpec(Spec):
             raise Problem("how much do they move together?", "correlation and matrix", "one of correlation and matrix")
         if len(set(self.between)) != len(self.between):
             raise Problem("a component is named twice", ", ".join(self.between), "each once", within=("between",))
-        rows, count = self.matrix, len(self.between)
-        if rows is None:
-            return self
-        if len(rows) != count or any(len(row) != count for row in rows):
-            found = f"{len(rows)} rows of {', '.join(str(len(row)) for row in rows)}"
-            raise Problem("not a matrix of this size", found, f"{count} rows of {count} numbers", within=("matrix",))
-        for i, row in enumerate(rows):
-            if row[i] != 1.0:
-                problem = "a correlation matrix has ones on its diagonal"
-                raise Problem(problem, f"{row[i]:g}", "1", within=("matrix", i, i))
-            for j in range(i):
-                if row[j] != rows[j][i]:
-                    found = f"{row[j]:g} and {rows[j][i]:g}"
-                    raise Problem("a correlation matrix is symmetric", found, "equal", within=("matrix", i, j))
+        if self.matrix is not None:
+            _check_matrix(self.matrix, len(self.between), ("matrix",))
         return self
 
     @property
@@ -148,6 +157,184 @@ class CorrelationSpec(Spec):
         return tuple(tuple(1.0 if i == j else value for j in range(count)) for i in range(count))
 
 
+JOINT = "joint"
+"""Key of components that go together, and what their cause is called."""
+MOST_JOINT = 200
+"""Components that go together: a config.yaml holds the matrix of their correlations."""
+MOST_JOINT_BYTES = 4 << 20
+"""Of a table of their correlations."""
+_AXES = ("x", "y", "z")
+
+
+def component_named(text: str) -> tuple[str, str, str, str]:
+    """The parts of a component's name: node, kind, axis or term, and pivot; parts that are not there are empty.
+
+    Args:
+        text: ``NODE KIND [AXIS] [about PIVOT]``, as the names of ``CorrelationSpec``.
+
+    Raises:
+        Problem: it is not of this form.
+    """
+    words = text.split()
+    if len(words) > 1 and words[1] == "index_gradient":  # no perturbation of a job
+        if len(words) != 3 or words[2] not in _AXES:
+            raise Problem("not a component", shown(text), "NODE index_gradient x, y or z")
+        return words[0], words[1], words[2], ""
+    node, kind, axis, amount, pivot = motion_of(text)
+    if amount:
+        raise Problem("a component has no amount in its name", shown(amount), shown(text.partition(f" {amount}")[0]))
+    return node, kind, axis, pivot
+
+
+_SPREADS: Mapping[str, Quantity] = {
+    "shift": _spread(units.LENGTH, "10 mm"),
+    "rotate": _spread(units.ANGLE, "1 deg"),
+    "scale": _spread(units.SCALE, "1 percent"),
+    "radius": _spread(units.SCALE, "1 percent"),
+    "figure": _spread(units.LENGTH, "100 um"),
+    "temperature": _spread(units.TEMPERATURE_DIFFERENCE, "100 K"),
+    "gradient": _spread(units.TEMPERATURE_GRADIENT, "1000 K/m"),
+    "index_gradient": _spread(units.PER_LENGTH, "1e-2 1/m"),
+}
+"""Kind of component -> its standard deviation."""
+_PURE: Mapping[str, float] = {"conic": 1.0, "index": 0.1}
+"""Kind that is a pure number -> its largest standard deviation."""
+
+
+def _sigma_of(name: str, value: Any) -> float:
+    """A standard deviation of a component, SI. Raises Problem."""
+    kind = component_named(name)[1]
+    if kind not in _PURE:
+        return _SPREADS[kind].parse(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= _PURE[kind]:
+        allowed = f"a plain number from 0 to {_PURE[kind]:g}"
+        raise Problem(f"not a standard deviation of a change of the {kind}", shown(value), allowed)
+    return float(value)
+
+
+def _components(value: Any) -> Any:
+    if not isinstance(value, Mapping) or not value:
+        raise Problem("no components", shown(value), '{"base/forward/M2 shift z": 3 um, ...}')
+    if len(value) > MOST_JOINT:
+        raise Problem("too many components", f"{len(value)} of them", f"at most {MOST_JOINT}, those that matter most")
+    out: dict[str, float] = {}
+    said: dict[tuple[str, str, str], str] = {}
+    for name, sigma in value.items():
+        try:
+            out[name] = _sigma_of(str(name), sigma)
+            parts = component_named(name)[:3]
+            if parts in said:
+                raise Problem("a component is named twice", shown(name), f"once; it is {said[parts]} as well")
+            said[parts] = name
+        except Problem as wrong:
+            raise wrong.below(name) from None
+    return out
+
+
+def written_sigma(name: str, sigma: float) -> str | float:
+    """A standard deviation of a component, SI, as a file has it.
+
+    Args:
+        name: of the component.
+        sigma: its standard deviation.
+    """
+    kind = component_named(name)[1]
+    return sigma if kind in _PURE else _SPREADS[kind].format(sigma)
+
+
+def _written(value: Mapping[str, float]) -> dict[str, str | float]:
+    return {name: written_sigma(name, sigma) for name, sigma in value.items()}
+
+
+JointSigmas = Annotated[
+    dict[str, float],
+    BeforeValidator(_components, json_schema_input_type=dict[str, str | float]),
+    AfterValidator(FrozenMap),
+    PlainSerializer(_written, when_used="json"),
+]
+
+
+class JointSpec(Spec):
+    """Components of bodies that go together, with a standard deviation each and one matrix of correlations: for example
+    what an estimate of an instrument's state leaves unknown.
+
+    Attributes:
+        components: name -> standard deviation with its unit, a plain number for `conic` and `index`. Names are those of
+            `correlations`, also `NODE index`; after a shift, a turn or a scale, `about PIVOT` names another pivot than
+            the body's centre, or its origin where it has none.
+        correlation: their correlation matrix, rows in the order of the components; independent without it.
+        correlation_file: a CSV file with the matrix in its place, and the names of the components as heads.
+        time: how they go on in a series of measurements.
+        reason: where the numbers come from.
+    """
+
+    components: JointSigmas
+    correlation: tuple[tuple[Correlation, ...], ...] | None = None
+    correlation_file: Reference | None = None
+    time: TimeLaw = TimeLawSpec(kind="constant")
+    reason: Reason
+
+    @model_validator(mode="after")
+    def _is_a_matrix(self) -> "JointSpec":
+        if self.correlation is not None and self.correlation_file is not None:
+            raise Problem("two matrices of correlations", "correlation and correlation_file", "one of them")
+        if self.correlation is not None:
+            _check_matrix(self.correlation, len(self.components), ("correlation",))
+        return self
+
+    def with_table(self) -> "JointSpec":
+        """The same with the matrix of its file in it.
+
+        Raises:
+            InputError: the file cannot be read, or is no correlation matrix of these components.
+        """
+        assert self.correlation_file is not None
+        key = ("correlation_file",)
+        path = self.file_at(key, self.correlation_file, Path(self.source.file).parent, "a CSV file")
+        rows = rows_of(path, MOST_JOINT_BYTES)
+        names = tuple(self.components)
+        heads = tuple(cell.strip() for cell in rows[0][1]) if rows else ()
+        line = rows[0][0] if rows else None
+        if sorted(heads) != sorted(names):
+            strange = [head for head in heads if head not in names]
+            missing = [name for name in names if name not in heads]
+            found = f"{names_text(strange[:3])} among the heads" if strange else f"no column {names_text(missing[:3])}"
+            found = found if strange or missing else "a column that stands twice"
+            problem = f"not the components of {self.source.file or 'the file of disturbances'}"
+            raise InputError(Issue(problem, str(path), line, (), found, f"their {len(names)} names, each once"))
+        order = [heads.index(name) for name in names]
+        table = [self._row(path, *row, len(names)) for row in rows[1:]]
+        if len(table) != len(names):
+            problem, found = "not a matrix of this size", f"{len(table)} rows"
+            raise InputError(Issue(problem, str(path), None, (), found, f"a row for each of the {len(names)} heads"))
+        matrix = tuple(tuple(table[i][j] for j in order) for i in order)
+        try:
+            _check_matrix(matrix, len(names))
+        except Problem as wrong:
+            row, column = (int(k) for k in wrong.within)
+            where = f"{names[row]}, {names[column]}"
+            at = rows[1 + order[row]][0]
+            raise InputError(Issue(wrong.problem, str(path), at, (where,), wrong.found, wrong.allowed)) from None
+        return self.model_copy(update={"correlation": matrix, "correlation_file": None})
+
+    @staticmethod
+    def _row(path: Path, line: int, cells: list[str], count: int) -> list[float]:
+        """A row of correlations. Raises InputError."""
+        allowed = f"{count} numbers from -1 to 1"
+        if len(cells) != count:
+            raise InputError(Issue("not a row of this table", str(path), line, (), f"{len(cells)} cells", allowed))
+        out = []
+        for cell in cells:
+            try:
+                value = float(cell)
+            except ValueError:
+                value = math.nan
+            if not -1.0 <= value <= 1.0:
+                raise InputError(Issue("not a correlation", str(path), line, (), shown(cell), allowed))
+            out.append(value)
+        return out
+
+
 class _CauseWords(Spec):
     """What may be said of a cause."""
 
@@ -156,6 +343,8 @@ class _CauseWords(Spec):
     rotate: Annotated[RotateSigma | None, STATED] = None
     scale: Annotated[ScaleSigma | None, STATED] = None
     figure: Annotated[FigureSigmas | None, STATED] = None
+    radius: Annotated[RadiusSigma | None, STATED] = None
+    conic: Annotated[ConicSigma | None, STATED] = None
     temperature: Annotated[TemperatureSigmaSpec | None, STATED] = None
     index_gradient: Annotated[IndexSigma | None, STATED] = None
     pivot: Annotated[Name | None, STATED] = None
@@ -176,6 +365,8 @@ class CauseSpec(_CauseWords):
         rotate: about the pivot, radians.
         scale: relative growth of a camera and all in it.
         figure: Zernike term (Noll) -> of the surface error, metres.
+        radius: relative, of the vertex radius of curvature of a mirror or face.
+        conic: of its conic constant, a pure number.
         temperature: of the bodies' temperature fields.
         index_gradient: of the refractive index in a prism, 1/m, other than by heat.
         pivot: of turns and growth; by default the body's centre if it has one, else its origin.
@@ -202,7 +393,7 @@ class CauseChangeSpec(_CauseWords):
     have needs all that a cause needs.
 
     Attributes:
-        bodies, shift, rotate, scale, figure, temperature, index_gradient: as of a cause.
+        bodies, shift, rotate, scale, figure, radius, conic, temperature, index_gradient: as of a cause.
         pivot, together, correlations, time, reason: as of a cause.
     """
 
@@ -232,10 +423,28 @@ class DisturbancesSpec(TitledSpec):
         description: for people.
         sigmas: how many standard deviations every number of the file is; 3 for a list of 3-sigma values.
         causes: by name.
+        joint: components of bodies, each by its name, that go together as an estimate of them does; besides the causes,
+            or in their place.
     """
 
     sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
-    causes: Annotated[Named[CauseSpec], Field(min_length=1)]
+    causes: Named[CauseSpec] = Field(default_factory=FrozenMap)
+    joint: JointSpec | None = None
+
+    @model_validator(mode="after")
+    def _states_something(self) -> "DisturbancesSpec":
+        if not self.causes and self.joint is None:
+            raise Problem("nothing is stated to move", "no cause", "causes: at least one; or joint", within=("causes",))
+        if self.joint is not None and JOINT in self.causes:
+            text = "the components of the file's own `joint` are called so"
+            raise Problem(text, JOINT, "another name of the cause", within=("causes", JOINT))
+        return self
+
+    def with_tables(self) -> "DisturbancesSpec":
+        """The statement with the correlations of the file that its `joint` names. Raises InputError: it is none."""
+        if self.joint is None or self.joint.correlation_file is None:
+            return self
+        return self.model_copy(update={"joint": self.joint.with_table()})
 
     def changed(self, changes: "JobDisturbancesSpec") -> "DisturbancesSpec":
         """Return the statement with a job's changes made.
@@ -249,6 +458,9 @@ class DisturbancesSpec(TitledSpec):
                 raise changes.error(unknown(f"no such cause in {self.name}", name, self.causes), ("without", k))
             del causes[name]
         for name, change in changes.causes.items():
+            if name == JOINT and self.joint is not None:
+                text = "the components of the file's `joint` stand one by one, and not by causes"
+                raise changes.error(text, ("causes", name), allowed="another file of disturbances")
             if name in causes:
                 causes[name] = change.made_to(causes[name])
                 continue
@@ -260,7 +472,7 @@ class DisturbancesSpec(TitledSpec):
                 raise changes.error(wrong, ("causes", name))
             # of checked parts: to validate them again would ask for quantities as text
             causes[name] = CauseSpec.model_construct(**change.given)
-        if not causes:
+        if not causes and self.joint is None:
             raise changes.error("no cause is left", ("without",), allowed="`disturbances: none` for none at all")
         return self.model_copy(update={"causes": FrozenMap(causes)})
 

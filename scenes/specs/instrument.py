@@ -14,6 +14,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.reflectors import REFLECTORS, Reflector
 from scenes.specs.baffle import BaffleSpec
 from scenes.specs.detector import AreaSide, PixelPitch
+from scenes.specs.perturbation import AsBuilt
 from scenes.yaml.errors import InputError, KeyPath, Problem, unknown
 from scenes.yaml.quantity import PositiveLength, Quantity, Vector, Vector2, Vector3, Wavelength
 from scenes.yaml.spec import (
@@ -25,7 +26,6 @@ from scenes.yaml.spec import (
     OneOf,
     Reference,
     Spec,
-    Text,
     TitledSpec,
     Whole,
     name_in,
@@ -442,6 +442,8 @@ class InstrumentSpec(TitledSpec):
         altitude: of its orbit, metres; for what changes of a pair's cameras do to points on the ground.
         disturbances: what is expected to move, unless a job says otherwise: a file of scenes/library/disturbances or of
             one's own.
+        as_built: node -> how it stands and is shaped against all else that the file says, as in a job's `perturb`. What
+            a job perturbs comes on top of it, and changes count from it.
     """
 
     cameras: Annotated[Named[MountedCameraSpec], Field(min_length=1)]
@@ -452,6 +454,7 @@ class InstrumentSpec(TitledSpec):
     baffles: Annotated[Named[BaffleSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     altitude: Annotated[float, Quantity(DISTANCE, smallest="100 km", largest="50000 km")] | None = None
     disturbances: Reference | None = None
+    as_built: AsBuilt | None = None
 
     @model_validator(mode="after")
     def _monitor_is_whole(self) -> InstrumentSpec:
@@ -481,6 +484,11 @@ class InstrumentSpec(TitledSpec):
         """
         site = MountedCameraSpec.model_construct(camera=camera, look=0.0, position=(0.0, 0.0, 0.0))
         return cls.model_construct(name=name, cameras=FrozenMap({name: site}))
+
+    @property
+    def as_drawn(self) -> InstrumentSpec:
+        """The instrument of the drawing, whatever was built."""
+        return self if self.as_built is None else self.model_copy(update={"as_built": None})
 
     @property
     def autocollimator(self) -> MonitorSpec:
@@ -557,44 +565,3 @@ class InstrumentSpec(TitledSpec):
             )
             for name, one in given.items()
         }
-
-
-AngleErrors = Annotated[
-    dict[Name, Annotated[dict[Name, Tilt], AfterValidator(FrozenMap)]], NothingIsEmpty, AfterValidator(FrozenMap)
-]
-
-
-class ErrorBudgetSpec(Spec):
-    """An error budget.
-
-    Attributes:
-        description: for people.
-        instrument: which, by name or path.
-        photons_per_frame: light of one spot in one frame; weak, as noise of the centroid is a line.
-        frames: averaged in one measurement.
-        trials: number of random states for each line.
-        all_together: number of random states with all causes at once.
-        angle_errors: prism (prism_180 or prism_0) -> face -> tilt about its x and y, as made.
-        disturbances: what changes, and by how much: a file of scenes/library/disturbances or of one's own. Each of its
-            causes is a line.
-    """
-
-    description: Text = ""
-    instrument: Reference
-    photons_per_frame: Annotated[Number, Field(gt=0.0, le=1e12)]
-    frames: Frames = 9
-    trials: Annotated[Whole, Field(ge=20, le=100_000)] = 100
-    all_together: Annotated[Whole, Field(ge=20, le=100_000)] = 300
-    angle_errors: AngleErrors
-    disturbances: Reference
-
-    def applied_to(self, instrument: InstrumentSpec) -> InstrumentSpec:
-        """The instrument with this budget's angle errors and light."""
-        monitor = instrument.autocollimator
-        changed = {
-            prism: getattr(monitor, prism).model_copy(update={"angle_errors": errors})
-            for prism, errors in self.angle_errors.items()
-        }
-        reticle = monitor.reticle.model_copy(update={"photons_per_frame": self.photons_per_frame})
-        copied = monitor.model_copy(update={**changed, "reticle": reticle})
-        return instrument.model_copy(update={"monitor": copied})

@@ -1,39 +1,36 @@
 """A job: which instrument, what is perturbed, what changes with time, what is rendered and how."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from optics.geometry.tree import Motion
 from optics.numerics.frozen_map import FrozenMap
 from optics.targets.target_shapes import TARGETS
 from optics.thermal.heat import Temperature
 from scenes.specs import job_tables
+from scenes.specs.as_built import InstrumentReference
 from scenes.specs.course import (
-    DEFAULT_PIVOT,
-    NO_MOTION,
-    ConicChange,
     CourseSpec,
-    IndexChange,
-    RadiusChange,
-    Rotation,
-    ScaleChange,
-    Shift,
-    Term,
-    noll,
     read_course,
 )
 from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.instrument import Frames
-from scenes.specs.motion_text import meant, node_named, perturbation_in_words
-from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, shown, unknown
+from scenes.specs.perturbation import (
+    IN_WORDS,
+    NodeInfo,
+    PlainPerturbationSpec,
+    in_full,
+    no_such_node,
+    not_allowed,
+    perturbation_issues,
+)
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, shown
 from scenes.yaml.quantity import Quantity
-from scenes.yaml.spec import Flag, Name, NothingIsEmpty, OneOf, Paths, Reference, Seed, Spec, Whole
-from scenes.yaml.units import ANGLE, LENGTH, SCALE
+from scenes.yaml.spec import Flag, NothingIsEmpty, OneOf, Paths, Seed, Spec, Whole
+from scenes.yaml.units import ANGLE, SCALE
 
 
 def target_names() -> tuple[str, ...]:
@@ -60,78 +57,6 @@ class TargetsSpec(Spec):
     region: Annotated[Whole, Field(ge=112, le=512)] = 112
     white: White = 0.6
     frames: Frames | None = None
-
-
-FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
-
-ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "temperature")
-"""What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
-
-
-class PlainPerturbationSpec(Spec):
-    """What happens to one body of the instrument: a small rigid motion, a scale change, a change of temperature, for a
-    mirror or a face an error of its figure, radius or conic constant, and for a lens of its index.
-
-    Attributes:
-        rotate: rotation vector in the body's own frame, about the pivot, radians; it comes before the shift.
-        shift: in the body's own frame, metres.
-        pivot: name of the body's point that the rotation leaves in place and that the scale change starts from.
-        figure: Zernike terms of the surface error, by Noll's numbering and normalisation, metres.
-        scale: relative growth of the body and all it carries, 1e-6 for 1 ppm.
-        radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
-        conic: change of the conic constant, a pure number.
-        index: change of the refractive index of the lens that begins at this face, a pure number.
-        temperature: uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that
-            carries it, also where the change is `0 K`; None for what it inherits.
-    """
-
-    rotate: Rotation = NO_MOTION
-    shift: Shift = NO_MOTION
-    pivot: Name = DEFAULT_PIVOT
-    figure: Annotated[dict[Term, FigureTerm], AfterValidator(FrozenMap)] = Field(default_factory=FrozenMap)
-    scale: ScaleChange = 0.0
-    radius: RadiusChange | None = None
-    conic: ConicChange | None = None
-    index: IndexChange | None = None
-    temperature: job_tables.PlainTemperature | None = None
-
-    @property
-    def heat(self) -> job_tables.TemperatureSpec:
-        """Its own temperature; no change where none is given."""
-        return job_tables.TemperatureSpec() if self.temperature is None else self.temperature
-
-    def uses(self) -> tuple[str, ...]:
-        """Which of ACTIONS do something; a temperature that is given does, since no change is another one than that of
-        a warmed carrier.
-        """
-        done = {
-            "rotate": any(self.rotate),
-            "shift": any(self.shift),
-            "figure": any(self.figure.values()),
-            **{name: bool(getattr(self, name)) for name in ("scale", "radius", "conic", "index")},
-            "temperature": self.temperature is not None,
-        }
-        return tuple(name for name, does in done.items() if does)
-
-    def needs(self) -> tuple[str, ...]:
-        """Which of these a node has to allow: all but a temperature that is no change, which a node without heat may
-        have as well.
-        """
-        return tuple(name for name in self.uses() if name != "temperature" or self.heat.warms)
-
-    def motion(self) -> Motion:
-        """All of it but the temperature, as a state has it."""
-        figure = {noll(term): value for term, value in self.figure.items()}
-        return Motion(
-            self.rotate,
-            self.shift,
-            self.pivot,
-            self.scale,
-            figure,
-            index=self.index or 0.0,
-            radius=self.radius or 0.0,
-            conic=self.conic or 0.0,
-        )
 
 
 class PerturbationSpec(PlainPerturbationSpec):
@@ -274,17 +199,6 @@ def pivot_problem(
     return None
 
 
-def _alone(value: Any) -> Any:
-    """`{camera: my.yaml}` is the camera by itself."""
-    return value["camera"] if isinstance(value, Mapping) and set(value) == {"camera"} else value
-
-
-def _in_words(value: Any) -> Any:
-    """`[M2 shift z 20 um]` is what it says of each node."""
-    words = isinstance(value, list | tuple) and all(isinstance(text, str) for text in value)
-    return perturbation_in_words(value) if words else value
-
-
 class JobSpec(Spec):
     """A job.
 
@@ -300,8 +214,8 @@ class JobSpec(Spec):
         analysis: how it is analysed.
     """
 
-    instrument: Annotated[Reference, BeforeValidator(_alone)]
-    perturb: Annotated[Paths[PerturbationSpec], BeforeValidator(_in_words)] = Field(default_factory=FrozenMap)
+    instrument: InstrumentReference
+    perturb: Annotated[Paths[PerturbationSpec], IN_WORDS] = Field(default_factory=FrozenMap)
     course: CourseSpec | None = None
     disturbances: JobDisturbances | None = None
     render: Annotated[RenderSpec, NothingIsEmpty] = RenderSpec()
@@ -373,26 +287,6 @@ def with_tables(job: JobSpec) -> JobSpec:
     return job.model_copy(update=whole) if whole else job
 
 
-@dataclass(frozen=True)
-class NodeInfo:
-    """What may be done to a body of the instrument.
-
-    Attributes:
-        pivots: names of its pivots.
-        allows: which of ACTIONS.
-        cold: why it has no temperature, where that is not plain.
-    """
-
-    pivots: tuple[str, ...] = (DEFAULT_PIVOT,)
-    allows: frozenset[str] = frozenset({"rotate", "shift", "temperature"})
-    cold: str = ""
-
-    @property
-    def known_pivots(self) -> tuple[str, ...]:
-        """Names of its pivots and of the one that every body has."""
-        return tuple(dict.fromkeys((*self.pivots, DEFAULT_PIVOT)))
-
-
 def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     """Check that every perturbed node exists, has the named pivot and allows what is done to it.
 
@@ -406,7 +300,9 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     Raises:
         InputError: one issue for each fault, with the nearest valid name.
     """
-    job = _full_names(job, nodes)
+    perturb = in_full(job.perturb, nodes, lambda problem, name: job.issue(problem, ("perturb", name)))
+    if perturb != job.perturb:
+        job = job.model_copy(update={"perturb": perturb})
     issues = [
         issue
         for path, what in job.perturb.items()
@@ -419,38 +315,14 @@ def checked_nodes(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
     return job
 
 
-def _full_names(job: JobSpec, nodes: Mapping[str, NodeInfo]) -> JobSpec:
-    """The job with the paths of all nodes that it perturbs; names of no node stay as they are.
-
-    Raises:
-        InputError: a name of several nodes, or two names of one.
-    """
-    issues: list[Issue] = []
-    named: dict[str, str] = {}
-    for name in job.perturb:
-        try:
-            path = node_named(name, nodes) if meant(name, nodes) else name
-            if path in named.values():
-                raise Problem("this node is perturbed twice", shown(name), f"{path} once, under one name")
-            named[name] = path
-        except Problem as problem:
-            issues.append(job.issue(problem, ("perturb", name)))
-    if issues:
-        raise InputError(*issues)
-    if all(name == path for name, path in named.items()):
-        return job
-    perturb = FrozenMap({named[name]: what for name, what in job.perturb.items()})
-    return job.model_copy(update={"perturb": perturb})
-
-
 def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Issue]:
     issues = []
     for path in course.temperature:
         key: KeyPath = ("temperature", path)
         if path not in nodes:
-            issues.append(_no_such_node(course, nodes, path, key))
+            issues.append(no_such_node(course, nodes, path, key))
         elif "temperature" not in nodes[path].allows:
-            issues.append(_not_allowed(course, nodes[path], "temperature", key))
+            issues.append(not_allowed(course, nodes[path], "temperature", key))
     for path, moves in course.motion.items():
         # what is given at any time counts, also where it is zero
         does: dict[str, Any] = {
@@ -459,38 +331,3 @@ def _course_issues(course: CourseSpec, nodes: Mapping[str, NodeInfo]) -> list[Is
         whole = PerturbationSpec.model_construct(**does, pivot=moves.pivot)
         issues += perturbation_issues(course, nodes, path, whole, ("motion", path))
     return issues
-
-
-def perturbation_issues(
-    owner: Spec, nodes: Mapping[str, NodeInfo], path: str, what: PlainPerturbationSpec, key: KeyPath
-) -> list[Issue]:
-    """What is wrong with a perturbation of the node ``path`` that stands at ``key`` of a specification.
-
-    Args:
-        owner: the specification.
-        nodes: node path -> what may be done to it.
-        path: of the node.
-        what: is done to it.
-        key: where it is written.
-    """
-    if path not in nodes:
-        return [_no_such_node(owner, nodes, path, key)]
-    info, issues = nodes[path], []
-    for action in what.needs():
-        # nodes are displaced where a surface has a figure
-        if ("figure" if action == "deformation" else action) not in info.allows:
-            issues.append(_not_allowed(owner, info, action, (*key, action)))
-    if what.pivot not in info.known_pivots:
-        wrong = unknown("this node has no such pivot", what.pivot, info.known_pivots)
-        issues.append(owner.issue(wrong, (*key, "pivot")))
-    return issues
-
-
-def _no_such_node(owner: Spec, nodes: Mapping[str, NodeInfo], path: str, key: KeyPath) -> Issue:
-    return owner.issue(unknown("no such node", path, sorted(nodes)), key)
-
-
-def _not_allowed(owner: Spec, info: NodeInfo, action: str, key: KeyPath) -> Issue:
-    allowed = names_text(sorted(info.allows)) or "nothing"
-    why = f": {info.cold}" if action == "temperature" and info.cold else ""
-    return owner.issue(f"this node does not allow {action}{why}", key, allowed=allowed)

@@ -8,19 +8,22 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.as_built import DESIGN, AsBuiltInstrumentSpec
 from scenes.specs.autocollimators import AutocollimatorSetup, AutocollimatorTestSpec
 from scenes.specs.camera import CameraDesignSpec, CameraSpec, MonitorDesignSpec
 from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import BASE, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, unknown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
+TestType = TypeVar("TestType", bound=CameraUnderTestSpec)
 
 SCENES = Path(__file__).resolve().parent.parent
 LIBRARY = SCENES / "library"
@@ -72,7 +75,8 @@ def load_error_budget(name_or_path: str | Path) -> ErrorBudgetSpec:
 
 
 def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
-    """Read an instrument. The cameras and the detector it names are looked for, not read.
+    """Read an instrument. The cameras and the detector it names are looked for, not read. Of one as built the design
+    is read as well, to which its errors and its paths belong.
 
     Args:
         name_or_path: a name in the library, or a path from the current folder (anything with a slash or ending in
@@ -86,6 +90,8 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
         camera = validate(CameraSpec, text)
         own = path.stem if path.parent == _folder(CAMERAS) else path.name
         return InstrumentSpec.of_camera(camera.name, own).with_source(Source(str(path)))
+    if isinstance(text.data, dict) and DESIGN in text.data:
+        return _as_built(validate(AsBuiltInstrumentSpec, text))
     instrument = validate(InstrumentSpec, text)
     paths_of_cameras(instrument)
     if instrument.monitor is not None:
@@ -93,9 +99,33 @@ def load_instrument(name_or_path: str | Path) -> InstrumentSpec:
     return instrument
 
 
+def _as_built(spec: AsBuiltInstrumentSpec) -> InstrumentSpec:
+    """The instrument that was built to the design of a file."""
+    path = find_named(_folder_of_instrument(spec.design), spec.design, spec, (DESIGN,), (CAMERAS,))
+    data = read_yaml(path).data
+    if isinstance(data, dict) and DESIGN in data:
+        problem, its = "this design is itself an instrument as built", shown(data[DESIGN])
+        allowed = f"the drawing that it names, {its}, and all that departs from it below as_built"
+        raise spec.error(problem, (DESIGN,), found=spec.design, allowed=allowed)
+    stated = spec.disturbances
+    if stated is not None and stated != NONE:
+        found = find_named(DISTURBANCES, stated, spec, ("disturbances",))
+        stated = str(found.absolute()) if is_path(stated) else stated
+    return spec.made_of(load_instrument(path), stated)
+
+
+def is_instrument(data: Any) -> bool:
+    """Whether plain data of a file are an instrument's, as drawn or as built."""
+    return isinstance(data, dict) and bool({"cameras", DESIGN} & set(data)) and not _OTHERS & set(data)
+
+
+_OTHERS = {"job", "study", "test", "detector", "camera"}
+"""Keys of a run's config.yaml, and no instrument's."""
+
+
 def load_disturbances(name_or_path: str | Path) -> DisturbancesSpec:
     """Read a disturbances file; arguments and errors as `load_instrument`."""
-    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path)
+    return load_named(DisturbancesSpec, DISTURBANCES, name_or_path).with_tables()
 
 
 def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesSpec | None:
@@ -115,7 +145,7 @@ def find_disturbances(job: JobSpec, instrument: InstrumentSpec) -> DisturbancesS
             text = "there is no disturbances file that could be changed"
             raise job.error(text, ("disturbances",), allowed="the name of one as file")
         return None
-    stated = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
+    stated = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
     return stated if asked is None else stated.changed(asked)
 
 
@@ -128,6 +158,9 @@ def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
         InputError: a file is not there or not valid, or nothing is stated to move.
     """
     start = load_instrument(find_named(INSTRUMENTS, design.instrument, design, ("instrument",)))
+    if start.as_built:
+        problem = f"{start.name} is an instrument as built, and a layout is drawn"
+        raise design.error(problem, ("instrument",), allowed="the drawing that its file names as its design")
     owner: Spec = design
     references = design.disturbances
     if references is None:
@@ -138,7 +171,7 @@ def read_design(design: MonitorDesignSpec) -> dict[str, Any]:
     stated = {}
     for k, reference in enumerate(references):
         key: KeyPath = ("disturbances", k) if owner is design else ("disturbances",)
-        stated[reference] = validate(DisturbancesSpec, read_yaml(find_named(DISTURBANCES, reference, owner, key)))
+        stated[reference] = load_disturbances(find_named(DISTURBANCES, reference, owner, key))
     sheets = {
         name: load_detector(find_named(DETECTORS, one.detector, design, ("area_ccds", name, "detector")))
         for name, one in (design.area_ccds or {}).items()
@@ -174,7 +207,11 @@ def path_of_detector(instrument: InstrumentSpec) -> Path:
 
 def load_camera(name_or_path: str | Path) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    return load_named(CameraSpec, CAMERAS, name_or_path).with_curves()
+    path, text = _read_named(CAMERAS, name_or_path)
+    if isinstance(text.data, dict) and DESIGN in text.data:
+        problem = "an instrument as built is no prescription of a camera"
+        raise InputError(Issue(problem, str(path), text.lines.get((DESIGN,)), (DESIGN,), None, "its design's camera"))
+    return validate(CameraSpec, text).with_curves()
 
 
 def load_detector(name_or_path: str | Path) -> DetectorSpec:
@@ -193,6 +230,36 @@ def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") 
 def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
     """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
     return find_named(CAMERAS, test.camera, test, ("camera",))
+
+
+def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
+    """The camera under test and the test; of a camera as built, with what was built in the test's `as_built`.
+
+    Args:
+        test: names the camera: a prescription, or an instrument as built that consists of one camera.
+
+    Raises:
+        InputError: as `load_instrument`; the instrument has several cameras, or both files say how a body was built.
+    """
+    path = find_camera(test)
+    data = read_yaml(path).data
+    if not (isinstance(data, dict) and DESIGN in data):
+        return test, load_camera(path)
+    instrument = load_instrument(path)
+    if len(instrument.cameras) > 1:
+        problem = f"one camera is tested, and {instrument.name} has {names_text(instrument.cameras)}"
+        raise test.error(problem, ("camera",), found=test.camera, allowed="an instrument as built to a camera's design")
+    (name, mounted), *_ = instrument.cameras.items()
+    built = dict(test.as_built)
+    for node, what in (instrument.as_built or {}).items():
+        # where the whole camera stands makes no difference before a collimator
+        if node in (f"{BASE}/{name}", name):
+            continue
+        own = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
+        if own in built:
+            raise test.error(f"{path} says how this body was built", ("as_built", own), allowed="one of the two")
+        built[own] = what
+    return test.model_copy(update={"as_built": FrozenMap(built)}), load_cameras(instrument)[mounted.camera]
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:

@@ -14,7 +14,8 @@ from scenes.specs.camera import PANCHROMATIC, CameraSpec
 from scenes.specs.camera_tests import DistortionTestSpec, FocusTestSpec, MeasuredDistortionSpec, MeasuredFocusSpec
 from scenes.specs.detector import DetectorSpec, require_detector
 from scenes.specs.disturbances import DisturbancesSpec
-from scenes.specs.instrument import ErrorBudgetSpec, InstrumentSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.job import JobSpec, PerturbationSpec, TargetsSpec, with_tables
 from scenes.specs.turntable import MeasuredTurntableSpec, TurntableFiles, TurntableTestSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, unknown
@@ -143,7 +144,8 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
     """
     text = str(file)
     named = not load.is_path(text) and not Path(text).is_file()
-    if named or ({"mirrors", "cameras"} & set(_keys(file)) and "job" not in _keys(file)):
+    data = None if named else read_yaml(file).data
+    if named or load.is_instrument(data) or (isinstance(data, dict) and "mirrors" in data):
         instrument = load.load_instrument(text if named else Path(text))
         job = JobSpec.model_validate({"instrument": text})
         resolved = _with_instrument(job, instrument)
@@ -152,12 +154,6 @@ def resolve_with(file: str | Path, disturbances: str | None = None) -> ResolvedJ
     if disturbances is None:
         return resolved
     return resolved.model_copy(update={"disturbances": load.load_disturbances(disturbances)})
-
-
-def _keys(file: str | Path) -> tuple[str, ...]:
-    """What a file says something of, at its top."""
-    data = read_yaml(file).data
-    return tuple(data) if isinstance(data, dict) else ()
 
 
 def target_band(camera: CameraSpec) -> str:
@@ -283,7 +279,7 @@ def resolve_focus(path: str | Path) -> FocusSetup:
         _require_detectors(again, again.camera, again.detectors)
         return again
     test = load.load_named(FocusTestSpec, load.LAB, path)
-    camera = load.load_camera(load.find_camera(test))
+    test, camera = load.load_camera_under_test(test)
     _require_plane(test, camera)
     return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera)))
 
@@ -299,7 +295,7 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
         _require_detectors(again, again.camera, again.detectors)
         return again
     test = load.load_named(DistortionTestSpec, load.LAB, path)
-    camera = load.load_camera(load.find_camera(test))
+    test, camera = load.load_camera_under_test(test)
     _require_bands(test, camera, test.band)
     turntable = load.load_named(
         TurntableTestSpec, load.LAB, load.find_named(load.LAB, test.turntable, test, ("turntable",))
@@ -498,7 +494,7 @@ def resolve_camera(file: Path | str, name: str | None = None) -> CameraSetup:
         return validate(CameraSetup, yaml)
     if "job" in data or ("instrument" in data and "mounted" not in data and "study" not in data):
         return _of_job(resolve(file), text, name)
-    if "cameras" in data and not {"job", "detector", "camera"} & set(data):
+    if load.is_instrument(data):
         return _mounted(load.load_instrument(Path(text)), text, name)
     return _of_run(yaml, name)
 

@@ -24,6 +24,7 @@ FOLDERS = {
     "examples/design": "camera_design",
     "examples/tolerance": "tolerance",
     "examples/asbuilt": "asbuilt",
+    "examples/as_built": "as_built_instrument",
     "examples/": "job",
     "lab/focus": "focus_test",
     "lab/distortion": "distortion_test",

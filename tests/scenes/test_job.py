@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from scenes.specs.course import noll
-from scenes.specs.job import NodeInfo, checked_nodes
+from scenes.specs.job import checked_nodes
 from scenes.specs.load import EXAMPLES, load_job
+from scenes.specs.perturbation import NodeInfo
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 

@@ -12,9 +12,10 @@ import twin
 from optics.geometry.tree import Motion
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.instrument import InstrumentSpec
-from scenes.specs.job import JobSpec, NodeInfo, checked_nodes
+from scenes.specs.job import JobSpec, checked_nodes
 from scenes.specs.load import library_names, load_camera, load_instrument
 from scenes.specs.motion_text import motion_of, node_named, perturbation_in_words
+from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import resolve_camera, resolve_job
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.spec import validate

@@ -81,11 +81,13 @@ class CameraOptics:
         path: its way from the scene to the line CCD.
         state: motions of bodies, with heat; empty as designed.
         colour: wavelength of the light, metres; None for that of the design.
+        built: whether it stands apart from the prescription by itself, as its instrument was built.
     """
 
     path: TargetPath
     state: State = field(default_factory=FrozenMap)
     colour: float | None = None
+    built: bool = False
 
     @classmethod
     def alone(cls, camera: CameraSpec | CameraModel, backend: Backend, state: State | None = None) -> Self:
@@ -117,7 +119,7 @@ class CameraOptics:
         path = TargetPath(
             instrument.assembly, name, f"{BASE}/{name}", instrument.cameras[name], backend, shadows=shadows
         )
-        return cls(path, FrozenMap(state or {}))
+        return cls(path, FrozenMap(state or {}), built=bool(instrument.as_built))
 
     def in_state(self, state: State) -> Self:
         """Return the camera in another state."""

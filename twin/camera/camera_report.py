@@ -12,7 +12,7 @@ from optics.geometry import zernike
 from scenes.models.camera_design import file_with_plane
 from scenes.models.camera_sharpness import FIELDS, field_text
 from twin.camera import camera_plots as plots
-from twin.camera.camera_run import CameraRun, perturbed_text, refocus_text, verdict
+from twin.camera.camera_run import CameraRun, built_text, perturbed_text, refocus_text, verdict
 from twin.camera.colour import Colours
 from twin.camera.first_order_data import FIRST_ORDER, unstated_shadows
 from twin.camera.layout_plot import layout_figure
@@ -31,15 +31,21 @@ def camera_report(run: CameraRun, warnings: tuple[str, ...] = ()) -> Report:
         run: the camera.
         warnings: what is wrong with it, to be told before all else.
     """
-    moved, done = refocus_text(run), perturbed_text(run)
+    texts = refocus_text(run), built_text(run), perturbed_text(run)
     told, more = answer(*verdict(run), "see the wavefronts and the layout")
-    sections = [_layout(run), *([_refocus(run)] if moved else []), _wavefronts(run), _spots(run), _mtf(run)]
+    sections = [
+        _layout(run),
+        *([_refocus(run)] if run.refocus is not None else []),
+        _wavefronts(run),
+        _spots(run),
+        _mtf(run),
+    ]
     sections += [*_colours(run)]
     sections += [_through_focus(run), _field(run), *([_bodies(run)] if run.quality is not None else [])]
     return Report(
         f"Camera {run.setup.title}",
         told,
-        (*more, *(text for text in (moved, done) if text), _first_order_text(run)),
+        (*more, *(text for text in texts if text), _first_order_text(run)),
         _facts(run),
         first_order_table(run),
         tuple(sections),

@@ -23,6 +23,7 @@ from scenes.models.job_state import job_state
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.camera import CameraSpec
 from scenes.specs.job import JobSpec, checked_nodes
+from scenes.specs.perturbation import in_words
 from scenes.specs.resolved import CameraSetup
 from scenes.yaml.errors import InputError, Issue
 from twin.camera import field_maps
@@ -83,8 +84,8 @@ class Perturbed:
     Attributes:
         job: that says it, with the paths of the bodies.
         change: of the camera's geometry, of one state.
-        errors: rms wavefront error as designed at the fields of the run's map, waves, (A, B).
-        mtf: at Nyquist as designed at MTF_FIELDS, along the line and along the track, (F, 2); empty where there is
+        errors: rms wavefront error before it at the fields of the run's map, waves, (A, B).
+        mtf: at Nyquist before it at MTF_FIELDS, along the line and along the track, (F, 2); empty where there is
             none.
     """
 
@@ -96,19 +97,7 @@ class Perturbed:
     @property
     def words(self) -> str:
         """What was done: ``base/gf7/M2 shift (0, 0, 20) um``."""
-        parts = []
-        for path, what in self.job.plain()["perturb"].items():
-            own = [f"{key} {_short(what[key])}" for key in self.job.perturb[path].uses()]
-            parts.append(f"{path} {', '.join(own)}")
-        return "; ".join(parts) or "nothing"
-
-
-def _short(value: Any) -> str:
-    """A quantity, or several, as a reader sees them."""
-    if isinstance(value, dict):
-        known = {key: part for key, part in value.items() if part not in ("0 K", ["0 K/m"] * 3)}
-        return ", ".join(f"{key} {_short(part)}" for key, part in known.items())
-    return f"({', '.join(map(str, value))})" if isinstance(value, list) else str(value)
+        return in_words(self.job.perturb) or "nothing"
 
 
 @shows("camera.name", "errors [waves]", "worst")
@@ -197,8 +186,10 @@ def run_camera(
     """
     advance("focus", 0, 1)
     camera, moved = setup.camera, None
-    if refocus and setup.perturb:
-        text = "the best image plane is that of a camera as designed, and this one is perturbed"
+    built = setup.instrument is not None and bool(setup.instrument.as_built)
+    if refocus and (setup.perturb or built):
+        what = "perturbed" if setup.perturb else "as built"
+        text = f"the best image plane is that of a camera as designed, and this one is {what}"
         raise InputError(Issue(text, found="--refocus", allowed="one of the two"))
     if refocus:
         moved = find_focus(camera, backend, tilt)
@@ -219,7 +210,9 @@ def run_camera(
             quality = image_quality(instrument, backend, [state], QUALITY_FIELDS).cameras[mounted]
     field = field_maps.field_grid(ERROR_GRID)
     where = tuple(map(tuple, field.reshape(-1, 2)))
-    errors = FieldBeams.field_errors(optics.model, backend, where, 5, optics.cut).reshape(field.shape[:2])
+    errors = (
+        optics.errors(where) if built else FieldBeams.field_errors(optics.model, backend, where, 5, optics.cut)
+    ).reshape(field.shape[:2])
     if setup.perturb:
         change = trace_truth(instrument, backend, [state]).cameras[mounted]
         done = Perturbed(job, change, errors, _nyquist(optics) if errors.max() < MOST_WAVES else np.empty((0, 2)))
@@ -324,7 +317,19 @@ def perturbed_text(run: CameraRun) -> str:
     if len(done.mtf) and run.mtfs:
         after = min(float(np.min(mtf.at(run.optics.nyquist))) for mtf in run.mtfs)
         text += f", the least MTF at Nyquist from {float(np.min(done.mtf)):.3f} to {after:.3f}"
-    return f"{text}. First-order data and layout are those of the camera as designed."
+    return f"{text}. {_OF_THE_DRAWING}"
+
+
+_OF_THE_DRAWING = "First-order data and layout are those of the camera as designed."
+
+
+def built_text(run: CameraRun) -> str:
+    """How the camera's instrument was built, empty for one as drawn."""
+    instrument = run.setup.instrument
+    words = "" if instrument is None or not instrument.as_built else in_words(instrument.as_built)
+    if not words:
+        return ""
+    return f"As built: {words}." if run.perturbed is not None else f"As built: {words}. {_OF_THE_DRAWING}"
 
 
 def refocus_text(run: CameraRun) -> str:

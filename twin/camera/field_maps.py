@@ -213,7 +213,7 @@ def through_focus(optics: CameraOptics, backend: Backend, fields: tuple[Field, .
     """Move the detector through focus."""
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
-    if optics.state:
+    if optics.state or optics.built:
         return _moved_through_focus(optics, fields, sharp, FOCUS_DEPTHS * 2.0 * spec.wavelength * f_number**2)
     beams = FieldBeams.trace(optics.model, backend, fields, 6, optics.cut)
     own, best = FocalPlane.of(spec), beams.best_plane()
@@ -240,7 +240,7 @@ def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus:
 
 
 def _moved_through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool, reach: float) -> ThroughFocus:
-    """Through focus of a perturbed camera: its line CCD moves in its state."""
+    """Through focus of a camera that stands apart from its prescription: its line CCD moves in its state."""
     # the mean square error is a parabola of the defocus, so that three places tell its lowest
     three = reach * np.array([-1.0, 0.0, 1.0])
     a, b, _ = np.polyfit(three, np.mean(optics.errors(fields, three) ** 2, axis=0), 2)

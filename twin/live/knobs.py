@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.job import JobSpec, NodeInfo
+from scenes.specs.job import JobSpec
+from scenes.specs.perturbation import NodeInfo
 from scenes.specs.study import DesignSpec, FactorSpec
 from scenes.yaml.errors import InputError, Issue, KeyPath, names_text, nearest
 from scenes.yaml.units import split_quantity, unit_ratio, with_unit

@@ -152,7 +152,7 @@ def _of_file(file: Path, run: int | None, manifest: Manifest | None = None) -> S
         return _of_measurement(file)
     if name == "orbit_monitor":
         return _of_orbit(file)
-    if name in ("instrument", "camera"):
+    if name in ("instrument", "as_built_instrument", "camera"):
         path = str(file.resolve())
         return Source(resolve_job(validate(JobSpec, YamlFile("", {"instrument": path}, {}))), about=file.stem)
     if manifest is not None and manifest.program != "twin.render":

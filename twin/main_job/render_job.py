@@ -9,14 +9,18 @@ import numpy as np
 
 from analysis.monitor.recovery import recover
 from analysis.spots.spot_positions import SpotError
-from optics.geometry.tree import State
+from optics.geometry.tree import State, compose
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import UnphysicalError
+from scenes.models.built import squared_facets
 from scenes.models.camera_sharpness import blur_warnings
+from scenes.models.instrument_model import MisplacedError
 from scenes.models.obstruction import find_obstructions, moved_into_beams
 from scenes.models.scenery import measured_finishes
+from scenes.specs.as_built import as_built_of
 from scenes.specs.instrument import PRISM_180, prism_of
 from scenes.specs.job import checked_nodes
+from scenes.specs.perturbation import in_words
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError
 from twin.camera.first_order_data import obscuration, unstated_shadows
@@ -117,7 +121,7 @@ def render_job(
     try:
         focus = experiment.nominal_focus
     except LOST as error:
-        raise _no_spots(resolved, str(error)) from error
+        raise _no_spots(experiment, str(error)) from error
     which = np.array([shown])
     try:
         stage.begin(3)
@@ -382,13 +386,29 @@ def _too_large(resolved: ResolvedJob, reason: str) -> InputError:
     )
 
 
-def _no_spots(resolved: ResolvedJob, reason: str) -> InputError:
-    return resolved.instrument.error(
+def _no_spots(experiment: MonitorExperiment, reason: str) -> InputError:
+    spec = experiment.resolved.instrument
+    if spec.as_built:
+        text = f"the monitor does not work as the instrument is built, without any perturbation: {reason}"
+        return InputError(next(iter(spec.as_built.values())).issue(text, allowed=_mounted_facets(experiment)))
+    return spec.error(
         f"the monitor does not work even as designed, without any perturbation: {reason}",
         ("monitor",),
         allowed="prism widths, angle_errors, pupil_offset, return_face.aperture and a sharp camera with which the "
         "beams pass the prisms twice, and an area_ccd (rows, columns, pitch) that the spots fall on",
     )
+
+
+def _mounted_facets(experiment: MonitorExperiment) -> str:
+    """How the facets would have to stand for the monitor of an instrument as built to work."""
+    instrument, smaller = experiment.instrument, "bodies that stand nearer to the drawing"
+    try:
+        turns = squared_facets(instrument, experiment.backend)
+    except (MisplacedError, *LOST):
+        return smaller
+    bodies = {body.path: body for body in instrument.assembly.tree.bodies}
+    stand = as_built_of(compose(instrument.as_built, turns, bodies))
+    return f"{smaller}; or facets turned as where they are mounted: {in_words({path: stand[path] for path in turns})}"
 
 
 def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotError, focus: SpotFocus) -> InputError:
@@ -402,7 +422,7 @@ def _unmeasured(experiment: MonitorExperiment, before: np.ndarray, error: SpotEr
     try:
         recover(before, before[None], experiment.calibration, resolved.job.analysis.centroid)
     except SpotError as first:
-        return _no_spots(resolved, "; ".join([told(first), *_blurred(experiment, focus)]))
+        return _no_spots(experiment, "; ".join([told(first), *_blurred(experiment, focus)]))
     return _too_large(resolved, told(error))
 
 

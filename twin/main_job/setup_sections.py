@@ -8,6 +8,8 @@ from analysis.units import ARCSEC
 from optics.geometry.tree import Motion
 from optics.thermal.heat import Temperature
 from scenes.models.job_state import motions_of
+from scenes.specs.disturbances import JOINT
+from scenes.specs.perturbation import in_words
 from twin.main_job.monitor_reading import CENTROID_NOTES
 from twin.main_job.render_results import JobRun, RenderRun
 from twin.main_job.result_sections import IN_PAGE
@@ -15,6 +17,7 @@ from twin.run.artefact import MINUS, Cell, Table, fixed, plain, shown_unit
 from twin.run.report import Section
 
 _PAPER = "Wang et al., Acta Photonica Sinica 47(10) 1012001 (2018), doi 10.3788/gxzb20184710.1012001"
+_BUILT = "The nominal state is the instrument as built: frames before, and changes, are those about it."
 ZERO_CELSIUS = 273.15
 
 
@@ -23,13 +26,14 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
     resolved, instrument = run.resolved, run.experiment.instrument
     spec, stated = resolved.instrument, run.experiment.stated is not None
     own = ("Instrument", f"{spec.name}: {spec.description}" if spec.description else spec.name)
+    built = () if not spec.as_built else (("As built", f"{in_words(spec.as_built)}. {_BUILT}"),)
     free = (
         "Structures expand freely and carry the bodies on them, mirrors and prisms bend (finite elements), and glass "
     )
     free += "changes its index."
     if not isinstance(run, RenderRun):
         without = "The instrument has no monitor: changes are those of the exact trace, and nothing is measured."
-        return ("Assumptions", f"{without} {free}"), own
+        return ("Assumptions", f"{without} {free}"), own, *built
     monitor, ccd, bits = spec.autocollimator, spec.autocollimator.area_ccd, resolved.area_detector.bit_depth
     fields = [float(np.degrees(one.field)) for name in spec.cameras for one in spec.channels_of(name).values()]
     family = "; ".join(e.title for e in run.estimators.values() if not e.stated)
@@ -50,6 +54,7 @@ def facts(run: JobRun) -> tuple[tuple[str, str], ...]:
         *((estimator.title, estimator.note) for estimator in run.estimators.values()),
         ("Paper", _PAPER),
         own,
+        *built,
         (
             "Monitor",
             f"{plain(1e9 * monitor.wavelength)} nm, pinhole {plain(1e6 * monitor.reticle.pinhole)} µm, return face "
@@ -129,6 +134,14 @@ def _stated(run: JobRun) -> Table:
             what.append(f"{len(cause.correlations)} correlations")
         which = f"{len(bodies)}: `{', '.join(cause.bodies)}`"
         rows.append([name.replace("_", " "), which, "; ".join(what), cause.time.text, cause.reason])
+    if (joint := spec.joint) is not None:
+        own = [c for c in motions.components if c.cause == JOINT]
+        for c in own:
+            amount = c.sigma / c.unit_size
+            full.append([JOINT, c.body, c.what, amount, shown_unit(c.unit), joint.time.text, joint.reason])
+        bodies = list(dict.fromkeys(c.body for c in own))
+        which = f"{len(bodies)}: `{', '.join(bodies[:3])}`" + (", ..." if len(bodies) > 3 else "")
+        rows.append([JOINT, which, f"{len(own)} components, one by one", joint.time.text, joint.reason])
     heads = ["cause", "body", "motion", "sigma", "unit", "in time", "reason"]
     return Table(
         "disturbances",

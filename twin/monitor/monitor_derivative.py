@@ -334,7 +334,7 @@ def _aimed(path: MonitorBeams, about: State) -> tuple[np.ndarray, np.ndarray]:
     return fan.at(q)
 
 
-STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6}
+STEPS = {"temperature": 0.1, "gradient": 0.1, "index_gradient": 1e-6, "radius": 1e-5, "conic": 1e-5, "index": 1e-6}
 """Half steps of the central differences, SI: spots move by some tenths of a pixel, where they are linear to 1e-6."""
 
 
@@ -345,7 +345,7 @@ def disturbances_of(
 
     Rigid motions, growth and figures are differentiated by automatic differentiation as all others of this program
     are; temperatures and gradients of indices by central differences of the traced spots, since they reach light by
-    many bodies at once.
+    many bodies at once, and so are radii, conic constants and indices, which few files state.
 
     Args:
         stated: the motions.

@@ -21,7 +21,8 @@ from optics.numerics.backend import Backend
 from optics.numerics.threads import cores, one_blas_thread
 from optics.thermal.heat import Temperature
 from scenes.models.disturbances import state_of
-from scenes.specs.instrument import BASE, ErrorBudgetSpec
+from scenes.specs.error_budget import ErrorBudgetSpec
+from scenes.specs.instrument import BASE
 from scenes.specs.resolved import ResolvedJob
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import Observing, observe, one_detector

@@ -174,7 +174,7 @@ class LineSight:
         cameras: dict[str, LineChange] = {}
         principal: dict[str, float] = {}
         for i, name in enumerate(self.instrument.cameras):
-            change = line_change(sight[i], line_points(self.instrument, name), self._axes[name])
+            change = line_change(sight[i], line_points(self.instrument, name), self.axes[name])
             cameras[name] = change
             principal[name] = change.nominal_distance
         lines = sight[:, :, LINE_POINTS // 2]
@@ -197,8 +197,16 @@ class LineSight:
         return aim_chief_rays(self.backend, to_stop, points, guess, ACROSS)[1:]
 
     @cached_property
-    def _axes(self) -> dict[str, np.ndarray]:
-        return {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
+    def axes(self) -> dict[str, np.ndarray]:
+        """Camera -> nominal X, Y, Z about which its changes count, in the base frame as columns, (3, 3); Z is its
+        nominal line of sight. That of an instrument as built is not the drawn one, and Y is then square to it, as near
+        to the camera's as can be.
+        """
+        own = {name: self.instrument.camera_axes(name) for name in self.instrument.cameras}
+        if not self.instrument.as_built:
+            return own
+        sights = self.nominal[:, 0, LINE_POINTS // 2]
+        return {name: _about(sight, own[name][:, 1]) for name, sight in zip(own, sights, strict=True)}
 
     def _from_the_image(
         self, states: Sequence[State], placed: PlacedBodies
@@ -209,6 +217,13 @@ class LineSight:
         points = np.concatenate([line_in_world(instrument, name, placed) for name in names])
         guess = np.concatenate([instrument.toward_optics(placed, name) for name in names])[:, None]
         return to_stop, points, guess
+
+
+def _about(sight: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Axes X, Y, Z as columns, of which Z is a line of sight, and Y as near to ``across`` as can be."""
+    x = np.cross(across, sight)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(sight, x), sight], axis=-1)
 
 
 def trace_truth(instrument: Instrument, backend: Backend, states: Sequence[State]) -> Truth:

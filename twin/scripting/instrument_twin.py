@@ -20,10 +20,11 @@ from optics.geometry.tree import ORIGIN, State
 from optics.numerics.backend import Backend, load_backend
 from scenes.models.camera_sharpness import blur_warnings
 from scenes.specs.course import noll
-from scenes.specs.job import JobSpec, NodeInfo, checked_nodes, with_tables
+from scenes.specs.job import JobSpec, checked_nodes, with_tables
 from scenes.specs.load import INSTRUMENTS, find_disturbances, is_path, library_names
 from scenes.specs.load import load_camera as read_camera
 from scenes.specs.motion_text import AXES, meant, motion_of, node_named, perturbation_in_words
+from scenes.specs.perturbation import NodeInfo
 from scenes.specs.resolved import ResolvedJob, resolve, resolve_job
 from scenes.yaml.errors import InputError, Issue, Problem, names_text, nearest
 from scenes.yaml.spec import validate

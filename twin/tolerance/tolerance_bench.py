@@ -512,7 +512,7 @@ class ToleranceBench:
         """Parts of the merits that are about the line, by kind."""
         if not self._wanted & {"boresight", "roll", "principal_distance", "distortion"}:
             return {}
-        sight, axes = self.experiment.sight, self.instrument.camera_axes(self.camera)
+        sight, axes = self.experiment.sight, self.experiment.sight.axes[self.camera]
         own = list(self.instrument.cameras).index(self.camera)
         seen = np.concatenate([sight.nominal[own], sight.trace(states)[own]])
         change = line_change(seen, self.line, axes)

@@ -20,8 +20,8 @@ from optics.thermal.heat import Temperature
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import TemperatureError, ThermalModel
 from scenes.specs.course import noll
-from scenes.specs.job import PlainPerturbationSpec, perturbation_issues
 from scenes.specs.motion_text import AXES, node_named
+from scenes.specs.perturbation import PlainPerturbationSpec, perturbation_issues
 from scenes.specs.tolerance import CompensatorSpec, ToleranceSetup, ToleranceSpec, Varied
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec

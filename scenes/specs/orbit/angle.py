@@ -5,8 +5,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, OrbitSpec
+from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.errors import Problem
 from scenes.yaml.old_keys import OldKeys
 from scenes.yaml.quantity import Quantity, Vector, Wavelength

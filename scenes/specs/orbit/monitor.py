@@ -12,19 +12,11 @@ from pydantic import AfterValidator, Field, model_validator
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import CourseSpec, Moment, Rotation, Shift, moment, no_such_time
 from scenes.specs.disturbances import JobDisturbances
-from scenes.specs.job import (
-    AnalysisSpec,
-    JobSpec,
-    NodeInfo,
-    PerturbationSpec,
-    PlainPerturbationSpec,
-    RenderSpec,
-    checked_nodes,
-    perturbation_issues,
-)
+from scenes.specs.job import AnalysisSpec, JobSpec, PerturbationSpec, RenderSpec, checked_nodes
 from scenes.specs.orbit.angle import Relief, TerrainHeight, check_ends
 from scenes.specs.orbit.calibration import Count, FieldLength, LineTime
 from scenes.specs.orbit.flight import AttitudeSpec, EarthSpec, ErrorsSpec, OrbitSpec
+from scenes.specs.perturbation import NodeInfo, PlainPerturbationSpec, perturbation_issues
 from scenes.yaml.errors import InputError, Problem
 from scenes.yaml.quantity import Quantity
 from scenes.yaml.spec import Flag, Name, NothingIsEmpty, Number, Paths, Reference, Seed, Spec, TitledSpec, Whole

@@ -130,8 +130,7 @@ def resolve_angle(path: str | Path) -> AngleSetup:
 
 def _with_camera(test: OrbitAngleSpec, file: Path) -> AngleSetup:
     """The test with what its camera's file holds: an instrument has cameras, a payload has lines."""
-    data = read_yaml(file).data
-    if not (isinstance(data, dict) and "cameras" in data):
+    if not load.is_instrument(read_yaml(file).data):
         return AngleSetup.model_construct(
             test=test, camera=load_three_line_camera(file), instrument=None, cameras=FrozenMap()
         )

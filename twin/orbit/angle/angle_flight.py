@@ -24,7 +24,8 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.models.instrument_model import Instrument
 from scenes.models.job_state import motions_of
 from scenes.models.thermal_model import TemperatureError, ThermalModel
-from scenes.specs.job import JobSpec, PerturbationSpec, perturbation_issues
+from scenes.specs.job import JobSpec, PerturbationSpec
+from scenes.specs.perturbation import perturbation_issues
 from scenes.yaml.errors import InputError
 from twin.monitor.truth import trace_truth
 from twin.orbit.flight import light_effects

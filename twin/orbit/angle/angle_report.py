@@ -9,8 +9,8 @@ from scipy.stats import chi2
 
 from analysis.units import ARCSEC
 from scenes.specs.course import DEFAULT_PIVOT
-from scenes.specs.job import PlainPerturbationSpec
 from scenes.specs.measured.orbit_data_setup import MeasuredAngleSetup
+from scenes.specs.perturbation import PlainPerturbationSpec
 from scenes.yaml.units import ANGLE, LENGTH, format_quantity
 from twin.orbit.angle.angle_run import AngleRun, PassAngles, SimulatedAngleRun, values_of
 from twin.orbit.angle.angle_sections import listed, sections, signs

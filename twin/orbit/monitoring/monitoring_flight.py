@@ -220,7 +220,7 @@ def fly_monitored(setup: MonitorSetup, backend: Backend, seed: int, advance: Adv
         raise BenchError(f"the instrument cannot be rendered: {error}", ("course",), TOO_FAR) from error
     calibrated = {}
     for name in pair:
-        line, axes = lines[spec.referred][name], instrument.camera_axes(name)
+        line, axes = lines[spec.referred][name], experiment.sight.axes[name]
         calibrated[name] = CalibratedLine(line.pixels, line.directions, line.origins, axes, distance[name])
     smoothed = {}
     if experiment.disturbances is not None:
