@@ -52,6 +52,10 @@ class AsBuiltBench(Site):
 
     def __init__(self, setup: AsBuiltSetup, backend: Backend) -> None:
         self.setup, self.backend, self.test = setup, backend, setup.test
+        if setup.base.instrument.as_built:
+            problem = "an instrument as built already: its measurements have to stand here with the others"
+            allowed = "the instrument of the drawing"
+            raise self.test.error(problem, ("instrument",), found=self.test.instrument, allowed=allowed)
         self.experiment = MonitorExperiment(setup.base, backend)
         self.camera = self._camera_name()
         self.line = line_points(self.experiment.instrument, self.camera)

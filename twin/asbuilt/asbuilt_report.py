@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses, shown
-from twin.asbuilt.built_instrument import instrument_text, posterior_text
-from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, shown_unit
+from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
+from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, shown_unit
 from twin.run.report import Report, Section, answer
 from twin.run.svg import (
     BLUE,
@@ -76,10 +76,7 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
                 "`instrument.yaml` is the instrument as built, which every command takes as its instrument; "
                 "`posterior.yaml` beside it is what is still unknown of it, as its disturbances.",
             ),
-            (
-                CameraFile("instrument", "Instrument", "", instrument_text(run)),
-                CameraFile("posterior", "Posterior", "", posterior_text(run)),
-            ),
+            (CameraFile("instrument", "Instrument", "", instrument_text(run)), *_posterior(run)),
             closed=True,
             name="instrument",
         ),
@@ -294,6 +291,12 @@ def _motion_table(run: AsBuiltRun) -> Table:
     ]
     heads = ("motion", "unit", "prior sigma", "estimate", "sigma", *(["true"] if run.true is not None else []))
     return Table("motions", "Motions", "", heads, rows, (None, None, *[3] * (len(heads) - 2)))
+
+
+def _posterior(run: AsBuiltRun) -> tuple[CameraFile, ...]:
+    text, table = posterior_files(run)
+    own = CameraFile(POSTERIOR, "Posterior", "", text)
+    return (own,) if table is None else (own, CsvFile(CORRELATION, "Its correlations", "", table))
 
 
 def _along_figure(run: AsBuiltRun) -> Figure:

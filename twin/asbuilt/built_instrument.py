@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
 
 from optics.geometry.tree import Motion
-from scenes.models.disturbances import HEAT
+from scenes.models.disturbances import HEAT, Component
+from scenes.models.joint_disturbances import joint_disturbances, joint_files
+from scenes.specs.as_built import as_built_file
+from scenes.specs.load import is_path
 from twin.asbuilt.asbuilt_run import AsBuiltRun
+
+POSTERIOR = "posterior"
+"""Name of the file of what is still unknown."""
+CORRELATION = f"{POSTERIOR}_correlation"
+"""Name of the table of its correlations."""
 
 
 def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
@@ -19,10 +30,91 @@ def built_motions(run: AsBuiltRun) -> Mapping[str, Motion]:
 
 
 def instrument_text(run: AsBuiltRun) -> str:
-    """The instrument's file."""
-    return "# later\n"
+    """The instrument's file, which names the drawing and how each body stands against it."""
+    test, base = run.setup.test, run.setup.base.instrument.name
+    name = test.instrument
+    if is_path(name):
+        name = str((Path(test.source.file).parent / name).resolve())
+    return as_built_file(
+        f"{base}_as_built",
+        name,
+        built_motions(run),
+        f"./{POSTERIOR}.yaml",
+        f"{base} as estimated from {', '.join(kind.name for kind in run.bench.kinds)}",
+        "The instrument as built; every command takes it as its instrument",
+    )
 
 
-def posterior_text(run: AsBuiltRun) -> str:
-    """The disturbances file of what is still unknown."""
-    return "# later\n"
+def unknown(run: AsBuiltRun) -> tuple[list[Component], np.ndarray]:
+    """Components of motions that are still uncertain, with heat left out, and their covariance (C, C), SI.
+
+    Errors of moves belong to the components of the bodies that were moved.
+    """
+    parameters, found = run.bench.parameters, run.found
+    components = [one for one in parameters.components if one.kind not in HEAT]
+    places = {(one.body, one.kind, one.axis): k for k, one in enumerate(components)}
+    rows: dict[int, np.ndarray] = {}
+    for k, one in enumerate(parameters.components):
+        if one.kind not in HEAT:
+            rows[places[one.body, one.kind, one.axis]] = np.eye(len(found.mean))[k]
+    tree = run.bench.experiment.instrument.assembly.tree
+
+    def add(body: str, kind: str, axis: int, pivot: str, amount: np.ndarray) -> None:
+        place = places.setdefault((body, kind, axis), len(components))
+        if place == len(components):
+            components.append(Component("moves", body, kind, axis, pivot, 0.0))
+        rows[place] = rows.get(place, np.zeros(len(found.mean))) + amount
+
+    for k, number in enumerate(parameters.actuators):
+        pull = _pull(run, k)
+        if not np.any(pull):
+            continue
+        for body, move in number.moves.items():
+            for axis in range(3):
+                if move.shift[axis]:
+                    add(body, "shift", axis, "origin", move.shift[axis] * pull)
+                if move.rotate[axis]:
+                    own = places.get((body, "rotate", axis))
+                    pivot = "origin" if own is None else components[own].pivot
+                    add(body, "rotate", axis, pivot, move.rotate[axis] * pull)
+                    away = np.cross(
+                        move.rotate[axis] * np.eye(3)[axis], np.array(tree[body].pivots[pivot]) - move.pivot
+                    )
+                    for other in np.flatnonzero(np.abs(away) > 1e-12):
+                        add(body, "shift", int(other), "origin", away[other] * pull)
+            for term, amount in move.figure.items():
+                add(body, "figure", term, "origin", amount * pull)
+            for kind in ("radius", "conic", "index"):
+                if kind in move.shape:
+                    add(body, kind, 0, "origin", move.shape[kind] * pull)
+    table = np.stack([rows[k] for k in range(len(components))])
+    spread = table @ found.spread
+    return components, np.asarray(found.variance_factor * spread @ spread.T)
+
+
+def _pull(run: AsBuiltRun, actuator: int) -> np.ndarray:
+    """Derivatives of how far an actuator has gone by all parameters, (K,)."""
+    parameters, last = run.bench.parameters, run.bench.last
+    count = len(run.found.mean)
+    if last is None:
+        return np.zeros(count)
+    steps = np.concatenate([np.zeros((1, count)), np.eye(count)])
+    moved = parameters.moved(steps, last)[:, actuator]
+    return np.asarray(moved[1:] - moved[0])
+
+
+def posterior_files(run: AsBuiltRun) -> tuple[str, str | None]:
+    """Text of the disturbances file of what is still unknown, and of the table of correlations beside it, if any."""
+    components, covariance = unknown(run)
+    kinds = ", ".join(kind.name for kind in run.bench.kinds)
+    spec = joint_disturbances(
+        POSTERIOR,
+        components,
+        covariance,
+        run.bench.experiment.instrument.nodes,
+        f"posterior covariance of an estimate from {kinds}",
+        f"What is not known of {run.setup.base.instrument.name} as built.",
+    )
+    files = joint_files(spec, POSTERIOR, "What is still unknown of the instrument as built")
+    text = files[f"{POSTERIOR}.yaml"].replace(f"{POSTERIOR}.csv", f"{CORRELATION}.csv")
+    return text, files.get(f"{POSTERIOR}.csv")

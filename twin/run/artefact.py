@@ -401,3 +401,10 @@ class CameraFile(Data):
     def content(self) -> bytes:
         """The file."""
         return str(self.data).encode()
+
+
+@dataclass(frozen=True, eq=False)
+class CsvFile(CameraFile):
+    """A table that other files name, kept beside the page; ``data`` is its text."""
+
+    kind: ClassVar[str] = "csv"
