@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.benchmarks import (
+    asbuilt_speed,
     cut_speed,
     jacobian_speed,
     large_speed,
@@ -56,6 +57,7 @@ BENCHMARKS = (
     Benchmark("quality", "image quality with shadows and without", quality_speed.measure, 20, 5),
     Benchmark("cut", "MTF of obscured pupils and of free ones", cut_speed.measure, 15, 4),
     Benchmark("tolerance", "cameras drawn within their tolerances", tolerance_speed.measure, 60, 15),
+    Benchmark("asbuilt", "the state of one instrument from its wavefronts", asbuilt_speed.measure, 12, 5),
     Benchmark("study", "the engine of trade studies", study_speed.measure, 45, 20),
     Benchmark("live", "the live twin: from a slider to painted spots and readings", live_speed.measure, 75, 30),
     Benchmark("large", "a study of ten thousand states", large_speed.measure, 200, 25),
