@@ -39,6 +39,12 @@ def test_metropro_of_every_form(tmp_path, form, resolution):
     assert "0.5 waves per fringe" in found.notes[0]
 
 
+@pytest.mark.parametrize("frames", [0, 1])
+def test_frames_that_the_header_does_not_count(tmp_path, frames):
+    write.metropro(tmp_path / "a.dat", WAVE, frames=frames, counted=0)
+    same(read_map(tmp_path / "a.dat").values, WAVE, 0.5 * 632.8e-9 / 32768)
+
+
 def test_what_the_header_of_metropro_says(tmp_path):
     path = tmp_path / "a.dat"
     write.metropro(path, WAVE, sign=1, codev=1, spacing=0.0)

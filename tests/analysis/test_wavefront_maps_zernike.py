@@ -124,7 +124,8 @@ UNITS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "waves": 632
 def text_of(order: str, size: str, unit: str, form: str, statements: bool = True) -> str:
     x, y = ring(0.0, 50)
     names, values = [], []
-    for noll, metres in WAVE.items():
+    # in no order of its own
+    for noll, metres in sorted(WAVE.items(), key=lambda item: item[1]):
         # the program's own term, scaled so that it reaches 1 at the edge where it has unit peak
         own = 1.0 if size == "rms" else edge_value(*noll_to_nm(noll))
         assert np.allclose(metres * own * (circle_terms([noll], x, y) / own), metres * circle_terms([noll], x, y))

@@ -31,14 +31,16 @@ def real_file(folder: Path) -> Path:
     return path
 
 
-def metropro(path: Path, values: np.ndarray, form: int = 1, frames: int = 1, **header: float) -> None:
+def metropro(
+    path: Path, values: np.ndarray, form: int = 1, frames: int = 1, counted: int | None = None, **header: float
+) -> None:
     """MetroPro's: header of 834 or 4096 bytes, intensities, then counts from the top row down."""
     size = 4096 if form == 3 else 834
     head = bytearray(size)
     known = {"scale": 0.5, "obliquity": 1.0, "resolution": 1, "sign": 0, "codev": 0, "spacing": 1e-4} | header
     rows, columns = values.shape
     struct.pack_into(">4sHI", head, 0, bytes([0x88, 0x1B, 0x03, 0x6E + form]), form, size)
-    struct.pack_into(">HHH", head, 52, 5, 4, frames)
+    struct.pack_into(">HHH", head, 52, 5, 4, frames if counted is None else counted)
     struct.pack_into(">HHI", head, 68, columns, rows, 4 * rows * columns)
     struct.pack_into(">fff", head, 164, known["scale"], WAVELENGTH, 0.0)
     struct.pack_into(">fff", head, 176, known["obliquity"], 0.0, known["spacing"])
