@@ -17,8 +17,6 @@ WAVES = "waves"
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 _NAMES = {
     **{name: name for name in _LENGTHS},
-    "µm": "um",
-    "μm": "um",
     "micron": "um",
     "microns": "um",
     **{f"{name}{end}": unit for name, unit in (("wave", WAVES), ("meter", "m"), ("metre", "m")) for end in ("", "s")},
@@ -83,7 +81,8 @@ def unit_named(path: Path, text: str) -> str:
     Raises:
         MapError: no such unit.
     """
-    name = text.strip().strip("'\"").lower()
+    # both letters that stand for micro
+    name = text.strip().strip("'\"").lower().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
     if name not in _NAMES:
         raise MapError(f"{path}: there is no unit {text.strip()[:40]!r}; m, mm, um, nm and waves are known")
     return _NAMES[name]

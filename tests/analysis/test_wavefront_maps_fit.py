@@ -59,7 +59,7 @@ def test_light_without_a_round_edge_needs_a_stated_pupil():
     with pytest.raises(UndeterminedError, match="state them in pixels"):
         find_pupil(map_of(values))
     with pytest.raises(UndeterminedError, match="state them in pixels"):
-        find_pupil(map_of(np.zeros((20, 20))))
+        find_pupil(map_of(np.zeros((20, 20))))  # steps at the end of a map are no edge
     with pytest.raises(MapError, match="radii are positive"):
         Pupil(1.0, 2.0, 0.0)
 
