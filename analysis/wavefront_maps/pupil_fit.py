@@ -80,7 +80,9 @@ class MapFit:
     Attributes:
         terms: indices of Noll, (Z,).
         coefficients: of the circle's terms, metres rms over the full disk each, (Z,).
-        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it.
+        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it. Where the
+            independent pixels are fewer than some five times the terms, it is itself known to some tens of per cent
+            only, and fewer errors than of a normal distribution lie within a sigma.
         parts: of the terms that are orthonormal over the light, metres rms over it each, (Z,).
         parts_covariance: likewise.
         rms: of the map over the light about its mean, metres.
@@ -290,7 +292,7 @@ def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], fac
         spread = irfft2(turned * spectrum(near), shape)[:, :rows, :wide]
         before, covariance = covariance, np.tensordot(columns, spread, ((1, 2), (1, 2))) / share**2
         covariance = 0.5 * (covariance + covariance.T)
-        if np.abs(covariance - before).max() < _SETTLED * np.abs(covariance).max():
+        if np.abs(covariance - before).max() <= _SETTLED * np.abs(covariance).max():
             break
         both = 2.0 * correlation(turned, spectrum(weight * spread)) / share
         size, turn = np.linalg.eigh(covariance)
