@@ -17,7 +17,8 @@ __all__ = ["MapError", "WavefrontMap", "read_map"]
 
 _PUPIL_SCALE = ("PUPLSCAL", "PIXELSCL", "PIXSCALE")
 """Keys of FITS files of pupils with metres per pixel, as POPPY writes and reads them."""
-_LARGEST_PIXEL = 1.0
+_LARGEST_PIXEL, _LARGEST = 1.0, 10.0
+"""Metres; beyond them a unit is wrong or a file is damaged."""
 
 
 def read_map(
@@ -44,9 +45,15 @@ def read_map(
     try:
         with path.open("rb") as file:
             start = file.read(16)
-        found = _read(path, start, unit, wavelength, page)
+        with np.errstate(over="ignore", invalid="ignore"):  # what comes of it is told below
+            found = _read(path, start, unit, wavelength, page)
     except OSError as error:
         raise MapError(f"{path} cannot be read: {error.strerror or 'input/output error'}") from error
+    largest = np.max(np.abs(found.values), where=~np.isnan(found.values), initial=0.0)
+    if largest > _LARGEST:
+        raise MapError(
+            f"{path} holds values of up to {largest:.3g} m, which no wavefront has: check its unit and scale"
+        )
     if not np.isfinite(found.values).any():
         raise MapError(f"{path} holds no measured point: all of its {found.values.size} points are without data")
     agreed(path, "wavelength", wavelength, found.wavelength)
@@ -92,9 +99,7 @@ def _fits(path: Path, unit: str | None, wavelength: float | None, page: int | No
     scale = next((float(header[key]) for key in _PUPIL_SCALE if isinstance(header.get(key), int | float)), math.nan)
     in_metres = "arc" not in str(header.get("PIXUNIT", "meter")).lower() and 0.0 < scale < _LARGEST_PIXEL
     metres = metres_per(path, named, wavelength)
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = np.asarray(values, dtype=np.float64) * metres
-    values[~np.isfinite(values)] = np.nan
+    values = np.asarray(values, dtype=np.float64) * metres
     return WavefrontMap(
         values=values,
         spacing=scale if in_metres else math.nan,

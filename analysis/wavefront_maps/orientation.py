@@ -73,6 +73,12 @@ class Orientation:
         c, s = _COSINE[self.quarter_turns], _COSINE[(self.quarter_turns + 3) % 4]
         return np.array([[c, -s], [s, c]]) @ np.diag([1, -1 if self.mirrored else 1])
 
+    @property
+    def inverse(self) -> Orientation:
+        """What takes it back: a mirror is its own inverse."""
+        turns = self.quarter_turns if self.mirrored else -self.quarter_turns % 4
+        return Orientation(self.mirrored, turns, self.sign)
+
     def __str__(self) -> str:
         return self.name if self.sign > 0 else f"{self.name}, sign inverted"
 

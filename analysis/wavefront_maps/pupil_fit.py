@@ -29,8 +29,10 @@ _BINS = 64
 """Fewest cells across the pupil in which correlated noise is looked at: terms are smooth over them."""
 _FEWEST_PAIRS, _ROUNDS, _SETTLED = 1e-3, 25, 0.01
 """Share of pairs of points below which a distance is not looked at; rounds of the noise; change that ends them."""
-_TRIES, _NEAR = 400, 1.5
-"""Circles through three points of the edge that are tried, and pixels from the circle within which a point is on it."""
+_TRIES, _NEAR, _STEP = 400, 1.5, 0.75
+"""Circles through three points of the edge that are tried; pixels from one of them within which a point is on it, at
+first and when it is refined: a step lies within half a pixel of the edge.
+"""
 _SPECK = 0.02
 """Of the largest connected lit area; smaller ones lie outside the pupil, or do not matter."""
 _ROUND_SHARE = 0.5
@@ -78,7 +80,9 @@ class MapFit:
     Attributes:
         terms: indices of Noll, (Z,).
         coefficients: of the circle's terms, metres rms over the full disk each, (Z,).
-        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it.
+        covariance: of them, (Z, Z), from what the fit leaves; systematic errors of the map are not in it. Where the
+            independent pixels are fewer than some five times the terms, it is itself known to some tens of per cent
+            only, and fewer errors than of a normal distribution lie within a sigma.
         parts: of the terms that are orthonormal over the light, metres rms over it each, (Z,).
         parts_covariance: likewise.
         rms: of the map over the light about its mean, metres.
@@ -137,11 +141,9 @@ def find_pupil(measured: WavefrontMap, distortion: tuple[float, ...] = ()) -> Pu
         near = int(np.count_nonzero(_off(points, circle) < _NEAR)) if circle[2] < 4.0 * max(lit.shape) else -1
         if near > most:
             best, most = circle, near
-    for _ in range(4 if most >= 8 else 0):
-        kept = points[_off(points, best) < _NEAR]
-        # of an edge that a row meets at a grazing angle, the step says little
-        steep = np.abs(kept - best[:2]).max(axis=1) > 0.9 * best[2] if len(kept) > 40 else np.ones(len(kept), bool)
-        best = _circle(kept[steep] if np.count_nonzero(steep) >= 8 else kept)
+    for near_by in (_NEAR, _NEAR, _STEP, _STEP, _STEP) if most >= 8 else ():
+        kept = points[_off(points, best) < near_by]
+        best = _circle(kept if len(kept) >= 8 else points[_off(points, best) < _NEAR])
     kept = points[_off(points, best) < _NEAR]
     angles = np.arctan2(kept[:, 1] - best[1], kept[:, 0] - best[0])
     seen = len(np.unique(np.floor(angles / (2.0 * np.pi) * 36.0))) / 36.0
@@ -193,7 +195,7 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
     pupil = find_pupil(measured) if pupil is None else pupil
     rows, columns = np.nonzero(measured.lit)
     x, y = pupil.unit(columns.astype(float), rows.astype(float))
-    inside = x**2 + y**2 <= 1.0
+    inside = x**2 + y**2 <= 1.0 + 1e-9
     beyond = int(np.count_nonzero(~inside))
     rows, columns, x, y = rows[inside], columns[inside], x[inside], y[inside]
     count, size = len(rows), len(terms)
@@ -211,7 +213,7 @@ def fit_map(measured: WavefrontMap, terms: Sequence[int], pupil: Pupil | None = 
         triangle = np.asarray(np.linalg.qr(np.concatenate([triangle, both]), mode="r"))
     sign = np.where(np.diag(triangle)[:size] < 0.0, -1.0, 1.0)
     factor, parts = triangle[:size, :size] * sign[:, None], triangle[:size, size] * sign
-    left = np.diag(factor) / np.linalg.norm(factor, axis=0)
+    left = np.diag(factor) / np.maximum(np.linalg.norm(factor, axis=0), HELD)
     if (left < HELD).any():
         raise UndeterminedError(
             f"over the lit part of the pupil, Z{terms[int(np.argmax(left < HELD))]} cannot be told from the terms"
@@ -290,7 +292,7 @@ def _parts_covariance(residual: Array, pupil: Pupil, terms: tuple[int, ...], fac
         spread = irfft2(turned * spectrum(near), shape)[:, :rows, :wide]
         before, covariance = covariance, np.tensordot(columns, spread, ((1, 2), (1, 2))) / share**2
         covariance = 0.5 * (covariance + covariance.T)
-        if np.abs(covariance - before).max() < _SETTLED * np.abs(covariance).max():
+        if np.abs(covariance - before).max() <= _SETTLED * np.abs(covariance).max():
             break
         both = 2.0 * correlation(turned, spectrum(weight * spread)) / share
         size, turn = np.linalg.eigh(covariance)

@@ -6,9 +6,9 @@ comments of CODE V and Zemax, lines that begin with ``#`` those of a plain table
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
+from array import array
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from analysis.wavefront_maps.wavefront_map import (
     unit_named,
 )
 
-MOST_BYTES = 200_000_000
+MOST_BYTES = 100_000_000
 MOST_POINTS = 20_000_000
 _ZEMAX_UNITS = {0: 1e-3, 1: 1e-2, 2: 25.4e-3, 3: 1.0}
 """Unit flag of a Grid Sag file -> metres."""
@@ -98,19 +98,19 @@ def is_zemax(lines: list[Line]) -> bool:
     return not like_a_table or len(lines) == int(first[0]) * int(first[1]) + 1
 
 
-def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> list[list[float]]:
-    """Numbers of each line. Raises MapError at the first text that is none."""
-    out = []
+def _numbers(path: Path, lines: Iterable[Line], split: str = r"\s+") -> tuple[Array, list[int]]:
+    """All numbers of lines in a row, and how many each line has. Raises MapError at the first text that is none."""
+    out, widths = array("d"), []
     for number, text in lines:
-        row = []
-        for one in re.split(split, text.strip(" \t,;")):
+        words = re.split(split, text.strip(" \t,;"))
+        for one in words:
             try:
                 # Python reads 1_000 as a number, no other program does
-                row.append(float(one.replace("_", "?")))
+                out.append(float(one.replace("_", "?")))
             except ValueError:
                 raise MapError(f"{path}, line {number}: {one[:40]!r} is no number") from None
-        out.append(row)
-    return out
+        widths.append(len(words))
+    return np.array(out), widths
 
 
 def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
@@ -160,8 +160,9 @@ def read_codev(path: Path, lines: list[Line]) -> WavefrontMap:
     if abs(values.get("XSC", 1.0) - 1.0) > 1e-6:
         raise MapError(f"{where}: its pixels are not square (XSC {values['XSC']:g}): resample the map to square ones")
     columns, rows = _grid(where, sizes)
-    data = list(itertools.chain.from_iterable(_numbers(path, lines[place + 1 :])))
-    counts = _all_points(path, data, rows, columns)
+    counts, _ = _numbers(path, lines[place + 1 :])
+    _check_points(path, counts, len(counts), rows, columns)
+    counts = counts.reshape(rows, columns)
     no_data = values.get("NDA", _CODEV_NO_DATA)
     metres = values["WVL"] * 1e-6 / values["SSZ"]
     notes = () if "NDA" in values else (f"NDA is not stated; {_CODEV_NO_DATA} was taken for no data, as CODE V does.",)
@@ -188,7 +189,7 @@ def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
         MapError: a header or points that are not of this form.
     """
     where = f"{path}, line {lines[0][0]}"
-    ((nx, ny, step_x, step_y, flag, *shift),) = _numbers(path, [lines[0]])
+    nx, ny, step_x, step_y, flag, *shift = _numbers(path, [lines[0]])[0]
     columns, rows = _grid(where, [int(nx), int(ny)])
     if flag not in _ZEMAX_UNITS:
         raise MapError(f"{where}: unit flag {flag:g} is not known; 0 (mm), 1 (cm), 2 (inch) and 3 (m) are")
@@ -198,17 +199,11 @@ def read_zemax(path: Path, lines: list[Line]) -> WavefrontMap:
         raise MapError(
             f"{where}: steps {step_x:g} and {step_y:g} are no square pixels: resample the map to square ones"
         )
-    points = _numbers(path, lines[1:])
-    widths = {len(point) for point in points}
-    if len(widths) != 1 or not widths <= {1, 4, 5}:
+    points, widths = _numbers(path, lines[1:])
+    if len(set(widths)) != 1 or widths[0] not in (1, 4, 5):
         raise MapError(f"{path}: each line has to hold sag, three derivatives and no-data flag, or the sag alone")
-    if len(points) != rows * columns:
-        raise MapError(
-            f"{path} has {len(points)} points, its first line says {columns} x {rows}: it is cut off or added to"
-        )
-    table = np.array(points)
-    if not np.isfinite(table).all():
-        raise MapError(f"{path}: a point is not a finite number; set its no-data flag to 1")
+    _check_points(path, points, len(widths), rows, columns)
+    table = points.reshape(rows * columns, widths[0])
     measured = table[:, 4] == 0.0 if table.shape[1] == 5 else np.ones(len(table), bool)
     values = np.where(measured, table[:, 0] * unit, np.nan).reshape(rows, columns)[::-1]
     notes = ["Read as sag. A Grid Phase file looks alike and would hold radians."]
@@ -236,11 +231,11 @@ def read_table(path: Path, text: str, unit: str | None, wavelength: float | None
     lines = lines_of(text, "#")
     if not lines:
         raise MapError(f"{path} holds no numbers")
-    rows = _numbers(path, lines, r"\s*[,;]\s*|\s+")
-    if len({len(row) for row in rows}) != 1 or len(rows) < 2 or len(rows[0]) < 2:
-        line = next((n for (n, _), row in zip(lines, rows, strict=True) if len(row) != len(rows[0])), lines[0][0])
+    numbers, widths = _numbers(path, lines, r"\s*[,;]\s*|\s+")
+    if len(set(widths)) != 1 or len(widths) < 2 or widths[0] < 2:
+        line = next((n for (n, _), width in zip(lines, widths, strict=True) if width != widths[0]), lines[0][0])
         raise MapError(f"{path}, line {line}: a map has at least two rows, all with as many columns as the first")
-    table = np.array(rows)
+    table = numbers.reshape(len(widths), widths[0])
     if np.isinf(table).any():
         raise MapError(f"{path} holds an infinite number; write nan where nothing was measured")
     wavelength = agreed(
@@ -305,10 +300,8 @@ def _grid(where: str, sizes: list[int]) -> tuple[int, int]:
     return sizes[0], sizes[1]
 
 
-def _all_points(path: Path, data: list[float], rows: int, columns: int) -> Array:
-    if len(data) != rows * columns:
-        raise MapError(f"{path} has {len(data)} points, its header says {columns} x {rows}: it is cut off or added to")
-    table = np.array(data)
-    if not np.isfinite(table).all():
-        raise MapError(f"{path}: a point is not a finite number")
-    return table.reshape(rows, columns)
+def _check_points(path: Path, numbers: Array, count: int, rows: int, columns: int) -> None:
+    if count != rows * columns:
+        raise MapError(f"{path} has {count} points, its header says {columns} x {rows}: it is cut off or added to")
+    if not np.isfinite(numbers).all():
+        raise MapError(f"{path}: a point is not a finite number; files mark points without data in another way")

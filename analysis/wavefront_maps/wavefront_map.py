@@ -14,12 +14,9 @@ from analysis.measurement_error import MeasurementError
 Array = NDArray[np.float64]
 WAVES = "waves"
 """The unit that needs a wavelength."""
-_MICRO, _GREEK_MU = chr(0xB5), chr(0x3BC)
-"""The sign for a millionth, and the letter that some programs write for it."""
 _LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "pm": 1e-12}
 _NAMES = {
     **{name: name for name in _LENGTHS},
-    "µm": "um",
     "micron": "um",
     "microns": "um",
     **{f"{name}{end}": unit for name, unit in (("wave", WAVES), ("meter", "m"), ("metre", "m")) for end in ("", "s")},
@@ -84,8 +81,8 @@ def unit_named(path: Path, text: str) -> str:
     Raises:
         MapError: no such unit.
     """
-    name = text.strip().strip("'\"").lower()
-    name = name.replace(_GREEK_MU, _MICRO)
+    # both letters that stand for micro
+    name = text.strip().strip("'\"").lower().replace("\N{MICRO SIGN}", "u").replace("\N{GREEK SMALL LETTER MU}", "u")
     if name not in _NAMES:
         raise MapError(f"{path}: there is no unit {text.strip()[:40]!r}; m, mm, um, nm and waves are known")
     return _NAMES[name]

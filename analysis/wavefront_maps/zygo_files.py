@@ -76,8 +76,10 @@ def read_metropro(path: Path) -> WavefrontMap:
         raise MapError(f"{path} is damaged: its header has phase resolution {head['resolution']}; 0, 1 and 2 exist")
     if rows * columns > MOST_POINTS:
         raise MapError(f"{path} has {rows} x {columns} points, more than {MOST_POINTS}: save a smaller part of it")
-    # prysm takes one frame where the header says none, but only where the frame has a size
-    start = head["header_size"] + 2 * head["frame_width"] * head["frame_height"] * max(head["frames"], 1)
+    start = head["header_size"] + 2 * head["frame_width"] * head["frame_height"] * head["frames"]
+    one = head["header_size"] + 2 * head["frame_width"] * head["frame_height"]
+    # some programs count no frame and write one
+    start = one if not head["frames"] and len(data) >= one + 4 * rows * columns else start
     if len(data) < start + 4 * rows * columns or head["header_size"] < _HEADERS[data[3]]:
         raise MapError(
             f"{path} is cut off or damaged: its header wants {rows} x {columns} points from byte {start} on, the file"

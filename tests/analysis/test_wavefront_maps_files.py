@@ -39,6 +39,12 @@ def test_metropro_of_every_form(tmp_path, form, resolution):
     assert "0.5 waves per fringe" in found.notes[0]
 
 
+@pytest.mark.parametrize("frames", [0, 1])
+def test_frames_that_the_header_does_not_count(tmp_path, frames):
+    write.metropro(tmp_path / "a.dat", WAVE, frames=frames, counted=0)
+    same(read_map(tmp_path / "a.dat").values, WAVE, 0.5 * 632.8e-9 / 32768)
+
+
 def test_what_the_header_of_metropro_says(tmp_path):
     path = tmp_path / "a.dat"
     write.metropro(path, WAVE, sign=1, codev=1, spacing=0.0)
@@ -226,6 +232,8 @@ BAD = {
     "size": (lambda p: p.write_text("t\nGRD 2 0 SUR SSZ 2 WVL 1\n1 2 3 4\n"), "grid of 2 x 0"),
     "short": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2 3\n"), "has 3 points"),
     "zernikes": (lambda p: p.write_text("t\nZFR 2 SUR SSZ 2 WVL 1\n1 2\n"), "Zernike terms"),
+    "huge": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 1e-300 WVL 1e20\n1 2 3 4\n"), "inf m, which no wavefront has"),
+    "unit of a table": (lambda p: write.table(p, WAVE, "# unit: m\n"), "check its unit"),
     "letters": (lambda p: p.write_text("t\nGRD 2 2 SUR SSZ 2 WVL 1\n1 2\n3 o\n"), "line 4: 'o' is no number"),
     "steps": (lambda p: p.write_text("5 5 1 2 0 0 0\n" + "1 0 0 0 0\n" * 25), "no square pixels"),
     "flag": (lambda p: p.write_text("5 5 1 1 7 0 0\n" + "1 0 0 0 0\n" * 25), "unit flag 7"),

@@ -10,14 +10,9 @@ from astropy.io import fits
 
 WAVELENGTH = 632.8e-9
 REAL = Path(__file__).with_name("metropro_interferogram.dat.xz")
-"""A measurement of a real part with a Zygo interferometer, sample_files/valid_zygo_dat_file.dat of prysm, whose licence
-is: The MIT License, Copyright (c) 2017 Brandon Dube, "Permission is hereby granted, free of charge, to any person
-obtaining a copy of this software and associated documentation files (the "Software"), to deal in the Software without
-restriction, including without limitation the rights to use, copy, modify, merge, publish, distribute, sublicense,
-and/or sell copies of the Software, and to permit persons to whom the Software is furnished to do so, subject to the
-following conditions: The above copyright notice and this permission notice shall be included in all copies or
-substantial portions of the Software. The Software is provided "as is", without warranty of any kind." Header and phase
-are to the byte those of the original; its intensities, which nothing here reads, are zeros, so that it packs smaller.
+"""A measurement of a real part with a Zygo interferometer: sample_files/valid_zygo_dat_file.dat of prysm by Brandon
+Dube, under the MIT licence beside it. Header and phase are to the byte those of the original; its intensities, which
+nothing here reads, are zeros, so that it packs to 0.2 MB.
 """
 
 
@@ -36,14 +31,16 @@ def real_file(folder: Path) -> Path:
     return path
 
 
-def metropro(path: Path, values: np.ndarray, form: int = 1, frames: int = 1, **header: float) -> None:
+def metropro(
+    path: Path, values: np.ndarray, form: int = 1, frames: int = 1, counted: int | None = None, **header: float
+) -> None:
     """MetroPro's: header of 834 or 4096 bytes, intensities, then counts from the top row down."""
     size = 4096 if form == 3 else 834
     head = bytearray(size)
     known = {"scale": 0.5, "obliquity": 1.0, "resolution": 1, "sign": 0, "codev": 0, "spacing": 1e-4} | header
     rows, columns = values.shape
     struct.pack_into(">4sHI", head, 0, bytes([0x88, 0x1B, 0x03, 0x6E + form]), form, size)
-    struct.pack_into(">HHH", head, 52, 5, 4, frames)
+    struct.pack_into(">HHH", head, 52, 5, 4, frames if counted is None else counted)
     struct.pack_into(">HHI", head, 68, columns, rows, 4 * rows * columns)
     struct.pack_into(">fff", head, 164, known["scale"], WAVELENGTH, 0.0)
     struct.pack_into(">fff", head, 176, known["obliquity"], 0.0, known["spacing"])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from analysis.measurement_error import UndeterminedError
-from analysis.wavefront_maps.orientation import READINGS, Orientation, ReadingEvidence, tellable
+from analysis.wavefront_maps.orientation import Orientation, ReadingEvidence, tellable
 from optics.numerics.backend import Backend
 from scenes.specs.asbuilt import AsBuiltSetup
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
@@ -84,7 +84,7 @@ def run_check(
         true = bench.draw(rng, setup.test.simulate.law)
         drawn = [k.drawn(k.predict(bench.view(true[None], a))[0], rng) for k, a in zip(kinds, afters, strict=True)]
         # as a file would have them that lies as it says
-        undone = inverse(stated)
+        undone = stated.inverse
         data = [undone.coefficients(values.reshape(-1, len(terms)), terms) for values in drawn]
     prior = bench.parameters.prior
     mean = np.concatenate(
@@ -105,12 +105,6 @@ def run_check(
         raise test.error(str(error), ("measurements",)) from error
     advance("readings", 1, 1)
     return OrientationCheck(setup, tuple(kind.name for kind in kinds), stated, evidence)
-
-
-def inverse(orientation: Orientation) -> Orientation:
-    """What undoes an orientation."""
-    turned = orientation.matrix.T
-    return next(one for one in READINGS if one.sign == orientation.sign and np.array_equal(one.matrix, turned))
 
 
 def _plain(one: Orientation) -> dict[str, Any]:
