@@ -229,11 +229,11 @@ class FocusReadings(MeasuredKind):
         path = self.file("file", self.spec.file, "a focus.json")
         data = read_json(self, path)
         try:
-            rounds = data["rounds"]
-            own = rounds[-1]
-            places, values = own["field"], own["vertex_um"]
-            fields = tuple((float(place), 0.0) for place in places)
-            return fields, tuple(1e-6 * float(value) for value in values)
+            # how far the chips of the first band stand downstream of best focus, after the last round of shims
+            sites = (data["rounds"][-1] if data.get("rounds") else data["initial"])["sites"]
+            own = [site for site in sites if site["band"] == sites[0]["band"]]
+            fields = tuple((float(site["field"]), 0.0) for site in own)
+            return fields, tuple(-1e-6 * float(site["defocus_um"]) for site in own)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise self.wrong(
                 f"no best foci in it ({error!r})", "file", "the focus.json of a run of twin.lab focus", str(path)

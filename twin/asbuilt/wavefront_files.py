@@ -59,17 +59,19 @@ def read_coefficients(one: NamesWavefronts, orientation: Orientation | None = No
     """
     lies = stated_orientation(one) if orientation is None else orientation
     spec, terms = one.spec, tuple(one.spec.numbers)
+
+    def turned(table: np.ndarray) -> np.ndarray:
+        try:
+            return lies.coefficients(table, terms)
+        except MapError as error:
+            raise one.wrong(str(error), "terms") from error
+
     if spec.zernikes is not None:
-        table = _of_table(one, "zernikes", spec.zernikes, len(spec.fields))
+        table = turned(_of_table(one, "zernikes", spec.zernikes, len(spec.fields)))
     else:
         table = np.stack([_of_map(one, k, name, lies) for k, name in enumerate(spec.maps)])
     if spec.reference is not None and Path(spec.reference).suffix.lower() in TABLES:
-        table = table - _of_table(one, "reference", spec.reference, 1)
-    if spec.zernikes is not None:
-        try:
-            table = lies.coefficients(table, terms)
-        except MapError as error:
-            raise one.wrong(str(error), "terms") from error
+        table = table - turned(_of_table(one, "reference", spec.reference, 1))
     return np.asarray(table * (0.5 if spec.double_pass else 1.0))
 
 
