@@ -195,6 +195,21 @@ class BatoidCamera:
             focus += 0.5 * FOCUS_STEP * (low - high) / (low - 2.0 * middle + high)
         return Found(focus, squares(focus))
 
+    def waves(self, errors: Mapping[Error, float]) -> np.ndarray:
+        """Optical paths at the stop's nodes of the designed focus, less the chief rays', (F, N), metres."""
+        mirrors, start = self._mirrors(errors), self._start
+        for _ in range(10):
+            miss = self._target - self._at_stop(mirrors, start)
+            if np.max(np.abs(miss)) < AIMED:
+                break
+            start = start + np.einsum("nij,nj->ni", self._inverse, miss)
+        rays = self._traced(mirrors, start, tuple(mirrors)[-1])
+        batoid.intersect(batoid.Plane(), rays, batoid.CoordSys(origin=[0.0, 0.0, self.spec.image.z]))
+        beams = (len(rays) // len(self.nodes.points), len(self.nodes.points))
+        place, heading, path = rays.r.reshape(*beams, 3), rays.v.reshape(*beams, 3), rays.t.reshape(beams)
+        eikonal = path - np.sum(heading * (place - place[:, :1]), axis=-1)
+        return np.asarray(eikonal[:, 1:] - eikonal[:, :1])
+
     def tried_all(self, errors: Sequence[Error], amounts: np.ndarray) -> list[Found]:
         """Many cameras, of amounts (S, K) of the same errors, one after the other."""
         return [self.tried(dict(zip(errors, row.tolist(), strict=True))) for row in amounts]
