@@ -21,6 +21,7 @@ import numpy as np
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import split
 from optics.geometry.tree import State
+from optics.numerics.physical_error import PhysicalError
 from scenes.specs.tolerance import OF_MONITOR, POSTERIOR, MeritSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.monitor.crosstalk import estimator_gains
@@ -66,7 +67,7 @@ class MonitorMerit:
         experiment: MonitorExperiment,
         camera: str,
         numbers: Sequence[VariedNumber],
-        steps: np.ndarray,
+        ranges: np.ndarray,
     ) -> MonitorMerit | None:
         """That of a budget; None where no merit is about a monitor.
 
@@ -75,7 +76,7 @@ class MonitorMerit:
             experiment: its designed instrument.
             camera: that is judged.
             numbers: K that vary, the compensators last.
-            steps: amount of each, SI, (K,), by which derivatives are differentiated; 0 to leave it out.
+            ranges: of the compensators, SI, (C,).
 
         Raises:
             InputError: the instrument has no monitor, nothing is stated to move, or there is no such reading.
@@ -104,9 +105,18 @@ class MonitorMerit:
         )
         every_one = states_of(numbers, np.array([[one.size for one in numbers]]))[0]
         images = SpotPath(experiment.instrument, experiment.backend, cameras=path.moved_cameras(every_one))
+        # derivatives are differentiated by these amounts
+        sizes = [
+            0.0 if setup.test.tolerances[one.entry].spectrum else one.size for one in numbers[: -len(ranges) or None]
+        ]
+        steps = np.concatenate([sizes, STEP * ranges])
         moved = np.flatnonzero(steps)
         built = [states_of([numbers[k]], steps[k : k + 1, None])[0] for k in moved.tolist()]
-        changes = derivative_changes(motions, path, experiment.sight, experiment.thermal, built)
+        try:
+            changes = derivative_changes(motions, path, experiment.sight, experiment.thermal, built)
+        except PhysicalError as error:
+            problem = f"the monitor has no derivatives at the limits: {error}"
+            raise setup.test.error(problem, ("tolerances",), allowed="smaller limits") from error
         every = tuple(np.zeros((len(numbers), *own.shape[1:])) for own in changes)
         for out, own in zip(every, changes, strict=True):
             out[moved] = own @ root / steps[moved, None, None]

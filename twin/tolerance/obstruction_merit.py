@@ -13,12 +13,23 @@ from optics.numerics import quadrature
 from optics.raytrace.system import assemble
 from optics.waves.imaging import imaging_rays
 from scenes.models.shadow import TracedBeams
+from scenes.specs.tolerance import ToleranceSetup
 from twin.targets.target_path import TargetPath
 
+KIND = "obstruction"
 RINGS = 7
 """Rings of the rays over the stop, as those of an image's quality."""
 AT_ONCE = 40
 """States traced in one launch, to bound memory."""
+
+
+def require_bodies(setup: ToleranceSetup, path: TargetPath) -> None:
+    """Raise InputError where a budget asks for an obstruction and nothing can stand in the beams of the camera."""
+    for name, merit in setup.test.merits.items():
+        if merit.kind == KIND and (path.shadows is None or not path.shadows.casters):
+            problem = f"no body of {setup.base.instrument.name} can stand in the beams of {path.name}"
+            allowed = "an instrument with a monitor, baffles or another camera; or other merits"
+            raise setup.test.error(problem, ("merits", name, "kind"), allowed=allowed)
 
 
 def obstructed_shares(

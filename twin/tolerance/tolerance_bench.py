@@ -37,8 +37,8 @@ from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.tolerance.merits import Merit, merits_of
-from twin.tolerance.monitor_merit import STEP, MonitorMerit
-from twin.tolerance.obstruction_merit import obstructed_shares
+from twin.tolerance.monitor_merit import MonitorMerit
+from twin.tolerance.obstruction_merit import obstructed_shares, require_bodies
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
 
 AT_ONCE = 200
@@ -134,12 +134,12 @@ class ToleranceBench:
         self.optics = CameraOptics.within(instrument, self.camera, backend)
         self.wavelength = float(self.optics.model.spec.wavelength)
         self._wanted = {merit.spec.kind for merit in self.merits}
-        self._require_bodies()
+        require_bodies(setup, self.optics.path)
         if len(self.fields):
             self._prepare()
-        steps = np.concatenate([np.where(self._whole_figures, 0.0, self.sizes), STEP * self.ranges])
-        every = (*self.numbers, *self.compensators)
-        self.monitor = MonitorMerit.of(setup, self.experiment, self.camera, every, steps)
+        self.monitor = MonitorMerit.of(
+            setup, self.experiment, self.camera, (*self.numbers, *self.compensators), self.ranges
+        )
 
     def _camera_name(self) -> str:
         test, names = self.setup.test, tuple(self.instrument.cameras)
@@ -148,20 +148,6 @@ class ToleranceBench:
         if test.camera is not None and test.camera not in names:
             raise test.error(unknown("no such camera", test.camera, names), ("camera",))
         return test.camera or names[0]
-
-    @property
-    def _whole_figures(self) -> np.ndarray:
-        """Which numbers are terms of a whole figure error, (K,)."""
-        return np.array([bool(self.setup.test.tolerances[one.entry].spectrum) for one in self.numbers])
-
-    def _require_bodies(self) -> None:
-        """Raise InputError where nothing can stand in the beams that are asked for."""
-        shadows = self.optics.path.shadows
-        for merit in self.merits:
-            if merit.spec.kind == "obstruction" and (shadows is None or not shadows.casters):
-                problem = f"no body of {self.setup.base.instrument.name} can stand in the beams of {self.camera}"
-                allowed = "an instrument with a monitor, baffles or another camera; or other merits"
-                raise self.setup.test.error(problem, ("merits", merit.name, "kind"), allowed=allowed)
 
     # what does not change from camera to camera
 
