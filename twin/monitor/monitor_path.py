@@ -404,10 +404,6 @@ class _OnSpots(MonitorBeams):
     def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
         """A CCD that is set to its spot has it."""
 
-    def coarse_trace(self, states: Sequence[State], placed: PlacedBodies | None = None) -> CoarseTrace:
-        known = super().coarse_trace(states, placed)
-        return replace(known, place=np.zeros_like(known.place))
-
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         rays = super().rays(states, coarse)
         share = self.nodes.share * rays.valid
@@ -419,3 +415,6 @@ class SpotPath(_OnSpots, MonitorPath):
     """Images of a monitor whose area CCDs have been set, when the instrument was built, so that every spot stands in
     the middle of its own: for spots of instruments that are not built as designed.
     """
+
+    def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+        return super().class_of(replace(known, place=np.zeros_like(known.place)), margin)
