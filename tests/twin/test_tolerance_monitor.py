@@ -131,6 +131,7 @@ def test_the_noise_of_blurred_spots_is_that_of_a_fit_to_them(bench: ToleranceBen
     np.testing.assert_allclose(bound[: len(fitted)], fitted, rtol=0.01)
 
 
+@pytest.mark.second
 def test_derivatives_are_those_of_the_built_instrument(bench: ToleranceBench) -> None:
     """Interpolated ones miss little of what tolerances change."""
     monitor = bench.monitor

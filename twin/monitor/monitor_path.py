@@ -417,4 +417,5 @@ class SpotPath(_OnSpots, MonitorPath):
     """
 
     def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+        """Number of the class of nodes that is right for all spots of each state, in the middle, (S,)."""
         return super().class_of(replace(known, place=np.zeros_like(known.place)), margin)

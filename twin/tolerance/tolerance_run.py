@@ -14,7 +14,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
-from scenes.specs.tolerance import MERIT_UNITS, ToleranceSetup, amount_text
+from scenes.specs.tolerance import MERIT_UNITS, AllocationSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import LENGTH
 from scenes.yaml.yaml_file import dump_yaml
@@ -316,7 +316,7 @@ def _warnings(
     merits: tuple[MeritResult, ...],
     allocation: Allocation | None,
     judged: Yield | None,
-    spec: Any,
+    spec: AllocationSpec | None,
 ) -> list[str]:
     out = []
     lost = [problem for problem in samples.problems if problem]
@@ -348,21 +348,28 @@ def _warnings(
             f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all"
         )
     if allocation is not None and judged is not None and spec is not None:
-        if not allocation.reached and allocation.unrounded:
-            out.append(
-                f"limits rounded to the grades do not reach a yield of {100 * spec.target:.0f} %, by the model "
-                f"{100 * allocation.predicted[1]:.1f} %, though those before rounding do: use more grades"
-            )
-        elif not allocation.reached:
-            out.append(
-                f"no limits that were found, up to {spec.tightest:g} times tighter, reach a yield of "
-                f"{100 * spec.target:.0f} %: those of the table have {100 * allocation.predicted[1]:.1f} % by the model"
-            )
-        if not judged.low <= allocation.predicted[1] <= judged.high:
-            out.append(
-                f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
-                f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
-            )
+        out += _allocation_warnings(allocation, judged, spec)
+    return out
+
+
+def _allocation_warnings(allocation: Allocation, judged: Yield, spec: AllocationSpec) -> list[str]:
+    """Of limits that do not reach what is asked, or of which other cameras say something else than the model."""
+    out = []
+    if not allocation.reached and allocation.unrounded:
+        out.append(
+            f"limits rounded to the grades do not reach a yield of {100 * spec.target:.0f} %, by the model "
+            f"{100 * allocation.predicted[1]:.1f} %, though those before rounding do: use more grades"
+        )
+    elif not allocation.reached:
+        out.append(
+            f"no limits that were found, up to {spec.tightest:g} times tighter, reach a yield of "
+            f"{100 * spec.target:.0f} %: those of the table have {100 * allocation.predicted[1]:.1f} % by the model"
+        )
+    if not judged.low <= allocation.predicted[1] <= judged.high:
+        out.append(
+            f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
+            f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
+        )
     return out
 
 
