@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from optics.geometry.zernike import MAX_NOLL
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.course import noll
+from scenes.specs.disturbances import JobDisturbances
 from scenes.specs.job import JobSpec
 from scenes.specs.motion_text import PURE, motion_of
 from scenes.specs.resolved import ExperimentSetup, ResolvedJob, read_setup, resolve_job
@@ -246,10 +247,17 @@ MERIT_UNITS: Mapping[str, Kind | None] = FrozenMap(
         "principal_distance": LENGTH,
         "distortion": LENGTH,
         "chief_ray": ANGLE,
+        "obstruction": None,
+        "monitor_angle": ANGLE,
+        "monitor_focus": LENGTH,
     }
 )
 """Kind of a merit -> what it measures; None for a pure number (waves of the design wavelength, MTF)."""
 MORE_IS_BETTER = ("mtf",)
+OF_MONITOR = ("monitor_angle", "monitor_focus")
+"""Kinds of merits that are about the readings of a monitor."""
+POSTERIOR = "posterior"
+"""Estimator of a monitor's readings that has the least variance."""
 
 
 class MeritSpec(Spec):
@@ -259,10 +267,16 @@ class MeritSpec(Spec):
         kind: `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which
             the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`,
             largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
-            turn of a chief ray at the line CCD.
-        fields: of wavefront and mtf, the worst of which counts: shares of the half field along the line and the track.
+            turn of a chief ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the stop,
+            that bodies of the instrument take; `monitor_angle` and `monitor_focus`, standard deviation that the
+            monitor's readings of a rotation and of `d_f` have under the disturbances.
+        fields: of wavefront, mtf, chief_ray and obstruction, the worst of which counts: shares of the half field along
+            the line and the track.
         frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
         direction: of mtf: along the line, along the track, or the worse of both.
+        reading: of monitor_angle: `angle` between the lines of sight of a pair, or `d_alpha`, `d_beta`, `d_gamma` of
+            the camera; by default that angle of a pair, and the worst of these three of one camera.
+        estimator: of the monitor's readings.
         at_most: largest value that passes; a change counts either way.
         at_least: smallest value that passes, of mtf.
         probability: share of cameras that are to pass.
@@ -270,10 +284,23 @@ class MeritSpec(Spec):
             and requirement over the square root of the number of tolerances.
     """
 
-    kind: Literal["wavefront", "mtf", "boresight", "roll", "principal_distance", "distortion", "chief_ray"]
+    kind: Literal[
+        "wavefront",
+        "mtf",
+        "boresight",
+        "roll",
+        "principal_distance",
+        "distortion",
+        "chief_ray",
+        "obstruction",
+        "monitor_angle",
+        "monitor_focus",
+    ]
     fields: Annotated[tuple[tuple[FieldShare, FieldShare], ...], Field(min_length=1, max_length=100)] = NINE
     frequency: Annotated[Number, Field(gt=0.0, le=10_000.0)] | None = None
     direction: Literal["line", "track", "worse"] = "worse"
+    reading: Literal["angle", "d_alpha", "d_beta", "d_gamma"] | None = None
+    estimator: Name = POSTERIOR
     at_most: Amount | None = None
     at_least: Number | None = None
     probability: Share = 0.9
@@ -291,6 +318,10 @@ class MeritSpec(Spec):
                 raise Problem("not greater than zero", shown(value), within=(key,))
         if self.kind != "mtf" and (self.frequency is not None or self.direction != "worse"):
             raise Problem(f"{self.kind} has no frequency and no direction", self.kind, "kind: mtf", within=("kind",))
+        if self.kind != "monitor_angle" and self.reading is not None:
+            raise Problem(f"{self.kind} has no reading", self.kind, "kind: monitor_angle", within=("kind",))
+        if self.kind not in OF_MONITOR and self.estimator != POSTERIOR:
+            raise Problem(f"{self.kind} has no estimator", self.kind, " or ".join(OF_MONITOR), within=("kind",))
         return self
 
     def _si(self, value: Amount, key: str) -> float:
@@ -345,6 +376,8 @@ class ToleranceBudgetSpec(Spec):
     Attributes:
         instrument: a camera or an instrument, by name or path, as in a job.
         camera: which camera of an instrument is judged; may be left out where there is one.
+        disturbances: what is expected to move between two measurements of the monitor, as in a job; those of the
+            instrument if not given.
         tolerances: by name, what varies.
         compensators: by name, what is adjusted in every camera, in this order; the mean square wavefront error over all
             fields of the merits is made least.
@@ -357,6 +390,7 @@ class ToleranceBudgetSpec(Spec):
 
     instrument: Reference
     camera: Name | None = None
+    disturbances: JobDisturbances | None = None
     tolerances: Annotated[Named[ToleranceSpec], Field(min_length=1, max_length=300)]
     compensators: Annotated[Named[CompensatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
@@ -364,6 +398,13 @@ class ToleranceBudgetSpec(Spec):
     seed: Seed = 0
     allocation: AllocationSpec | None = None
     limits: Annotated[LimitsSpec, NothingIsEmpty] = LimitsSpec()
+
+    @model_validator(mode="after")
+    def _disturbances_have_readings(self) -> ToleranceBudgetSpec:
+        if self.disturbances is not None and not any(one.kind in OF_MONITOR for one in self.merits.values()):
+            allowed = f"a merit of kind {' or '.join(OF_MONITOR)}, or no disturbances"
+            raise Problem("no merit rests on disturbances", None, allowed, within=("disturbances",))
+        return self
 
 
 class ToleranceSetup(ExperimentSetup[ToleranceBudgetSpec]):
@@ -389,5 +430,6 @@ def resolve_tolerance(path: str | Path) -> ToleranceSetup:
     if setup is not None:
         return setup
     test = validate(ToleranceBudgetSpec, read_yaml(path))
-    job = JobSpec.model_validate({"instrument": test.instrument}).with_source(test.source)
+    given = {key: value for key, value in test.plain().items() if key in ("instrument", "disturbances")}
+    job = JobSpec.model_validate(given).with_source(test.source)
     return ToleranceSetup(test=test, base=resolve_job(job))

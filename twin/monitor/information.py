@@ -17,7 +17,9 @@ import numpy as np
 from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.ground_error import GroundGeometry
 from analysis.monitor.limits import Split, split
+from analysis.monitor.recovery import joint
 from analysis.spots.likelihood import image_bound
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from scenes.models.disturbances import motions_of_spec
 from scenes.models.instrument_model import Instrument
@@ -181,18 +183,45 @@ def spot_noise(
     Raises:
         BeamMissedError, AimError: light does not come to the area CCDs.
     """
-    channels, spec = path.channels, path.instrument.spec
+    channels = path.channels
     groups = {(c.camera, c.aperture) if alike else c.key: c for c in reversed(channels)}
     shown = tuple(c for c in channels if c in groups.values())
     own = path if len(shown) == len(channels) else MonitorPath(replace(path.instrument, channels=shown), path.backend)
     photons = own.expected_photons([{}], margin=_SLOPE, single=single)[0]
-    exposure = spec.autocollimator.area_ccd.exposure
-    model, dark = detector.noise_model(exposure), float(detector.expected_dn(np.zeros((1, 1)), exposure)[0, 0])
-    out, brightest = np.zeros((len(channels), 2, len(channels), 2)), np.zeros(len(channels))
-    for k, channel in enumerate(channels):
+    images = []
+    for channel in channels:
         like = groups[(channel.camera, channel.aperture) if alike else channel.key]
-        image = photons[shown.index(like)] * (channel.photons / like.photons)
-        light = detector.expected_dn(image, exposure) - dark
-        out[k, :, k, :] = 2.0 * image_bound(light[None], dark, model, spec.autocollimator.frames)[0]
-        brightest[k] = light.max() / (detector.saturation_dn - dark)
-    return out.reshape(2 * len(channels), -1), brightest
+        images.append(photons[shown.index(like)] * (channel.photons / like.photons))
+    bounds, brightest = _image_bounds(np.stack(images)[None], path, detector)
+    return joint(2.0 * bounds)[0], brightest[0]
+
+
+def built_noise(path: MonitorPath, detector: EmvaDetector, states: Sequence[State]) -> np.ndarray:
+    """Covariance of all shifts by the noise of images, px^2, (S, D, D), as of ``spot_noise``, of instruments that are
+    built as S states say: both images of each are its own.
+
+    Args:
+        path: the monitor's light.
+        detector: of the area CCDs.
+        states: S of them.
+
+    Raises:
+        BeamMissedError, AimError: light does not come to the area CCDs, or no image can be made of it.
+    """
+    found = [_image_bounds(photons, path, detector)[0] for _, photons in path.iterate_photons(states, margin=_SLOPE)]
+    return joint(2.0 * np.concatenate(found))
+
+
+def _image_bounds(photons: np.ndarray, path: MonitorPath, detector: EmvaDetector) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (S, C, 2, 2) px^2 of spots by their images (S, C, H, W) with the margin of ``_SLOPE``, and how full their
+    brightest pixels are, (S, C).
+    """
+    spec = path.instrument.spec.autocollimator
+    exposure = spec.area_ccd.exposure
+    model, dark = detector.noise_model(exposure), float(detector.expected_dn(np.zeros((1, 1)), exposure)[0, 0])
+    bounds, brightest = np.zeros((*photons.shape[:2], 2, 2)), np.zeros(photons.shape[:2])
+    for k in range(photons.shape[1]):
+        light = detector.expected_dn(photons[:, k], exposure) - dark
+        bounds[:, k] = image_bound(light, dark, model, spec.frames)
+        brightest[:, k] = light.max(axis=(1, 2)) / (detector.saturation_dn - dark)
+    return bounds, brightest

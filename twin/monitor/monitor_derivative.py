@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
-from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State
+from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State, compose
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
 from optics.numerics.number_tree import Path, leaves
@@ -32,10 +32,11 @@ from scenes.models.disturbances import Component, StatedMotions, state_of
 from scenes.models.instrument_model import Instrument
 from scenes.models.thermal_model import ThermalModel
 from scenes.specs.disturbances import TimeLawSpec
+from scenes.specs.instrument import BASE
 from twin.monitor.monitor_beams import AIM_TOLERANCE, MonitorBeams
 from twin.monitor.monitor_path import MonitorPath
 from twin.monitor.motions import FIGURE_TERMS, ElementaryMotion, pivot_states
-from twin.monitor.truth import trace_truth, truth_jacobian
+from twin.monitor.truth import LineSight, trace_truth, truth_jacobian
 
 
 def _size_steps(placed: PlacedBodies, bodies: Sequence[str]) -> np.ndarray:
@@ -405,6 +406,69 @@ def _by_differences(
     changes = [np.stack([c.d_alpha, c.d_beta, c.d_gamma, c.d_f]) for c in truth.cameras.values()]
     both = np.concatenate(changes)
     return (rows[:, :count] - rows[:, count:]) / (2.0 * steps), (both[:, :count] - both[:, count:]) / (2.0 * steps)
+
+
+SMALL: Mapping[str, float] = {"rotate": 1e-6, "shift": 1e-6, "scale": 1e-6, "figure": 1e-8}
+"""Steps of what is rigid, of growth and of figures, SI, where two derivatives are compared that are taken alike."""
+
+
+def derivative_changes(
+    stated: StatedMotions, path: MonitorPath, sight: LineSight, thermal: ThermalModel, built: Sequence[State]
+) -> tuple[np.ndarray, np.ndarray]:
+    """By how much the derivatives of ``disturbances_of`` are others in instruments that are not built as designed.
+
+    Both are one-sided differences of exact traces with the same steps, so that what is wrong with each cancels.
+
+    Args:
+        stated: the motions, M of them; they act about an instrument that is built otherwise.
+        path: the monitor's light, D spot coordinates.
+        sight: of the K line CCDs.
+        thermal: of the instrument.
+        built: Z states.
+
+    Returns:
+        Of spots, px, (Z, D, M), and of parameters, (Z, 4 K, M), for one standard deviation each.
+
+    Raises:
+        AimError, BeamMissedError: the light of one is lost.
+    """
+    components = stated.components
+    steps = np.array([{**STEPS, **SMALL}[c.kind] for c in components])
+    heat = [c for c in components if c.kind in STEPS]
+    singles = [
+        state_of(steps[k] * np.array([c is one for one in heat]), heat, thermal)
+        if c.kind in STEPS
+        else _elementary(c).state(float(steps[k]))
+        for k, c in enumerate(components)
+    ]
+    bodies = {body.path: body for body in path.instrument.assembly.tree.bodies}
+    roots = {name: f"{BASE}/{name}" for name in path.instrument.cameras}
+
+    def reached(state: State) -> set[str]:
+        """Cameras of whose spots' or lines' light something moves."""
+        inside = {name for name, root in roots.items() if any(f"{body}/".startswith(f"{root}/") for body in state)}
+        return inside | set(path.moved_cameras(state))
+
+    reach = [reached(single) for single in singles]
+
+    def slopes(about: State, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        states = [about, *(compose(singles[m], about, bodies) for m in which.tolist())]
+        spots = np.moveaxis(path.coarse_trace(states).place, 1, 2).reshape(-1, len(states))
+        truth = sight.truth(states)
+        found = spots, np.concatenate([truth.vector(name).T for name in truth.cameras])
+        size = stated.sigma[which] / steps[which]
+        return tuple((values[:, 1:] - values[:, :1]) * size for values in found)
+
+    designed = slopes({}, np.arange(len(components)))
+    out = tuple(np.zeros((len(built), *one.shape)) for one in designed)
+    for z, about in enumerate(built):
+        # a motion changes nothing of what another one does to light that it does not meet
+        own = reached(about)
+        which = np.array([m for m, cameras in enumerate(reach) if own & cameras], dtype=int)
+        if which.size:
+            for change, now, before in zip(out, slopes(about, which), designed, strict=True):
+                change[z][:, which] = now - before[:, which]
+    return out[0], out[1]
 
 
 def _law(law: TimeLawSpec) -> TimeLaw:

@@ -9,6 +9,7 @@ the pinhole is an incoherent disk imaged at unit scale. Every image is made with
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +22,7 @@ from optics.raytrace.system import touched_bodies
 from optics.waves.diffraction import PupilField, image
 from optics.waves.pixel_response import PixelResponse, UnsampledImageError
 from scenes.models.instrument_model import Instrument
-from scenes.specs.instrument import BASE
+from scenes.specs.instrument import BASE, Channel
 from twin.monitor.image_sampling import (
     GOOD,
     SPOT_RANGES,
@@ -392,3 +393,29 @@ class MonitorPath(MonitorBeams):
         pixel.
         """
         return np.array([channel.photons * self.pitch**2 for channel in self.channels])
+
+
+class _OnSpots(MonitorBeams):
+    """Beams whose positions count from the middle of their own spot, wherever it stands."""
+
+    def _with(self, nodes: PupilNodes) -> MonitorBeams:
+        return _OnSpots(self.instrument, self.backend, nodes, self.cameras)
+
+    def _require_on_ccd(self, channel: Channel, place: np.ndarray) -> None:
+        """A CCD that is set to its spot has it."""
+
+    def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
+        rays = super().rays(states, coarse)
+        share = self.nodes.share * rays.valid
+        middle = np.einsum("bn,bnk->bk", share / np.sum(share, axis=1, keepdims=True), rays.position)
+        return replace(rays, position=rays.position - middle[:, None] * [1.0, 1.0, 0.0])
+
+
+class SpotPath(_OnSpots, MonitorPath):
+    """Images of a monitor whose area CCDs have been set, when the instrument was built, so that every spot stands in
+    the middle of its own: for spots of instruments that are not built as designed.
+    """
+
+    def class_of(self, known: CoarseTrace, margin: int = 0) -> np.ndarray:
+        """Number of the class of nodes that is right for all spots of each state, in the middle, (S,)."""
+        return super().class_of(replace(known, place=np.zeros_like(known.place)), margin)

@@ -51,7 +51,8 @@ class Allocation:
         limits: entry -> new limit as files have it.
         cost: of all entries, before and after.
         predicted: yield of the old and of the new limits, by the model as it was corrected.
-        reached: whether that reaches the yield that was asked.
+        reached: whether the yield of the new limits, as they are rounded, reaches what was asked.
+        unrounded: whether that of the limits before rounding does.
     """
 
     scales: np.ndarray
@@ -60,6 +61,7 @@ class Allocation:
     cost: tuple[float, float]
     predicted: tuple[float, float]
     reached: bool
+    unrounded: bool
 
 
 def allocate(
@@ -101,15 +103,24 @@ def allocate(
             break
         total = total + trade.tightened(np.where(costs.kept, 0.0, np.clip(low - total, -np.log(BOUND), 0.0)))
         trade = _Trade.at(bench, total, samples, costs, share)
-    reached = trade.quantile(nothing)[0] <= 0.0
-    for looser in (reached, False):
+    passes = trade.quantile(nothing)[0] <= 0.0
+    for looser in (passes, False):
         limits, rounded = _graded(setup, trade, total, spec, looser)
         final = _Trade.at(bench, np.log(rounded), samples, costs, share)
         if final.quantile(nothing)[0] <= 0.0:
             break
+    predicted = final.passing(nothing)
     advance("allocation", ROUNDS, ROUNDS)
     cost = costs.of_level(nothing), costs.of_level(np.log(rounded))
-    return Allocation(np.exp(total), rounded, FrozenMap(limits), cost, (first, final.passing(nothing)), reached)
+    return Allocation(
+        np.exp(total),
+        rounded,
+        FrozenMap(limits),
+        cost,
+        (first, predicted),
+        predicted >= spec.target,
+        trade.passing(nothing) >= spec.target,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scenes.specs.tolerance import OF_MONITOR
 from twin.run.procedure import Advance, silent
 from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench, Tried
 
@@ -162,7 +163,7 @@ def _spread(bench: ToleranceBench, model: MeritModel, rows: np.ndarray, share: n
     rms = np.outer(share, np.sqrt(np.sum(model.slope[:, rows] ** 2, axis=1)))
     bends = np.zeros(bench.parts, dtype=bool)
     for merit in bench.merits:
-        bends[merit.parts] = merit.spec.kind in ("wavefront", "mtf")
+        bends[merit.parts] = merit.spec.kind in ("wavefront", "mtf", *OF_MONITOR)
     return np.asarray(model.nominal + np.where(bends, mean, rms))
 
 

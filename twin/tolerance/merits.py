@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from scenes.specs.tolerance import MeritSpec
+from twin.tolerance.monitor_merit import readings_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,7 +16,8 @@ class Merit:
     """One merit of a budget.
 
     Its **parts** change smoothly with small motions, which its value, as the worst of some fields, does not: mean
-    square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line.
+    square wavefront errors by field, MTF by field and direction, components of a turn, residual places along the line,
+    shares of a beam by field, variances of readings.
 
     Attributes:
         name: in the file.
@@ -33,6 +36,8 @@ class Merit:
         own = parts[..., self.parts]
         match self.spec.kind:
             case "wavefront":
+                return np.sqrt(np.maximum(np.max(own, axis=-1), 0.0))
+            case "monitor_angle" | "monitor_focus":
                 return np.sqrt(np.maximum(np.max(own, axis=-1), 0.0))
             case "mtf":
                 return np.asarray(np.min(own, axis=-1))
@@ -60,13 +65,17 @@ class Merit:
 
 
 PART_COUNTS = {"boresight": 2, "roll": 1, "principal_distance": 1}
+AT_FIELDS = ("wavefront", "mtf", "chief_ray", "obstruction")
+"""Kinds of merits that have fields."""
 """Kind of a merit -> number of its parts, where that does not depend on fields."""
 
 
-def part_count(spec: MeritSpec, line_points: int) -> int:
+def part_count(spec: MeritSpec, line_points: int, cameras: Sequence[str] = ()) -> int:
     """Number of a merit's parts."""
     match spec.kind:
-        case "wavefront":
+        case "monitor_angle" | "monitor_focus":
+            return len(readings_of(spec, cameras))
+        case "wavefront" | "obstruction":
             return len(spec.fields)
         case "mtf":
             return len(spec.fields) * (2 if spec.direction == "worse" else 1)
@@ -78,14 +87,22 @@ def part_count(spec: MeritSpec, line_points: int) -> int:
             return PART_COUNTS[kind]
 
 
-def merits_of(specs: dict[str, MeritSpec], line_points: int) -> tuple[tuple[Merit, ...], np.ndarray]:
-    """The merits of a budget, and the fields (F, 2) that any of them has."""
+def merits_of(
+    specs: dict[str, MeritSpec], line_points: int, cameras: Sequence[str] = ()
+) -> tuple[tuple[Merit, ...], np.ndarray]:
+    """The merits of a budget, and the fields (F, 2) that any of them has.
+
+    Args:
+        specs: by name.
+        line_points: at which distortion is told.
+        cameras: of the instrument.
+    """
     fields: dict[tuple[float, float], int] = {}
     out, start = [], 0
     for name, spec in specs.items():
-        used = spec.fields if spec.kind in ("wavefront", "mtf", "chief_ray") else ()
+        used = spec.fields if spec.kind in AT_FIELDS else ()
         numbers = np.array([fields.setdefault(place, len(fields)) for place in used], dtype=int)
-        count = part_count(spec, line_points)
+        count = part_count(spec, line_points, cameras)
         out.append(Merit(name, spec, numbers, slice(start, start + count)))
         start += count
     return tuple(out), np.array(list(fields)).reshape(-1, 2)

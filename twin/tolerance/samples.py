@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import fcntl
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ from twin.run.procedure import Advance, silent
 from twin.study.runs import cluster
 from twin.study.runs.base_job import BlockResult, Failure, Outcome, Run, Tree, one_line, with_values
 from twin.study.runs.chunk_store import ChunkStore
-from twin.study.runs.engine import Engine, Progress
+from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
 from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench
@@ -202,11 +202,13 @@ class Workforce:
         workers: number of processes; 0 for this one alone.
         scheduler: address of a running cluster, None for none.
         journal: folder that keeps what is done, to go on with; None for none, then nothing is kept.
+        warn: told what the user should know of how it is done.
     """
 
     workers: int = 0
     scheduler: str | None = None
     journal: Path | None = None
+    warn: Callable[[str], None] = field(default=lambda text: None, compare=False)
 
 
 def draw_samples(
@@ -268,16 +270,30 @@ def _by_engine(
     with _journal(folder, plan.setup.fingerprint):
         store = ChunkStore(folder, plan)
         store.open()
-        engine = Engine(plan, store, backend.name, Progress(done=lambda done, total: advance(part, done, total)))
+        for text in store.corrupt:
+            force.warn(text)
+        progress = Progress(done=lambda done, total: advance(part, done, total), warn=force.warn)
+        engine = Engine(plan, store, backend.name, progress)
         if store.missing:
             who = (
-                cluster.remote_workers(force.scheduler, lambda text: None)
+                cluster.remote_workers(force.scheduler, force.warn)
                 if force.scheduler is not None
-                else cluster.local_workers(max(1, force.workers))
+                else cluster.local_workers(_workers(plan, force))
             )
             with who as workers:
+                for text in workers.warnings:
+                    force.warn(text)
                 engine.run(workers, memory.largest_memory())
         return store.result()
+
+
+def _workers(plan: Plan, force: Workforce) -> int:
+    """Number of worker processes, as many as fit into the memory."""
+    limits, wanted = plan.setup.study.limits, max(1, force.workers)
+    count = fit_workers(wanted, limits.bytes, cluster.LEAST_MEMORY)
+    if count < wanted:
+        force.warn(f"{count} workers instead of {wanted}: no more fit into the budget's {limits.memory}")
+    return count
 
 
 @contextmanager

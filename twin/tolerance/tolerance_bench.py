@@ -1,7 +1,8 @@
 """One camera on which tolerances are tried: exact traces of many cameras at once, with their adjustments.
 
 All wavefronts are those of the beams that the designed camera images at the merits' fields, traced through the same
-points of the stop. What bodies and edges take of a beam is that of the designed camera.
+points of the stop. What bodies and edges take of a beam is that of the designed camera, but where it is itself the
+merit.
 """
 
 from __future__ import annotations
@@ -30,12 +31,14 @@ from optics.waves.transfer import transfer
 from optics.waves.varied_pupil import VariedTransfer
 from optics.waves.wavefront import path_to_sphere
 from scenes.models.camera_model import LAUNCH_DISTANCE
-from scenes.specs.tolerance import ToleranceSetup
+from scenes.specs.tolerance import OF_MONITOR, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.tolerance.merits import Merit, merits_of
+from twin.tolerance.monitor_merit import MonitorMerit
+from twin.tolerance.obstruction_merit import obstructed_shares, require_bodies
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
 
 AT_ONCE = 200
@@ -104,6 +107,7 @@ class ToleranceBench:
         compensators: that are adjusted.
         merits: that are asked.
         fields: of the wavefronts, (F, 2).
+        monitor: of the instrument; None where no merit is about it.
 
     Raises:
         InputError: names that do not exist, a merit that the camera cannot have, or a camera without light.
@@ -119,7 +123,7 @@ class ToleranceBench:
         thermal = self.experiment.thermal
         self.numbers: tuple[VariedNumber, ...] = tolerance_numbers(setup, instrument, thermal)
         self.compensators: tuple[VariedNumber, ...] = compensator_numbers(setup, instrument, thermal)
-        self.merits, self.fields = merits_of(dict(test.merits), len(self._along))
+        self.merits, self.fields = merits_of(dict(test.merits), len(self._along), tuple(instrument.cameras))
         if not len(self.fields) and self.compensators:
             allowed = "a merit of kind wavefront, mtf or chief_ray, at whose fields the wavefront is made least"
             raise test.error("compensators need fields", ("merits",), allowed=allowed)
@@ -130,8 +134,12 @@ class ToleranceBench:
         self.optics = CameraOptics.within(instrument, self.camera, backend)
         self.wavelength = float(self.optics.model.spec.wavelength)
         self._wanted = {merit.spec.kind for merit in self.merits}
+        require_bodies(setup, self.optics.path)
         if len(self.fields):
             self._prepare()
+        self.monitor = MonitorMerit.of(
+            setup, self.experiment, self.camera, (*self.numbers, *self.compensators), self.ranges
+        )
 
     def _camera_name(self) -> str:
         test, names = self.setup.test, tuple(self.instrument.cameras)
@@ -378,7 +386,7 @@ class ToleranceBench:
             return states_of((*self.numbers, *self.compensators), np.concatenate([amounts, moves], axis=1))
 
         if not len(self.fields):
-            return Tried(moves, self._parts(state(moves), None, None), ("",) * count, settled)
+            return Tried(moves, self._parts(state(moves), amounts, moves, None, None), ("",) * count, settled)
         states = state(moves)
         paths, chiefs = self._errors(states)
         if np.any(self.ranges > 0.0):
@@ -401,7 +409,7 @@ class ToleranceBench:
                 moves = self._made(self._residuals(paths), moves, errors)
                 states = state(moves)
                 paths, chiefs = self._errors(states)
-        return Tried(moves, self._parts(states, paths, chiefs), ("",) * count, settled, paths)
+        return Tried(moves, self._parts(states, amounts, moves, paths, chiefs), ("",) * count, settled, paths)
 
     def _made(self, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
         """Moves as they are made: by whole steps and with errors, one after the other."""
@@ -472,9 +480,23 @@ class ToleranceBench:
                     out[part] = one.curvature(slopes[:, f])
         return out
 
-    def _parts(self, states: Sequence[State], paths: np.ndarray | None, chiefs: np.ndarray | None) -> np.ndarray:
+    def _parts(
+        self,
+        states: Sequence[State],
+        amounts: np.ndarray,
+        moves: np.ndarray,
+        paths: np.ndarray | None,
+        chiefs: np.ndarray | None,
+    ) -> np.ndarray:
         """Parts of all merits, (S, P)."""
         out = np.empty((len(states), self.parts))
+        known: dict[str, np.ndarray] = {}
+        if self.monitor is not None:
+            known = self.monitor.variances(np.concatenate([amounts, moves], axis=1), states)
+        taken = None
+        if "obstruction" in self._wanted:
+            start = np.asarray(self._fan.position)[:, 0]
+            taken = obstructed_shares(self.optics.path, states, self.directions, start)
         squares = None
         if paths is not None and "wavefront" in self._wanted:
             terms = self._residuals(paths).reshape(len(states), len(self.fields), -1)
@@ -492,6 +514,11 @@ class ToleranceBench:
                 assert chiefs is not None
                 turn = chiefs[:, merit.fields, :2] - self.chief[merit.fields, :2]
                 own = turn.reshape(len(states), -1)
+            elif kind == "obstruction":
+                assert taken is not None
+                own = taken[:, merit.fields]
+            elif kind in OF_MONITOR:
+                own = known[merit.name]
             else:
                 own = line[kind]
             out[:, merit.parts] = own

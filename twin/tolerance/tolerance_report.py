@@ -6,11 +6,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from scenes.yaml.units import split_quantity
 from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, shown_unit
 from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.tolerance.merit_models import FARTHEST
-from twin.tolerance.tolerance_run import LEVELS, MeritResult, ToleranceRun, Yield, merit_unit
+from twin.tolerance.monitor_merit import readings_of
+from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield, merit_unit
 
 _FEW = 3
 """Tolerances that the verdict names."""
@@ -62,6 +64,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
             name="inverse",
         ),
         *_allocation_sections(run),
+        *_monitor_sections(run),
         *_compensator_sections(run),
         Section(
             "Worst cameras",
@@ -132,7 +135,12 @@ def _further(run: ToleranceRun) -> list[str]:
                 f"{found.cost[1]:.3g} against {found.cost[0]:.3g}"
             )
         else:
-            out.append(f"No allocation within the bounds reaches a yield of {_percent(asked.target)}")
+            which = (
+                "None of the graded limits that were found" if found.unrounded else "No allocation within the bounds"
+            )
+            out.append(
+                f"{which} reaches a yield of {_percent(asked.target)}: those of the table give {_interval(judged)}"
+            )
     return out
 
 
@@ -198,7 +206,9 @@ def _shares_table(run: ToleranceRun) -> Table:
 
 
 def _sensitivity_table(run: ToleranceRun) -> Table:
+    adjusted = run.setup.test.compensators
     rows: list[list[Cell]] = []
+    full: list[list[Cell]] = []
     for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
         cells: list[Cell] = [
             name,
@@ -207,11 +217,37 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         ]
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
-        rows.append(cells)
-    heads = ("tolerance", "motion", "limit", *(sign for _ in run.merits for sign in ("\N{MINUS SIGN}", "+")))
-    over = (("", 3), *((_head(one), 2) for one in run.merits))
+        shares = [
+            float(run.found.moves[e, end, c]) / (compensator.range_si or 1.0)
+            for c, compensator in enumerate(adjusted.values())
+            for end in (0, 1)
+        ]
+        ranges = [compensator.range for compensator in adjusted.values() for _ in (0, 1)]
+        both = list(zip(ranges, shares, strict=True))
+        rows.append([*cells, *(_scaled_limit(limit, x) if np.isfinite(x) else "" for limit, x in both)])
+        full.append([*cells, *(_number(limit)[0] * x if np.isfinite(x) else None for limit, x in both)])
+    signs = ("\N{MINUS SIGN}", "+")
+    moved = [f"move of {name} [{_number(c.range)[1]}]".replace(" []", "") for name, c in adjusted.items()]
+    groups = [*map(_head, run.merits), *moved]
+    heads = ("tolerance", "motion", "limit", *(sign for _ in groups for sign in signs))
+    over = (
+        ("", 3),
+        *((group, 2) for group in groups[: len(run.merits)]),
+        *((f"move of {name}", 2) for name in adjusted),
+    )
     caption = "Merits with one tolerance at its limit. Of a figure error: what its terms come to on the average."
-    return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over)
+    if adjusted:
+        caption += " Then how far each compensator is moved for it; a figure error has no one answer."
+    told = Table(
+        "sensitivities", "", "", (*heads[:3], *(f"{group} {sign}" for group in groups for sign in signs)), full
+    )
+    return Table("sensitivities", "Each tolerance at its limits", caption, heads, rows, over=over, full=told)
+
+
+def _number(limit: str | float) -> tuple[float, str]:
+    """Number and unit of a limit as files have it; a pure number has none."""
+    parts = split_quantity(limit)
+    return (float(limit), "") if parts is None else (float(parts[0]), parts[1])
 
 
 def _inverse_table(run: ToleranceRun) -> Table:
@@ -298,6 +334,26 @@ def _compensator_sections(run: ToleranceRun) -> tuple[Section, ...]:
     table = Table("compensators", "Adjustments", "Over all cameras.", heads, rows)
     tables = (table,) if run.allocation is not None else (table, _tol_table(run))
     return (Section("Compensators", (), tables, name="compensators"),)
+
+
+def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
+    if not run.missed or run.bench.monitor is None:
+        return ()
+    stated = run.bench.monitor.stated.name
+    rows: list[list[Cell]] = []
+    for one in run.merits:
+        if one.merit.name in run.missed:
+            spec = one.merit.spec
+            readings = ", ".join(readings_of(spec, tuple(run.bench.instrument.cameras)))
+            rows.append([_head(one), readings, spec.estimator, _scaled(one.nominal, one), run.missed[one.merit.name]])
+    text = (
+        f"Standard deviations of the monitor's readings under the disturbances {stated}, with the derivatives and the "
+        "noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. Derivatives are "
+        f"interpolated between those of the tolerances; in {EXACT} of the cameras they were traced as well.",
+    )
+    heads = ("merit", "reading", "estimator", "designed", "relative difference of traced derivatives")
+    table = Table("monitor", "What the monitor still knows", "", heads, rows, (None, None, None, None, 7))
+    return (Section("Monitor", text, (table,), name="monitor"),)
 
 
 def _yield_figure(run: ToleranceRun) -> Figure:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
 from analysis.units import ARCSEC
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
-from scenes.specs.tolerance import MERIT_UNITS, ToleranceSetup, amount_text
+from scenes.specs.tolerance import MERIT_UNITS, AllocationSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import LENGTH
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
+from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
 from twin.tolerance.merits import Merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
@@ -36,6 +38,8 @@ _MORE = 7919
 """What is added to the seed for the cameras by which an allocation is judged, so that they are others."""
 _NOTHING = 1e-15
 """Metres and radians below which a motion is rounding."""
+EXACT = 4
+"""Cameras in which the derivatives of the monitor are traced."""
 NEAR_MODEL = 0.05
 """Share by which a model's quantile may differ from the samples' without a warning."""
 
@@ -114,6 +118,8 @@ class ToleranceRun:
         judged: share of cameras with these limits that meet all requirements, of cameras of their own.
         jobs: the worst cameras as files of jobs, by name.
         warnings: what the user should know.
+        missed: merit of the monitor -> largest relative difference of its sigma from that with derivatives which are
+            traced in the camera itself, in the first ``EXACT`` cameras.
     """
 
     setup: ToleranceSetup
@@ -127,6 +133,7 @@ class ToleranceRun:
     judged: Yield | None
     jobs: Mapping[str, str]
     warnings: tuple[str, ...]
+    missed: Mapping[str, float] = field(default_factory=FrozenMap)
 
 
 def run_tolerance(
@@ -150,8 +157,16 @@ def run_tolerance(
         RunFolderError, IncompleteError, ProgramFault, ClusterError: as ``draw_samples``.
     """
     test, force = setup.test, force or Workforce()
+    told: dict[str, None] = {}  # what is told twice, of the cameras and of those by which an allocation is judged
+
+    def warn(text: str, further: Callable[[str], None] = force.warn) -> None:
+        told[text] = None
+        further(text)
+
+    force = replace(force, warn=warn)
     seed = test.seed if seed is None else seed
     bench = ToleranceBench(setup, backend)
+    given = given_warnings(setup, bench)
     found = sensitivities(bench, advance)
     _require_light(setup, found)
     inverse = inverse_limits(bench, found, advance)
@@ -163,6 +178,14 @@ def run_tolerance(
     if test.allocation is not None:
         allocation = allocate(setup, bench, found.model, samples, test.allocation, advance)
         judged = _judged(setup, backend, allocation, seed, force, advance)
+    missed = _missed(bench, samples)
+    warnings = (
+        *given,
+        *told,
+        *beam_warnings(bench, _states(bench, samples, worst_of(bench, samples))),
+        *_warnings(bench, found, samples, merits, allocation, judged, test.allocation),
+        *missed_warnings(missed, EXACT),
+    )
     return ToleranceRun(
         setup,
         bench,
@@ -174,8 +197,32 @@ def run_tolerance(
         allocation,
         judged,
         FrozenMap(worst_jobs(setup, bench, samples)),
-        tuple(_warnings(bench, found, samples, merits, allocation, judged, test.allocation)),
+        warnings,
+        FrozenMap(missed),
     )
+
+
+def _amounts(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> np.ndarray:
+    """Amounts of the numbers and the compensators of some cameras, SI, (W, K)."""
+    return np.concatenate([samples.x[which] * bench.sizes, np.nan_to_num(samples.moves[which])], axis=1)
+
+
+def _states(bench: ToleranceBench, samples: Samples, which: np.ndarray) -> list[State]:
+    """States of some cameras with their adjustments."""
+    return states_of((*bench.numbers, *bench.compensators), _amounts(bench, samples, which))
+
+
+def worst_of(bench: ToleranceBench, samples: Samples) -> np.ndarray:
+    """Numbers of the worst cameras, the worst first."""
+    return np.argsort(-bench.worst_margins(samples.values), kind="stable")[:WORST]
+
+
+def _missed(bench: ToleranceBench, samples: Samples) -> dict[str, float]:
+    """Merit of the monitor -> by how much its sigma is off in the first of the cameras, relative; empty for none."""
+    known = np.flatnonzero(np.all(np.isfinite(samples.values), axis=1))[:EXACT]
+    if bench.monitor is None or not known.size:
+        return {}
+    return bench.monitor.missed(_amounts(bench, samples, known), _states(bench, samples, known))
 
 
 def _require_light(setup: ToleranceSetup, found: Sensitivities) -> None:
@@ -269,7 +316,7 @@ def _warnings(
     merits: tuple[MeritResult, ...],
     allocation: Allocation | None,
     judged: Yield | None,
-    spec: Any,
+    spec: AllocationSpec | None,
 ) -> list[str]:
     out = []
     lost = [problem for problem in samples.problems if problem]
@@ -301,32 +348,51 @@ def _warnings(
             f"compensator {bench.compensators[c].name} stands at the end of its range in {100 * share:.1f} % of all"
         )
     if allocation is not None and judged is not None and spec is not None:
-        if not allocation.reached:
-            out.append(
-                f"no limits up to {spec.tightest:g} times tighter reach a yield of {100 * spec.target:.0f} %: the "
-                "table has the tightest"
-            )
-        elif not judged.low <= allocation.predicted[1] <= judged.high:
-            out.append(
-                f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
-                f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
-            )
+        out += _allocation_warnings(allocation, judged, spec)
+    return out
+
+
+def _allocation_warnings(allocation: Allocation, judged: Yield, spec: AllocationSpec) -> list[str]:
+    """Of limits that do not reach what is asked, or of which other cameras say something else than the model."""
+    out = []
+    if not allocation.reached and allocation.unrounded:
+        out.append(
+            f"limits rounded to the grades do not reach a yield of {100 * spec.target:.0f} %, by the model "
+            f"{100 * allocation.predicted[1]:.1f} %, though those before rounding do: use more grades"
+        )
+    elif not allocation.reached:
+        out.append(
+            f"no limits that were found, up to {spec.tightest:g} times tighter, reach a yield of "
+            f"{100 * spec.target:.0f} %: those of the table have {100 * allocation.predicted[1]:.1f} % by the model"
+        )
+    if not judged.low <= allocation.predicted[1] <= judged.high:
+        out.append(
+            f"the allocated limits yield {100 * judged.share:.1f} % of cameras of their own, and the model "
+            f"{100 * allocation.predicted[1]:.1f} %: trust the cameras"
+        )
     return out
 
 
 def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -> dict[str, str]:
     """The worst cameras as jobs that ``python -m twin.render`` and ``twin.camera`` take, the worst first."""
-    worst = bench.worst_margins(samples.values)
+    worst = worst_of(bench, samples)
     out = {}
-    for rank, s in enumerate(np.argsort(-worst, kind="stable")[:WORST]):
-        moves = np.nan_to_num(samples.moves[s])
-        amounts = np.concatenate([samples.x[s] * bench.sizes, moves])[None]
-        state = states_of((*bench.numbers, *bench.compensators), amounts)[0]
+    for rank, (s, state) in enumerate(zip(worst, _states(bench, samples, worst), strict=True)):
         perturb = {path: _perturb(motion) for path, motion in state.items()}
-        data = {"instrument": setup.test.instrument, "perturb": {path: what for path, what in perturb.items() if what}}
+        data: dict[str, Any] = {
+            "instrument": setup.test.instrument,
+            "perturb": {path: what for path, what in perturb.items() if what},
+        }
+        data |= {key: _short(value) for key, value in setup.test.plain().items() if key == "disturbances"}
         number = f"worst_{rank + 1:02d}"
         out[number] = _job_text(data, int(s), setup)
     return out
+
+
+def _short(disturbances: dict[str, Any]) -> Any:
+    """Disturbances as a file says them: by the name alone where nothing of the file is changed."""
+    said = {key: value for key, value in disturbances.items() if value}
+    return said["file"] if said.keys() == {"file"} else said
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
@@ -372,7 +438,7 @@ def _yield_plain(one: Yield) -> dict[str, Any]:
     return {"share": one.share, "passed": one.passed, "of": one.of, "interval": [one.low, one.high]}
 
 
-def _merit_plain(one: MeritResult) -> dict[str, Any]:
+def _merit_plain(one: MeritResult, missed: float | None = None) -> dict[str, Any]:
     merit = one.merit
 
     def row(values: tuple[float, ...]) -> dict[str, float | None]:
@@ -394,6 +460,7 @@ def _merit_plain(one: MeritResult) -> dict[str, Any]:
         "yield_quadratic": one.model_passing[1],
         "judged": one.passing.judged(merit.spec.probability),
         "variance_shares": dict(one.shares),
+        **({} if missed is None else {"interpolation_error": missed}),
     }
 
 
@@ -411,6 +478,8 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
             "limit": one.limit,
             "at_minus": below,
             "at_plus": above,
+            "moves_at_minus": _moves_at(run, e, 0),
+            "moves_at_plus": _moves_at(run, e, 1),
             "share_for_loss": {
                 m.name: (float(share[k]) if np.isfinite(share[k]) else None) for k, m in enumerate(bench.merits)
             },
@@ -420,12 +489,22 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
     return out
 
 
+def _moves_at(run: ToleranceRun, entry: int, end: int) -> dict[str, str | float | None]:
+    """Compensator -> its move with one tolerance at an end of its limit, as files have it; None for a figure error."""
+    moves = run.found.moves[entry, end].tolist()
+    return {
+        one.name: amount_text(move, one.kind) if np.isfinite(move) else None
+        for one, move in zip(run.bench.compensators, moves, strict=True)
+    }
+
+
 def _allocation_plain(run: ToleranceRun) -> dict[str, Any] | None:
     found = run.allocation
     if found is None or run.judged is None:
         return None
     return {
         "reached": found.reached,
+        "reached_unrounded": found.unrounded,
         "cost_before": found.cost[0],
         "cost_after": found.cost[1],
         "yield_predicted_before": found.predicted[0],
@@ -459,7 +538,7 @@ TOLERANCE: Record[ToleranceRun] = Record(
     Quantity("yield", lambda run: _yield_plain(run.passing), "share of cameras that meet all requirements"),
     Quantity(
         "merits",
-        lambda run: {one.merit.name: _merit_plain(one) for one in run.merits},
+        lambda run: {one.merit.name: _merit_plain(one, run.missed.get(one.merit.name)) for one in run.merits},
         "each in its unit; p90 is the value that 90 % of the cameras keep",
     ),
     Quantity("tolerances", _tolerance_plain, "each at its limits, and the share of its limit that costs the loss"),

@@ -1,0 +1,211 @@
+"""What the monitor of an instrument that is out of tolerance still knows: variances of its readings.
+
+The instrument as it is built and adjusted is where everything is linear: the stated disturbances move spots and cameras
+by the derivatives that they have there, and the images before and after have the noise that they have there. So the
+sigma is that of ``twin.uncertainty`` for that instrument. The gain of the posterior is that of the instrument as it is
+built; other estimators have theirs of the designed one. Area CCDs have been set to their spots when it was built.
+
+Derivatives change by some 1e-4 within tolerances. What each tolerance and each adjustment changes of them is traced
+once, and what several do together is the sum. The terms of a whole figure error are left out: 10 nm of one change the
+derivatives by less than 1e-5. The noise of every camera is that of its own images. ``MonitorMerit.missed`` tells by how
+much sigmas come out wrong by that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.limits import split
+from optics.geometry.tree import State
+from optics.numerics.physical_error import PhysicalError
+from scenes.specs.tolerance import OF_MONITOR, POSTERIOR, MeritSpec, ToleranceSetup
+from scenes.yaml.errors import names_text, unknown
+from twin.monitor.crosstalk import estimator_gains
+from twin.monitor.information import built_noise, quantity_rows, spot_noise
+from twin.monitor.monitor_derivative import derivative_changes
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.monitor.monitor_path import SpotPath
+from twin.tolerance.variations import VariedNumber, states_of
+
+ROTATIONS = ("d_alpha", "d_beta", "d_gamma")
+STEP = 0.1
+"""Share of a compensator's range by which derivatives are differentiated."""
+
+
+@dataclass(frozen=True, eq=False)
+class MonitorMerit:
+    """The monitor of a budget's instrument.
+
+    Attributes:
+        experiment: the designed instrument with what is stated to move.
+        path: its light, on area CCDs that are set to their spots.
+        images: likewise, of the cameras alone whose spots something moves.
+        stated: disturbances of the designed instrument, as motions that are independent of each other.
+        noise: of its spots' shifts, (D, D) px^2.
+        changes: of the derivatives of spots (K, D, M) and parameters (K, 4 J, M) per SI unit of each number that
+            varies and of each compensator.
+        asked: name of a merit -> its readings' rows on the parameters, (Q, 4 J), and the gain that reads them; None for
+            the posterior's.
+    """
+
+    experiment: MonitorExperiment
+    path: SpotPath
+    images: SpotPath
+    stated: Disturbances
+    noise: np.ndarray
+    changes: tuple[np.ndarray, np.ndarray]
+    asked: Mapping[str, tuple[np.ndarray, np.ndarray | None]]
+
+    @classmethod
+    def of(
+        cls,
+        setup: ToleranceSetup,
+        experiment: MonitorExperiment,
+        camera: str,
+        numbers: Sequence[VariedNumber],
+        ranges: np.ndarray,
+    ) -> MonitorMerit | None:
+        """That of a budget; None where no merit is about a monitor.
+
+        Args:
+            setup: the budget.
+            experiment: its designed instrument.
+            camera: that is judged.
+            numbers: K that vary, the compensators last.
+            ranges: of the compensators, SI, (C,).
+
+        Raises:
+            InputError: the instrument has no monitor, nothing is stated to move, or there is no such reading.
+        """
+        wanted = {name: merit for name, merit in setup.test.merits.items() if merit.kind in OF_MONITOR}
+        if not wanted:
+            return None
+        _require_monitor(setup, experiment, next(iter(wanted)))
+        known, motions = experiment.disturbances, experiment.stated
+        assert known is not None
+        assert motions is not None
+        path = SpotPath(experiment.instrument, experiment.backend)
+        noise, _ = spot_noise(path, experiment.detector)
+        gains = estimator_gains(experiment.cameras, known, noise)
+        rows = quantity_rows(experiment.instrument, None)
+        asked = {}
+        for name, merit in wanted.items():
+            if merit.estimator not in gains:
+                wrong = unknown("no such estimator", merit.estimator, tuple(gains))
+                raise setup.test.error(wrong, ("merits", name, "estimator"))
+            gain = None if merit.estimator == POSTERIOR else gains[merit.estimator]
+            asked[name] = np.concatenate([rows[key] for key in _readings(setup, experiment, name, merit, camera)]), gain
+        root = known.root
+        stated = replace(
+            known, spots=known.spots @ root, parameters=known.parameters @ root, correlation=np.eye(len(root))
+        )
+        every_one = states_of(numbers, np.array([[one.size for one in numbers]]))[0]
+        images = SpotPath(experiment.instrument, experiment.backend, cameras=path.moved_cameras(every_one))
+        # derivatives are differentiated by these amounts
+        sizes = [
+            0.0 if setup.test.tolerances[one.entry].spectrum else one.size for one in numbers[: -len(ranges) or None]
+        ]
+        steps = np.concatenate([sizes, STEP * ranges])
+        moved = np.flatnonzero(steps)
+        built = [states_of([numbers[k]], steps[k : k + 1, None])[0] for k in moved.tolist()]
+        try:
+            changes = derivative_changes(motions, path, experiment.sight, experiment.thermal, built)
+        except PhysicalError as error:
+            problem = f"the monitor has no derivatives at the limits: {error}"
+            raise setup.test.error(problem, ("tolerances",), allowed="smaller limits") from error
+        every = tuple(np.zeros((len(numbers), *own.shape[1:])) for own in changes)
+        for out, own in zip(every, changes, strict=True):
+            out[moved] = own @ root / steps[moved, None, None]
+        return cls(experiment, path, images, stated, noise, (every[0], every[1]), asked)
+
+    def variances(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, np.ndarray]:
+        """Variances of all readings of every merit, (S, Q), SI.
+
+        Args:
+            amounts: of the numbers and the compensators, SI, (S, K).
+            states: what they add up to, S.
+
+        Raises:
+            BeamMissedError, AimError: the light of a state does not come to its area CCDs.
+        """
+        noise = self._noise(states)
+        used = np.flatnonzero(np.any(self.changes[0], axis=(1, 2)) | np.any(self.changes[1], axis=(1, 2)))
+        spots, parameters = (np.tensordot(amounts[:, used], own[used], 1) for own in self.changes)
+        return self._read(spots, parameters, noise)
+
+    def exact(self, states: Sequence[State]) -> dict[str, np.ndarray]:
+        """The same with derivatives that are traced in every state."""
+        motions = self.experiment.stated
+        assert motions is not None
+        known = self.experiment
+        changes = derivative_changes(motions, self.path, known.sight, known.thermal, states)
+        assert known.disturbances is not None
+        root = known.disturbances.root
+        return self._read(changes[0] @ root, changes[1] @ root, self._noise(states))
+
+    def missed(self, amounts: np.ndarray, states: Sequence[State]) -> dict[str, float]:
+        """Name of a merit -> largest relative difference of its sigmas from ``exact``; arguments as ``variances``."""
+        near, right = self.variances(amounts, states), self.exact(states)
+        return {
+            name: float(np.max(np.abs(np.sqrt(near[name].max(axis=1) / right[name].max(axis=1)) - 1.0)))
+            for name in self.asked
+        }
+
+    def _noise(self, states: Sequence[State]) -> np.ndarray:
+        """Covariance of the shifts by the noise of images of every state, (S, D, D), px^2."""
+        out = np.tile(self.noise, (len(states), 1, 1))
+        keys = [channel.key for channel in self.images.channels]
+        own = [2 * k + axis for k, channel in enumerate(self.path.channels) if channel.key in keys for axis in (0, 1)]
+        if own:
+            rows = np.ix_(range(len(states)), own, own)
+            out[rows] = built_noise(self.images, self.experiment.detector, states)
+        return out
+
+    def _read(self, spots: np.ndarray, parameters: np.ndarray, noise: np.ndarray) -> dict[str, np.ndarray]:
+        """Variances with changes of the derivatives (S, D, M), (S, 4 J, M) and noise (S, D, D)."""
+        out = {name: np.empty((len(noise), len(rows))) for name, (rows, _) in self.asked.items()}
+        for s, own in enumerate(noise):
+            stated = replace(
+                self.stated, spots=self.stated.spots + spots[s], parameters=self.stated.parameters + parameters[s]
+            )
+            best = stated.best_gain(own)
+            for name, (rows, gain) in self.asked.items():
+                out[name][s] = split(rows, stated, own, best if gain is None else gain).sigma ** 2
+        return out
+
+
+def _require_monitor(setup: ToleranceSetup, experiment: MonitorExperiment, name: str) -> None:
+    """Raise InputError for an instrument without a monitor, and for a monitor of which nothing is stated to move."""
+    test, kind = setup.test, setup.test.merits[name].kind
+    if not experiment.monitored:
+        allowed = "an instrument with a monitor, such as gf7_pair; or other merits"
+        problem = f"{kind} is about the readings of a monitor, and {setup.base.instrument.name} has none"
+        raise test.error(problem, ("merits", name, "kind"), allowed=allowed)
+    if experiment.stated is None:
+        allowed = "`disturbances: NAME` at the top of this file, or in the instrument's"
+        problem = f"{kind} is a sigma under a prior on disturbances, and there is none"
+        raise test.error(problem, ("merits", name, "kind"), allowed=allowed)
+
+
+def readings_of(merit: MeritSpec, cameras: Sequence[str]) -> tuple[str, ...]:
+    """Which readings a merit is about, the worst of which counts: ``angle``, ``d_alpha`` ... of one camera."""
+    if merit.kind == "monitor_focus":
+        return ("d_f",)
+    if merit.reading is None:
+        return ("angle",) if len(cameras) == 2 else ROTATIONS
+    return (merit.reading,)
+
+
+def _readings(
+    setup: ToleranceSetup, experiment: MonitorExperiment, name: str, merit: MeritSpec, camera: str
+) -> list[str]:
+    """Names of a merit's readings in ``quantity_rows``. Raises InputError where there is no angle."""
+    cameras = tuple(experiment.instrument.cameras)
+    if merit.reading == "angle" and len(cameras) != 2:
+        wrong = f"an angle is between the lines of sight of two cameras, and there are {len(cameras)}"
+        raise setup.test.error(wrong, ("merits", name, "reading"), allowed=names_text(ROTATIONS))
+    return [key if key == "angle" else f"{camera}/{key}" for key in readings_of(merit, cameras)]
