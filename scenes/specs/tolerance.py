@@ -39,12 +39,15 @@ MEASURES: Mapping[str, Kind] = FrozenMap(
         "rotate": ANGLE,
         "scale": SCALE,
         "radius": SCALE,
+        "abbe": SCALE,
         "figure": LENGTH,
         "temperature": TEMPERATURE_DIFFERENCE,
         "gradient": TEMPERATURE_GRADIENT,
     }
 )
 """Kind of a motion -> what its amounts measure; the others are pure numbers."""
+MOST_ABBE = 0.1
+"""Relative limit of an Abbe number at which, at ten times of it, no Abbe number is left."""
 SPECTRUM = "figure"
 """Kind of a motion that, without a term, is a whole figure error."""
 
@@ -109,7 +112,7 @@ class ToleranceSpec(Varied):
 
     Attributes:
         motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
-            `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
+            `L1 abbe` (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
         carrying: further bodies that move rigidly with the first.
         limit: largest amount either way; of a figure error its rms.
         law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
@@ -149,6 +152,9 @@ class ToleranceSpec(Varied):
     @model_validator(mode="after")
     def _is_a_tolerance(self) -> ToleranceSpec:
         self.si(self.limit, "limit", positive=True)
+        if self.parts[1] == "abbe" and self.limit_si >= MOST_ABBE:
+            problem = "no Abbe number is that uncertain; it is tried at ten times its limit"
+            raise Problem(problem, shown(self.limit), "less than 10 percent", within=("limit",))
         if self.mean is not None:
             self.si(self.mean, "mean")
         for value in self.measured or ():
@@ -259,7 +265,7 @@ class MeritSpec(Spec):
         kind: `wavefront`, rms error in waves of the design wavelength; `mtf` of the optics; `boresight`, angle by which
             the line of sight turns; `roll` of the line about it; `principal_distance`, its change; `distortion`,
             largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
-            turn of a chief ray at the line CCD.
+            turn of a chief ray at the line CCD. The budget's `light` says in which light.
         fields: of wavefront and mtf, the worst of which counts: shares of the half field along the line and the track.
         frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
         direction: of mtf: along the line, along the track, or the worse of both.
@@ -349,6 +355,8 @@ class ToleranceBudgetSpec(Spec):
         compensators: by name, what is adjusted in every camera, in this order; the mean square wavefront error over all
             fields of the merits is made least.
         merits: by name, what is asked.
+        light: in which wavefronts and MTFs are judged: `spectrum`, that of the camera, or `design`, its
+            design wavelength alone; the spectrum of a camera with lenses that has one, when left out.
         samples: cameras that are drawn.
         seed: of everything drawn.
         allocation: whether limits are allocated anew, and for which yield.
@@ -360,6 +368,7 @@ class ToleranceBudgetSpec(Spec):
     tolerances: Annotated[Named[ToleranceSpec], Field(min_length=1, max_length=300)]
     compensators: Annotated[Named[CompensatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
+    light: Literal["spectrum", "design"] | None = None
     samples: Annotated[Whole, Field(ge=20, le=MOST_RUNS)] = 1000
     seed: Seed = 0
     allocation: AllocationSpec | None = None

@@ -111,7 +111,8 @@ def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarra
     again = other.try_out(drawn[:, place] * other.sizes)
     np.testing.assert_allclose(again.parts, own.parts, rtol=1e-9, atol=1e-15)
     alone = np.concatenate([bench.try_out(row[None] * bench.sizes).parts for row in drawn[:3]])
-    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-9, atol=1e-15)
+    # matrix products of other sizes round otherwise, and a path of ten metres has no digits below 3e-9 waves
+    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-8, atol=1e-15)
 
 
 def test_a_compensator_without_a_range_changes_nothing(
@@ -126,7 +127,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     def squares(one: ToleranceBench, moves: np.ndarray) -> np.ndarray:
         amounts = np.concatenate([drawn * one.sizes, moves], axis=1)
         return np.sum(
-            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts))[0]) ** 2, axis=1
+            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts)).paths) ** 2, axis=1
         )
 
     tried = bench.try_out(drawn * bench.sizes)

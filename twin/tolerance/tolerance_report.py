@@ -73,6 +73,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     facts = (
         ("camera", run.bench.camera),
+        ("light", _light(run)),
         ("tolerances", str(len(test.tolerances))),
         ("compensators", str(len(test.compensators)) or "none"),
         ("cameras drawn", str(len(run.samples.problems))),
@@ -80,6 +81,14 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     title = f"Tolerances of {run.bench.camera}"
     return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+
+
+def _light(run: ToleranceRun) -> str:
+    """Wavelengths in which wavefronts and MTFs are told."""
+    colours = 1e9 * run.bench.colours
+    if len(colours) == 1:
+        return f"{colours[0]:.4g} nm"
+    return f"{colours.min():.4g} to {colours.max():.4g} nm, {len(colours)} wavelengths"
 
 
 def _percent(share: float) -> str:

@@ -26,7 +26,7 @@ from scenes.specs.tolerance import CompensatorSpec, ToleranceBudgetSpec, Toleran
 from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 
 HEAT = ("temperature", "gradient")
-SHAPE = ("scale", "stretch", "radius", "conic", "index")
+SHAPE = ("scale", "stretch", "radius", "conic", "index", "abbe")
 """Numbers of a motion that are neither rigid nor a figure."""
 
 
