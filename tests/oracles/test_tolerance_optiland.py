@@ -29,6 +29,8 @@ pytestmark = pytest.mark.oracle
 
 ARCSEC = np.pi / 648_000
 MM = 1e-3
+
+
 def _budget() -> dict[str, tuple[str, str, float, str, int, str | None]]:
     """Name -> motion, limit in the file and in SI; optiland's variable, surface and axis."""
     out: dict[str, tuple[str, str, float, str, int, str | None]] = {}

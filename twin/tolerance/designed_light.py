@@ -93,9 +93,9 @@ class LitRoots:
             terms: coefficients of K wavelengths about one point of the image, (S, F, K, T).
             shares: of the wavelengths, which sum to 1, (K,).
         """
-        out = np.einsum("fjt,sfkt->sfkj", self.rest, terms)
+        out = terms @ np.swapaxes(self.rest, 1, 2)
         if len(shares) > 1:
-            tilt = np.einsum("fjt,sfkt->sfkj", self.tilt, terms)
+            tilt = terms @ np.swapaxes(self.tilt, 1, 2)
             tilt = tilt - np.einsum("k,sfkj->sfj", shares, tilt)[:, :, None]
             out = np.concatenate([out, tilt], axis=-1) * np.sqrt(shares)[:, None]
         return np.asarray(out.reshape(len(terms), -1))

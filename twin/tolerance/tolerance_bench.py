@@ -32,7 +32,7 @@ from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.band_light import wavelengths_enough
-from twin.tolerance.adjustments import Adjustments
+from twin.tolerance.adjustments import Adjustments, told
 from twin.tolerance.designed_light import LitRoots, fixed_transfers, light_of
 from twin.tolerance.merits import Merit, merits_of
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
@@ -67,7 +67,7 @@ class Errors(NamedTuple):
         paths: as of ``Tried``.
         eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where no MTF is asked.
         chiefs: directions of chief rays, (S, F, 3).
-        aimed: where rays start, as parameters of the fan of launch points, (S, K, F, N, 2).
+        aimed: where rays start, (S, K, F, N, 3), world, metres.
     """
 
     paths: np.ndarray
@@ -271,7 +271,7 @@ class ToleranceBench:
     # exact traces
 
     def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """Parameters of the fan's rays of coloured states that meet their points of the stop, (S * K * F, N, 2).
+        """Where rays start that meet their points of the stop in coloured states, (S * K * F, N, 3).
 
         Raises:
             AimError: the light of some state does not reach the stop.
@@ -280,13 +280,13 @@ class ToleranceBench:
         to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
         near, slope = (np.tile(one, (count, *[1] * (one.ndim - 1))) for one in self._aimed)
         systems, fan = to_stop.take(self._owners(count)), self._fan_for(count)
-        return aim(self.backend, systems, fan, self._target, near, slope, AIM_TOLERANCE)[0]
+        return fan.at(aim(self.backend, systems, fan, self._target, near, slope, AIM_TOLERANCE)[0])[0]
 
     def _rays(
         self, states: Sequence[State], aimed: np.ndarray | None = None
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
         """Position and direction (S, K, F, N, 3), path and validity (S, K, F, N) of the beams at the line CCD, in light
-        of K traced wavelengths, and where their rays start, (S, K, F, N, 2), which is found where it is not given.
+        of K traced wavelengths, and where their rays start, (S, K, F, N, 3), which is found where it is not given.
 
         Raises:
             AimError: the light of some state does not reach the stop.
@@ -296,11 +296,12 @@ class ToleranceBench:
         placed = path.assembly.place(coloured)
         aimed = self._aimed_at_stop(coloured, placed) if aimed is None else aimed
         imaging = assemble(path.assembly, [f"{path.name}/imaging"], coloured, placed=placed).take(self._owners(count))
-        rays = make_rays(self.backend, *self._fan_for(count).at(aimed.reshape(-1, *aimed.shape[-2:])))
+        along = np.tile(self.directions[:, None], (count * len(self._glass), 1, 1))
+        rays = make_rays(self.backend, aimed.reshape(len(along), -1, 3), along)
         traced = trace(self.backend, imaging, rays).numpy()
         shape = (count, len(self._glass), len(self.fields), len(self.points))
         told = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
-        return told, aimed.reshape(*shape, 2)  # type: ignore[return-value]
+        return told, aimed.reshape(*shape, 3)  # type: ignore[return-value]
 
     def _coloured(self, states: Sequence[State]) -> list[State]:
         """The states as each traced wavelength meets them, camera by camera, S * K."""
@@ -402,8 +403,9 @@ class ToleranceBench:
         count = len(amounts)
         moves, settled = np.zeros((count, len(self.ranges))), np.zeros(count)
 
-        def state(moves: np.ndarray) -> list[State]:
-            return states_of((*self.numbers, *self.compensators), np.concatenate([amounts, moves], axis=1))
+        def state(moves: np.ndarray, which: np.ndarray | slice = slice(None)) -> list[State]:
+            own = np.concatenate([amounts[which], moves[which]], axis=1)
+            return states_of((*self.numbers, *self.compensators), own)
 
         if not len(self.fields):
             return Tried(moves, self._parts(state(moves), None), ("",) * count, settled)
@@ -416,24 +418,29 @@ class ToleranceBench:
 
         if np.any(self.ranges > 0.0):
             every = np.ones(len(self.ranges), dtype=bool)
+            residuals = self._residuals(light.paths)
+            slopes = np.tile(self._adjust.slope, (count, 1, 1))
             for _ in range(MOST_STEPS):
-                residuals = self._residuals(light.paths)
-                target = self._adjust.best(residuals, moves, every)
-                settled = np.sqrt(np.sum(((target - moves) @ self._adjust.slope.T) ** 2, axis=1) / len(self.fields))
+                target = self._adjust.best(slopes, residuals, moves, every)
+                expected = told(slopes, target - moves)
+                settled = np.sqrt(np.sum(expected**2, axis=1) / len(self.fields))
                 # what has settled stays, so that a camera's numbers do not depend on the others
                 going = settled > SETTLED * 1e-2
                 if not going.any():
                     break
-                moves = np.where(going[:, None], target, moves)
                 some = np.flatnonzero(going)
-                own = state(moves)
-                for k in some:
-                    states[k] = own[k]
-                anew = again([own[k] for k in some], some)
+                change, moves = target[some] - moves[some], np.where(going[:, None], target, moves)
+                own = state(moves, some)
+                for k, one in zip(some, own, strict=True):
+                    states[k] = one
+                anew = again(own, some)
                 for known, new in zip(light[:3], anew[:3], strict=True):
                     known[some] = new
+                arrived = self._residuals(anew.paths)
+                miss = arrived - residuals[some] - expected[some]
+                slopes[some], residuals[some] = self._adjust.corrected(slopes[some], change, miss), arrived
             if errors is not None and not self._adjust.exact:
-                moves = self._adjust.made(self._residuals(light.paths), moves, errors)
+                moves = self._adjust.made(slopes, residuals, moves, errors)
                 states = state(moves)
                 light = again(states, np.arange(count))
         return Tried(moves, self._parts(states, light), ("",) * count, settled, light.paths)
