@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -32,6 +33,7 @@ from scenes.yaml.yaml_file import read_yaml
 Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
 """A quantity with its unit, or a pure number where the motion has no unit."""
 Share = Annotated[Number, Field(gt=0.0, lt=1.0)]
+Cost = Annotated[Number, Field(gt=0.0)]
 
 MEASURES: Mapping[str, Kind] = FrozenMap(
     {
@@ -124,6 +126,8 @@ class ToleranceSpec(Varied):
         power: of a figure error: the variance of its terms falls with the power of their radial order.
         cost: of holding it as stated, in any unit.
         exponent: the cost goes with the inverse limit to this power.
+        costs: in place of both, what limits cost where it is known, `[[20 um, 1], [10 um, 3]]`; between them and beyond
+            their ends along a smooth line in logarithms.
         kept: whether the allocation leaves it as it is.
     """
 
@@ -134,8 +138,9 @@ class ToleranceSpec(Varied):
     measured: Annotated[tuple[Amount, ...], Field(min_length=2, max_length=10_000)] | None = None
     terms: tuple[Text, Text] | None = None
     power: Annotated[Number, Field(ge=0.0, le=10.0)] = 3.0
-    cost: Annotated[Number, Field(gt=0.0)] = 1.0
+    cost: Cost = 1.0
     exponent: Annotated[Number, Field(gt=0.0, le=5.0)] = 1.0
+    costs: Annotated[tuple[tuple[Amount, Cost], ...], Field(min_length=2, max_length=50)] | None = None
     kept: Flag = False
 
     @model_validator(mode="before")
@@ -161,6 +166,7 @@ class ToleranceSpec(Varied):
             self.si(value, "measured")
         if self.measured is not None and (self.mean is not None or self.law != "normal"):
             raise Problem("what was measured has no law and no mean", None, "measured: [...]", within=("measured",))
+        self._costs_fall()
         if self.terms is not None:
             if self.parts[1] != SPECTRUM:
                 raise Problem("only a figure has terms", self.motion, "M1 figure", within=("terms",))
@@ -172,6 +178,25 @@ class ToleranceSpec(Varied):
                 problem = "the terms of a figure error are distributed normally about zero"
                 raise Problem(problem, None, "no law, mean or measured", within=("law",))
         return self
+
+    def _costs_fall(self) -> None:
+        """Refuse costs that say something twice. Raises Problem."""
+        if self.costs is None:
+            return
+        if (self.cost, self.exponent) != (1.0, 1.0):
+            raise Problem("costs stand in place of cost and exponent", None, "one of both", within=("costs",))
+        points = sorted((self.si(limit, "costs", positive=True), cost) for limit, cost in self.costs)
+        for (limit, cost), (looser, less) in pairwise(points):
+            if not limit < looser or less > cost:
+                problem = "a looser limit costs no more than a tighter one, and each limit has one cost"
+                raise Problem(problem, f"{cost:g} and {less:g}", "costs that fall with the limit", within=("costs",))
+
+    @property
+    def cost_points(self) -> tuple[tuple[float, float], ...]:
+        """Limits over the stated one and what they cost, ascending, two at least."""
+        if self.costs is None:
+            return (1.0, self.cost), (2.0, self.cost * 2.0**-self.exponent)
+        return tuple(sorted((amount_si(limit, self.parts[1]) / self.limit_si, cost) for limit, cost in self.costs))
 
     @property
     def spectrum(self) -> tuple[int, ...]:

@@ -16,11 +16,13 @@ import pytest
 
 from scenes.specs.job import checked_nodes
 from scenes.specs.resolved import resolve
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import inverse_limits, sensitivities
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import ToleranceBench
@@ -257,7 +259,62 @@ def test_the_yield_of_an_allocation_is_that_of_other_cameras(backend, tmp_path) 
     )
 
 
+def test_costs_of_grades_are_those_stated_and_fall_between_them() -> None:
+    stated = {"motion": "M2 shift z", "limit": "20 um", "costs": [["50 um", 1.0], ["10 um", 4.0], ["20 um", 1.5]]}
+    one = validate(ToleranceSpec, YamlFile("", stated, {}))
+    curve = CostCurve(one.cost_points)
+    for limit, cost in ((50.0, 1.0), (20.0, 1.5), (10.0, 4.0)):
+        assert np.exp(curve(np.log(limit / 20.0))[0]) == pytest.approx(cost)
+    level = np.linspace(np.log(0.1), np.log(10.0), 400)
+    told, slope = np.array([curve(x) for x in level]).T
+    assert np.all(np.diff(told) < 0.0)
+    inside = (level > np.log(0.52)) & (level < np.log(2.4))
+    np.testing.assert_allclose(np.gradient(told, level)[inside], slope[inside], atol=0.05)
+    # beyond the tightest as between the two tightest: twice as tight costs 4 / 1.5 as much
+    assert np.exp(curve(np.log(0.25))[0]) == pytest.approx(4.0 * 4.0 / 1.5)
+    plain = validate(ToleranceSpec, YamlFile("", {**stated, "costs": None, "cost": 3.0, "exponent": 2.0}, {}))
+    curve = CostCurve(plain.cost_points)
+    assert [np.exp(curve(np.log(x))[0]) for x in (0.1, 0.5, 1.0, 3.0)] == pytest.approx([300.0, 12.0, 3.0, 1.0 / 3.0])
+
+
+@pytest.mark.second
+def test_an_allocation_pays_where_it_is_cheap(backend, tmp_path) -> None:
+    """Two alike errors, of which one can hardly be bought: the other is tightened."""
+    ways = {"cheap": [["200 um", 1.0], ["50 um", 1.1], ["20 um", 1.2]], "dear": [["200 um", 1.0], ["50 um", 50.0]]}
+    tolerances = {
+        name: {"motion": f"M1 shift {axis}", "limit": "200 um", "costs": costs}
+        for axis, (name, costs) in zip("xy", ways.items(), strict=True)
+    }
+    changed = {
+        "tolerances": tolerances,
+        "merits": {"wavefront": {"kind": "wavefront", "at_most": 0.06, "fields": [[0.0, 0.0]]}},
+        "compensators": {"focus": BUDGET["compensators"]["focus"]},
+    }
+    loose = budget(tmp_path, **changed, samples=200, allocation={"target": 0.9})
+    run = run_tolerance(loose, backend)
+    assert run.allocation is not None
+    assert run.allocation.reached
+    ratio = dict(zip(tolerances, run.allocation.scales.tolist(), strict=True))
+    assert ratio["cheap"] < 0.5
+    assert ratio["dear"] > 2.0 * ratio["cheap"]
+    np.testing.assert_allclose(run.allocation.costs[0], [1.0, 1.0])
+
+
 BAD = {
+    "costs that rise with the limit": (
+        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "costs": [["1 um", 1.0], ["2 um", 3.0]]}}},
+        "costs no more",
+        "tolerances",
+    ),
+    "costs said twice": (
+        {
+            "tolerances": {
+                "a": {"motion": "M2 shift z", "limit": "1 um", "cost": 2.0, "costs": [["1 um", 3.0], ["2 um", 1.0]]}
+            }
+        },
+        "in place of cost",
+        "tolerances",
+    ),
     "no such body": ({"tolerances": {"a": {"motion": "M7 shift z", "limit": "1 um"}}}, "no such node", "tolerances"),
     "an amount in the motion": (
         {"tolerances": {"a": {"motion": "M2 shift z 3 um", "limit": "1 um"}}},

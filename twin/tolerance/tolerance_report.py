@@ -261,14 +261,12 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
                 _scaled_limit(one.limit, float(found.scales[e])),
                 str(found.limits[name]),
                 float(found.rounded[e]),
-                one.cost,
-                one.cost * float(found.rounded[e]) ** -one.exponent,
+                float(found.costs[0, e]),
+                float(found.costs[1, e]),
             ]
         )
     heads = ("tolerance", "motion", "limit", "chosen", "rounded", "ratio", "cost", "new cost")
-    caption = (
-        "Limits as stated, as the least cost asks for, and rounded to the grades; costs go with the inverse limit."
-    )
+    caption = "Limits as stated, as the least cost asks for, and rounded to the grades, with what they cost."
     table = Table(
         "allocation", "Limits before and after", caption, heads, rows, (None, None, None, None, None, 3, 2, 2)
     )
