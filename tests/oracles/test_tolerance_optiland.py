@@ -244,9 +244,9 @@ def test_cameras_are_distributed_as_optilands_and_come_faster(
 ) -> None:
     """As many as optiland makes in about a minute; and the processor time of each, without and with its own wavefronts.
 
-    Measured on a busy machine of two cores, processor time of a camera: twin 2.4 ms; optiland 52 ms where an operand of
-    ours traces all fields at once, 22 times as much; 1600 ms where each field is an operand of its own wavefront, as
-    its users have it, 660 times as much. Of the one a quarter is asked for, of the other a seventh.
+    Measured on a busy machine of two cores, processor time of a camera: twin 1.3 ms; optiland 56 ms where an operand of
+    ours traces all fields at once, 42 times as much; 1300 ms where each field is an operand of its own wavefront, as
+    its users have it, 990 times as much. Of the one a quarter is asked for, of the other a fifth.
     """
     draw_samples(setup, bench, backend, 200, 3, Workforce())  # kernels are compiled
     start = time.process_time()
@@ -265,5 +265,5 @@ def test_cameras_are_distributed_as_optilands_and_come_faster(
             f"twin {1e3 * ours:.2f} ms, optiland {1e3 * together:.1f} ms, with its own wavefronts {1e3 * each:.0f} ms"
         )
         print(f"\nprocessor time of a camera: {told}")  # noqa: T201 - the test's result
-    assert each > 100.0 * ours
-    assert together > 5.0 * ours
+    assert each > 200.0 * ours
+    assert together > 10.0 * ours
