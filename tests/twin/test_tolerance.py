@@ -148,6 +148,23 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     assert np.any(best < 0.999 * without)
 
 
+@pytest.mark.parametrize("motion", ["M2 shift x", "focal_plane shift z"])
+def test_rays_go_through_the_stop_where_adjustments_have_brought_it(motion: str, backend, tmp_path) -> None:
+    """M2 is the stop; rays are aimed once where an adjustment leaves it alone."""
+    one = {"one": {"motion": motion, "range": "5 mm"}}
+    tolerances = {
+        "decentre": {"motion": "M3 shift x", "limit": "1 mm"},
+        "radius": {"motion": "M1 radius", "limit": "0.1 percent"},
+    }
+    bench = ToleranceBench(budget(tmp_path, compensators=one, tolerances=tolerances), backend)
+    amounts = np.eye(2) * bench.sizes
+    tried = bench.try_out(amounts, paths=True)
+    assert np.max(np.abs(tried.moves)) > 1e-4
+    states = states_of((*bench.numbers, *bench.compensators), np.concatenate([amounts, tried.moves], axis=1))
+    assert tried.paths is not None
+    np.testing.assert_allclose(tried.paths, bench._errors(states).paths, rtol=0, atol=1e-13)
+
+
 def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:
     moved = {
         "focus": {"motion": "focal_plane shift z", "range": "50 um", "step": "10 um"},

@@ -101,9 +101,9 @@ def allocate(
         bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
         step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
         total, trade = total + step, _Trade.at(bench, total + step, samples, costs, share)
-        cost = costs.of_level(total)
-        if (cheapest is None or cost < cheapest[0]) and trade.quantile(nothing)[0] <= 0.0:
-            cheapest = cost, total, trade
+        price = costs.of_level(total)
+        if (cheapest is None or price < cheapest[0]) and trade.quantile(nothing)[0] <= 0.0:
+            cheapest = price, total, trade
         if np.max(np.abs(step)) < _SETTLED:
             break
     if cheapest is not None:
