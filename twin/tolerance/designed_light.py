@@ -1,11 +1,12 @@
-"""The light of the designed camera, of which wavefronts and MTFs of a tolerance run are told: what does not change from
-camera to camera.
+"""The light in which wavefronts and MTFs of a tolerance run are told, and what of it does not change from camera to
+camera.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,6 +42,23 @@ def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | No
     if test.light == "design" or (test.light is None and not lenses(camera)):
         return None
     return camera.light
+
+
+class Errors(NamedTuple):
+    """Light of states at the line CCD.
+
+    Attributes:
+        paths: optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N),
+            metres.
+        eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where no MTF is asked.
+        chiefs: directions of chief rays, (S, F, 3).
+        aimed: where rays start, (S, K, F, N, 3), world, metres.
+    """
+
+    paths: np.ndarray
+    eikonals: np.ndarray
+    chiefs: np.ndarray
+    aimed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)

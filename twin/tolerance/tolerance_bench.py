@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,7 +32,7 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.band_light import wavelengths_enough
 from twin.tolerance.adjustments import Adjustments, told
-from twin.tolerance.designed_light import LitRoots, fixed_transfers, light_of
+from twin.tolerance.designed_light import Errors, LitRoots, fixed_transfers, light_of
 from twin.tolerance.merits import Merit, merits_of
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
 
@@ -58,22 +57,6 @@ EVERY = 4
 """Distortion is told of each fourth point of the line."""
 _MOVE = 1e-3
 """Step of the derivatives by compensators, as a share of their range."""
-
-
-class Errors(NamedTuple):
-    """Light of states at the line CCD.
-
-    Attributes:
-        paths: as of ``Tried``.
-        eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where no MTF is asked.
-        chiefs: directions of chief rays, (S, F, 3).
-        aimed: where rays start, (S, K, F, N, 3), world, metres.
-    """
-
-    paths: np.ndarray
-    eikonals: np.ndarray
-    chiefs: np.ndarray
-    aimed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
