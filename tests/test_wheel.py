@@ -165,7 +165,7 @@ def test_commands_of_the_wheel_run_beside_foreign_packages_of_their_names(instal
     """With every file of the library, every template, and the examples that their help names."""
     assert run(installed, tmp_path, "python", "-c", "import optics").returncode == 1
     own = installed / backend.PREFIX
-    kept = ("yaml", "csv", "j2", "css", "html", "js", "typed", "py")
+    kept = ("yaml", "csv", "zmx", "j2", "css", "html", "js", "typed", "py")
     files = [path.relative_to(ROOT) for name in backend.PACKAGES for path in (ROOT / name).rglob("*.*")]
     files = [path for path in files if path.suffix[1:] in kept]
     assert len(files) > 400

@@ -9,7 +9,7 @@ from docs.site.markdown import anchor, code, table
 from scenes.specs.load import INSTRUMENTS, library_names
 from scenes.specs.perturbation import NodeInfo
 
-ACTIONS = ("rotate", "shift", "scale", "figure", "radius", "conic", "index", "temperature")
+ACTIONS = ("rotate", "shift", "scale", "figure", "radius", "conic", "index", "abbe", "temperature")
 """Columns of the tables, as they are written in a job."""
 
 

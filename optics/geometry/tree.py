@@ -73,6 +73,8 @@ class Motion:
         grid: surface error of a mirror or face beyond ``figure``, on a grid.
         radius: relative change of the vertex radius of curvature of a mirror or face, e.g. 100e-6.
         conic: change of its conic constant.
+        abbe: relative change of the Abbe number of a glass body. Its index at the d line stays, and what the index
+            differs from that at any other wavelength goes with the inverse of the Abbe number.
     """
 
     rotate: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -86,14 +88,20 @@ class Motion:
     grid: GridFigure | None = None
     radius: float = 0.0
     conic: float = 0.0
+    abbe: float = 0.0
 
     def __post_init__(self) -> None:
         """Freeze the figure."""
         object.__setattr__(self, "figure", FrozenMap(self.figure))
 
+    @property
+    def dispersion(self) -> float:
+        """Relative change of a glass's dispersion, which its Abbe number makes."""
+        return 1.0 / (1.0 + self.abbe) - 1.0
+
     def component(self, kind: str, axis: int) -> float:
         """One number of the motion, SI: ``rotate`` or ``shift`` by an axis, a ``figure`` term, or one of ``scale``,
-        ``radius``, ``conic`` and ``index``.
+        ``radius``, ``conic``, ``index`` and ``abbe``.
 
         Raises:
             ValueError: there is no such kind of motion.
@@ -103,12 +111,13 @@ class Motion:
                 return float(self.rotate[axis])
             case "shift":
                 return float(self.shift[axis])
-            case "scale" | "radius" | "conic" | "index":
+            case "scale" | "radius" | "conic" | "index" | "abbe":
                 return float(getattr(self, kind))
             case "figure":
                 return float(self.figure.get(axis, 0.0))
             case _:
-                raise ValueError(f"a motion is a rotate, shift, scale, radius, conic, index or figure, not a {kind!r}")
+                known = "rotate, shift, scale, radius, conic, index, abbe or figure"
+                raise ValueError(f"a motion is a {known}, not a {kind!r}")
 
 
 AT_REST = Motion()
@@ -354,6 +363,7 @@ def compose(first: State, then: State, bodies: Mapping[str, Body]) -> State:
             grid=_sum(before.grid, motion.grid),
             radius=(1.0 + before.radius) * (1.0 + motion.radius) - 1.0,
             conic=before.conic + motion.conic,
+            abbe=(1.0 + before.abbe) * (1.0 + motion.abbe) - 1.0,
         )
     return out
 

@@ -9,6 +9,9 @@ from math import sqrt
 from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import UnphysicalError
 
+ABBE_LINES = (587.5618e-9, 486.1327e-9, 656.2725e-9)
+"""The lines d, F and C, metres, whose indices make an Abbe number: (n_d - 1) / (n_F - n_C)."""
+
 
 def _powers(c: Sequence[float], w: float, exponents: Sequence[int]) -> float:
     """Index n of n^2 = sum c_k w^e_k."""

@@ -11,7 +11,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture
 from optics.geometry.pose import Pose
 from optics.geometry.surface import GridFigure, SummedFigure, Surface, ZernikeFigure
-from optics.geometry.tree import Motion, PlacedBodies, RigidTree, State
+from optics.geometry.tree import AT_REST, Motion, PlacedBodies, RigidTree, State
 from optics.numerics.frozen_map import FrozenMap
 
 
@@ -105,12 +105,14 @@ class Assembly:
         elements: name -> element.
         sequences: name -> element names in the order in which light meets them (an element may come twice).
         media: path of a glass body -> its refractive index in vacuum.
+        above_d: path of a glass body whose dispersion is known -> that index less the one at the d line.
     """
 
     tree: RigidTree
     elements: Mapping[str, Element]
     sequences: Mapping[str, tuple[str, ...]]
     media: Mapping[str, float] = field(default_factory=FrozenMap)
+    above_d: Mapping[str, float] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         """Freeze and check that every name exists."""
@@ -131,7 +133,12 @@ class Assembly:
                     raise ValueError(f"sequence {sequence!r} names unknown element {name!r}")
         object.__setattr__(self, "elements", FrozenMap(self.elements))
         object.__setattr__(self, "media", FrozenMap(self.media))
+        object.__setattr__(self, "above_d", FrozenMap(self.above_d))
         object.__setattr__(self, "sequences", FrozenMap({k: tuple(v) for k, v in self.sequences.items()}))
+
+    def index(self, solid: str, motion: Motion = AT_REST) -> float:
+        """Refractive index of a glass body with a motion, where its own frame begins."""
+        return self.media[solid] + motion.index + self.above_d.get(solid, 0.0) * motion.dispersion
 
     def sequence(self, name: str) -> tuple[Element, ...]:
         """The elements of a named sequence.

@@ -219,7 +219,7 @@ def _index_numbers(
         gradient = np.zeros((len(states), 3)) if graded else None
     else:
         motions = [state.get(medium.solid, AT_REST) for state in states]
-        index = assembly.media[medium.solid] + np.array([m.index for m in motions])
+        index = np.array([assembly.index(medium.solid, m) for m in motions])
         gradient = None
         if graded:
             here, glass = placed.index[element.body], placed.index[medium.solid]

@@ -16,6 +16,7 @@ import numpy as np
 from optics.geometry.aperture import Aperture, Edge
 from optics.geometry.pose import Pose
 from optics.geometry.surface import Surface
+from optics.materials.dispersion import ABBE_LINES
 from optics.numerics.frozen_map import FrozenMap
 from optics.raytrace.assembly import Interaction
 from scenes.lens.prescription import LensSurface, Note, Prescription
@@ -192,7 +193,7 @@ Glasses = Mapping[str, Callable[[float], float]]
 NO_GLASSES: Glasses = FrozenMap()
 FARTHEST = 1e8
 """An object beyond this distance is at infinity, metres; programs write it as 1e10 or 1e13 millimetres."""
-D_LINE, _D_WIDTH = 587.5618e-9, 0.1e-9
+D_LINE, _D_WIDTH = ABBE_LINES[0], 0.1e-9
 """Wavelength at which the index of a glass without a catalogue is stated, and how near to it one has to be, metres."""
 
 

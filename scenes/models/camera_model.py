@@ -10,6 +10,7 @@ to the image plane and toward the scene, X = Y x Z.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +20,7 @@ from optics.geometry.aperture import Aperture, Circle, Edge, Rectangle
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
 from optics.geometry.surface import Surface, plane
 from optics.geometry.tree import AT_REST, Body, RigidTree, State
+from optics.materials.dispersion import ABBE_LINES
 from optics.numerics.array_math import determinant, norm, turned
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -98,14 +100,15 @@ def shape_changes(model: CameraModel, root: str) -> dict[str, tuple[str, ...]]:
         root: path of its body.
 
     Returns:
-        Body -> which of "figure", "radius", "conic" and "index"; surfaces that light passes have none.
+        Body -> which of "figure", "radius", "conic", "index" and "abbe"; surfaces that light passes have none.
     """
-    glass = lenses(model.spec)
+    glass, dispersive = lenses(model.spec), above_d_line(model.spec)
     out = {}
     for name, surface in model.surfaces.items():
         if LIGHT[model.spec.mirrors[name].light] is not Interaction.PASS:
             curved = () if surface.is_plane or surface.curvature == 0.0 else ("radius", "conic")
-            out[f"{root}/{name}"] = ("figure", *curved, *(("index",) if glass.get(name) == name else ()))
+            lens = ("index", *(("abbe",) if name in dispersive else ())) if glass.get(name) == name else ()
+            out[f"{root}/{name}"] = ("figure", *curved, *lens)
     return out
 
 
@@ -116,7 +119,8 @@ def camera_alone(model: CameraModel) -> Assembly:
     """The camera by itself: bodies ``camera/M1`` ... ``camera/focal_plane``, sequences ``camera/imaging`` ..."""
     tree = RigidTree(tuple(camera_bodies(ROOT, Pose(), model)))
     index = {f"{ROOT}/{lens}": n for lens, n in glass_indices(model.spec).items()}
-    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model), index)
+    above_d = {f"{ROOT}/{lens}": step for lens, step in above_d_line(model.spec).items()}
+    return Assembly(tree, camera_elements(ROOT, ROOT, model), camera_sequences(ROOT, model), index, above_d)
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,6 +398,19 @@ def glass_indices(spec: CameraSpec, wavelength: float | None = None) -> dict[str
     return {name: spec.index_behind(name, wavelength) for name in dict.fromkeys(lenses(spec).values())}
 
 
+def above_d_line(spec: CameraSpec) -> dict[str, float]:
+    """Lens whose glass has an Abbe number -> its index at the design wavelength less that at the d line.
+
+    A glass has one where it is known at the lines d, F and C.
+    """
+    out = {}
+    for name, index in glass_indices(spec).items():
+        with suppress(ValueError):
+            at_d, _, _ = (spec.index_behind(name, line) for line in ABBE_LINES)
+            out[name] = index - at_d
+    return out
+
+
 def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> State:
     """A state as light of another wavelength than the design's meets it: its lenses have other indices.
 
@@ -412,14 +429,36 @@ def coloured(spec: CameraSpec, root: str, state: State, wavelength: float) -> St
     Raises:
         ValueError: as ``glass_indices``.
     """
+    return in_glass(state, glass_steps(spec, root, wavelength))
+
+
+def glass_steps(spec: CameraSpec, root: str, wavelength: float) -> dict[str, float]:
+    """Body of a lens -> its index at a wavelength less that of the design wavelength; empty for none.
+
+    Arguments and exceptions as of ``coloured``.
+    """
     if wavelength == spec.wavelength or not lenses(spec):
-        return state
+        return {}
     design = glass_indices(spec)
+    at_colour = glass_indices(spec, wavelength)
+    return {f"{root}/{lens}" if root else lens: index - design[lens] for lens, index in at_colour.items()}
+
+
+def in_glass(state: State, steps: Mapping[str, float]) -> State:
+    """A state as light meets it whose indices are those of the design's wavelength and ``steps``.
+
+    A glass with another Abbe number disperses more or less than the catalogue's.
+
+    Args:
+        state: body path -> motion.
+        steps: of ``glass_steps``.
+    """
+    if not steps:
+        return state
     moved = dict(state)
-    for lens, index in glass_indices(spec, wavelength).items():
-        path = f"{root}/{lens}" if root else lens
+    for path, step in steps.items():
         motion = moved.get(path, AT_REST)
-        moved[path] = replace(motion, index=motion.index + (index - design[lens]))
+        moved[path] = replace(motion, index=motion.index + step * (1.0 + motion.dispersion))
     return FrozenMap(moved)
 
 

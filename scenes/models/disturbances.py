@@ -42,6 +42,7 @@ UNITS: Mapping[str, tuple[str, float]] = {
     "radius": ("ppm", 1e-6),
     "conic": ("ppm", 1e-6),
     "index": ("ppm", 1e-6),
+    "abbe": ("percent", 1e-2),
     "figure": ("nm", 1e-9),
     "temperature": ("K", 1.0),
     "gradient": ("mK/m", 1e-3),

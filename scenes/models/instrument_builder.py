@@ -24,6 +24,7 @@ from scenes.models import monitor_chain
 from scenes.models.built import as_built
 from scenes.models.camera_model import (
     CameraModel,
+    above_d_line,
     camera_bodies,
     camera_elements,
     camera_sequences,
@@ -101,6 +102,7 @@ def _build(
     if spec.central_prism is not None:
         bodies.append(Body(CENTRAL_PRISM, Pose(np.eye(3), np.array(spec.central_prism.position))))
     index: dict[str, float] = {}
+    above_d: dict[str, float] = {}
     elements: dict[str, Element] = {}
     sequences: dict[str, tuple[str, ...]] = {}
     channels: list[Channel] = []
@@ -114,6 +116,7 @@ def _build(
         elements.update({**camera_elements(name, root, model), **_ccd_elements(own)})
         sequences.update(camera_sequences(name, model))
         index |= {f"{root}/{lens}": n for lens, n in glass_indices(model.spec).items()}
+        above_d |= {f"{root}/{lens}": step for lens, step in above_d_line(model.spec).items()}
         if not own:
             continue
         bodies += [Body(f"{root}/monitor"), *(Body(f"{root}/monitor/{channel.name}") for channel in own)]
@@ -144,7 +147,7 @@ def _build(
     for solid in (solid for solid in solids if solid.transparent):
         index[solid.path] = glass(solid.material).vacuum_index(spec.autocollimator.wavelength)
     cameras = FrozenMap({name: derived[site.camera] for name, site in spec.cameras.items()})
-    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index)
+    assembly = Assembly(RigidTree(tuple(bodies)), elements, sequences, index, above_d)
     _check_alike(spec, assembly)
     if channels:
         assembly = monitor_chain.square_facets(assembly, channels, cameras, backend)

@@ -156,7 +156,7 @@ def _components(what: PerturbationSpec) -> Iterator[tuple[str, str, float]]:
     for kind, vector in vectors.items():
         yield from ((kind, f"{kind} {axis}", value) for axis, value in zip("xyz", vector, strict=True) if value)
     yield from (("figure", f"figure {term}", value) for term, value in what.figure.items() if value)
-    for kind in ("scale", "radius", "conic", "index"):
+    for kind in ("scale", "radius", "conic", "index", "abbe"):
         if value := getattr(what, kind):
             yield kind, kind, value
     if what.heat.change:

@@ -361,7 +361,7 @@ def square_facets(
         local = turned(block.rotation.T, normal / norm(normal))
         poses[channel.face_body] = Pose(_facet_axes(local), assembly.tree[channel.face_body].pose.translation)
     bodies = tuple(Body(b.path, poses.get(b.path, b.pose), b.pivots, b.scales) for b in assembly.tree.bodies)
-    return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media)
+    return Assembly(RigidTree(bodies), assembly.elements, assembly.sequences, assembly.media, assembly.above_d)
 
 
 def _aimed(

@@ -165,9 +165,7 @@ def solid_surfaces(
     """
     mesh = solid_mesh(solid, placed)
     own = placed.pose(solid.path)
-    index = (
-        assembly.media[solid.path] + getattr(state.get(solid.path, AT_REST), "index", 0.0) if solid.transparent else 1.0
-    )
+    index = assembly.index(solid.path, state.get(solid.path, AT_REST)) if solid.transparent else 1.0
     nominal = assembly.place()
     out = []
     for face, polygon in zip(solid.faces, mesh.polygons, strict=True):

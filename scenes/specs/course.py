@@ -30,6 +30,7 @@ ScaleChange = Annotated[float, Quantity(units.SCALE, largest="1 percent")]
 RadiusChange = Annotated[float, Quantity(units.SCALE, largest="10 percent")]
 ConicChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1.0, le=1.0)]
 IndexChange = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-0.1, le=0.1)]
+AbbeChange = Annotated[float, Quantity(units.SCALE, largest="50 percent")]
 _TERM = re.compile(r"Z([1-9][0-9]{0,3})")
 
 

@@ -72,6 +72,7 @@ class PerturbationSpec(PlainPerturbationSpec):
         radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
         conic: change of the conic constant, a pure number.
         index: change of the refractive index of the lens that begins at this face, a pure number.
+        abbe: relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
         temperature: uniform change as `2 K`, with a gradient, or a table of temperatures at nodes, in place of what the
             body inherits from the one that carries it, also where the change is `0 K`; None for what it inherits.
         deformation: the table of displaced nodes, or a mesh; None for none.

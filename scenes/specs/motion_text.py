@@ -23,6 +23,7 @@ KINDS = {
     "radius": "SHARE",
     "conic": "NUMBER",
     "index": "NUMBER",
+    "abbe": "SHARE",
     "figure": "Z5 LENGTH",
     "temperature": "DIFFERENCE",
     "gradient": "x|y|z DIFFERENCE/LENGTH",

@@ -12,6 +12,7 @@ from scenes.specs import job_tables
 from scenes.specs.course import (
     DEFAULT_PIVOT,
     NO_MOTION,
+    AbbeChange,
     ConicChange,
     IndexChange,
     RadiusChange,
@@ -29,7 +30,7 @@ from scenes.yaml.units import LENGTH
 
 FigureTerm = Annotated[float, Quantity(LENGTH, largest="100 um")]
 
-ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "temperature")
+ACTIONS = ("rotate", "shift", "figure", "scale", "radius", "conic", "index", "abbe", "temperature")
 """What can be done to a node, as its perturbation names it; `NodeInfo.allows` says which of them."""
 
 
@@ -46,6 +47,7 @@ class PlainPerturbationSpec(Spec):
         radius: relative change of the vertex radius of curvature, 1e-6 for 1 ppm.
         conic: change of the conic constant, a pure number.
         index: change of the refractive index of the lens that begins at this face, a pure number.
+        abbe: relative change of the Abbe number of the lens that begins at this face; its index at the d line stays.
         temperature: uniform change as `2 K`, or with a gradient, in place of what the body inherits from the one that
             carries it, also where the change is `0 K`; None for what it inherits.
     """
@@ -58,6 +60,7 @@ class PlainPerturbationSpec(Spec):
     radius: RadiusChange | None = None
     conic: ConicChange | None = None
     index: IndexChange | None = None
+    abbe: AbbeChange | None = None
     temperature: job_tables.PlainTemperature | None = None
 
     @property
@@ -73,7 +76,7 @@ class PlainPerturbationSpec(Spec):
             "rotate": any(self.rotate),
             "shift": any(self.shift),
             "figure": any(self.figure.values()),
-            **{name: bool(getattr(self, name)) for name in ("scale", "radius", "conic", "index")},
+            **{name: bool(getattr(self, name)) for name in ("scale", "radius", "conic", "index", "abbe")},
             "temperature": self.temperature is not None,
         }
         return tuple(name for name, does in done.items() if does)
@@ -96,6 +99,7 @@ class PlainPerturbationSpec(Spec):
             index=self.index or 0.0,
             radius=self.radius or 0.0,
             conic=self.conic or 0.0,
+            abbe=self.abbe or 0.0,
         )
 
 

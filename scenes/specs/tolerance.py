@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +34,7 @@ from scenes.yaml.yaml_file import read_yaml
 Amount = Annotated[str, Field(strict=True, max_length=100)] | Number
 """A quantity with its unit, or a pure number where the motion has no unit."""
 Share = Annotated[Number, Field(gt=0.0, lt=1.0)]
+Cost = Annotated[Number, Field(gt=0.0)]
 
 MEASURES: Mapping[str, Kind] = FrozenMap(
     {
@@ -40,12 +42,15 @@ MEASURES: Mapping[str, Kind] = FrozenMap(
         "rotate": ANGLE,
         "scale": SCALE,
         "radius": SCALE,
+        "abbe": SCALE,
         "figure": LENGTH,
         "temperature": TEMPERATURE_DIFFERENCE,
         "gradient": TEMPERATURE_GRADIENT,
     }
 )
 """Kind of a motion -> what its amounts measure; the others are pure numbers."""
+MOST_ABBE = 0.1
+"""Relative limit of an Abbe number at which, at ten times of it, no Abbe number is left."""
 SPECTRUM = "figure"
 """Kind of a motion that, without a term, is a whole figure error."""
 
@@ -110,7 +115,7 @@ class ToleranceSpec(Varied):
 
     Attributes:
         motion: what varies: `M2 shift z`, `M2 rotate x about centre`, `M1 radius`, `M1 conic`, `L1 index`,
-            `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
+            `L1 abbe` (relative), `M2 figure Z7`, `base temperature`; `M1 figure` alone is a figure error of many terms.
         carrying: further bodies that move rigidly with the first.
         limit: largest amount either way; of a figure error its rms.
         law: how it is distributed: `normal` within the limit, which is `sigmas` standard deviations; `uniform` within
@@ -122,6 +127,8 @@ class ToleranceSpec(Varied):
         power: of a figure error: the variance of its terms falls with the power of their radial order.
         cost: of holding it as stated, in any unit.
         exponent: the cost goes with the inverse limit to this power.
+        costs: in place of both, what limits cost where it is known, `[[20 um, 1], [10 um, 3]]`; between them and beyond
+            their ends along a smooth line in logarithms.
         kept: whether the allocation leaves it as it is.
     """
 
@@ -132,8 +139,9 @@ class ToleranceSpec(Varied):
     measured: Annotated[tuple[Amount, ...], Field(min_length=2, max_length=10_000)] | None = None
     terms: tuple[Text, Text] | None = None
     power: Annotated[Number, Field(ge=0.0, le=10.0)] = 3.0
-    cost: Annotated[Number, Field(gt=0.0)] = 1.0
+    cost: Cost = 1.0
     exponent: Annotated[Number, Field(gt=0.0, le=5.0)] = 1.0
+    costs: Annotated[tuple[tuple[Amount, Cost], ...], Field(min_length=2, max_length=50)] | None = None
     kept: Flag = False
 
     @model_validator(mode="before")
@@ -150,12 +158,16 @@ class ToleranceSpec(Varied):
     @model_validator(mode="after")
     def _is_a_tolerance(self) -> ToleranceSpec:
         self.si(self.limit, "limit", positive=True)
+        if self.parts[1] == "abbe" and self.limit_si >= MOST_ABBE:
+            problem = "no Abbe number is that uncertain; it is tried at ten times its limit"
+            raise Problem(problem, shown(self.limit), "less than 10 percent", within=("limit",))
         if self.mean is not None:
             self.si(self.mean, "mean")
         for value in self.measured or ():
             self.si(value, "measured")
         if self.measured is not None and (self.mean is not None or self.law != "normal"):
             raise Problem("what was measured has no law and no mean", None, "measured: [...]", within=("measured",))
+        self._costs_fall()
         if self.terms is not None:
             if self.parts[1] != SPECTRUM:
                 raise Problem("only a figure has terms", self.motion, "M1 figure", within=("terms",))
@@ -167,6 +179,25 @@ class ToleranceSpec(Varied):
                 problem = "the terms of a figure error are distributed normally about zero"
                 raise Problem(problem, None, "no law, mean or measured", within=("law",))
         return self
+
+    def _costs_fall(self) -> None:
+        """Refuse costs that say something twice. Raises Problem."""
+        if self.costs is None:
+            return
+        if (self.cost, self.exponent) != (1.0, 1.0):
+            raise Problem("costs stand in place of cost and exponent", None, "one of both", within=("costs",))
+        points = sorted((self.si(limit, "costs", positive=True), cost) for limit, cost in self.costs)
+        for (limit, cost), (looser, less) in pairwise(points):
+            if not limit < looser or less > cost:
+                problem = "a looser limit costs no more than a tighter one, and each limit has one cost"
+                raise Problem(problem, f"{cost:g} and {less:g}", "costs that fall with the limit", within=("costs",))
+
+    @property
+    def cost_points(self) -> tuple[tuple[float, float], ...]:
+        """Limits over the stated one and what they cost, ascending, two at least."""
+        if self.costs is None:
+            return (1.0, self.cost), (2.0, self.cost * 2.0**-self.exponent)
+        return tuple(sorted((amount_si(limit, self.parts[1]) / self.limit_si, cost) for limit, cost in self.costs))
 
     @property
     def spectrum(self) -> tuple[int, ...]:
@@ -269,7 +300,8 @@ class MeritSpec(Spec):
             largest change of an image's place along the line that neither of these three explains; `chief_ray`, largest
             turn of a chief ray at the line CCD; `obstruction`, largest share of a field's beam, by area of the stop,
             that bodies of the instrument take; `monitor_angle` and `monitor_focus`, standard deviation that the
-            monitor's readings of a rotation and of `d_f` have under the disturbances.
+            monitor's readings of a rotation and of `d_f` have under the disturbances. The budget's `light` says in
+            which light wavefronts and MTFs are.
         fields: of wavefront, mtf, chief_ray and obstruction, the worst of which counts: shares of the half field along
             the line and the track.
         frequency: of mtf, cycles per mm; that of the pixels (Nyquist) if not given.
@@ -382,6 +414,8 @@ class ToleranceBudgetSpec(Spec):
         compensators: by name, what is adjusted in every camera, in this order; the mean square wavefront error over all
             fields of the merits is made least.
         merits: by name, what is asked.
+        light: in which wavefronts and MTFs are judged: `spectrum`, that of the camera, or `design`, its
+            design wavelength alone; the spectrum of a camera with lenses that has one, when left out.
         samples: cameras that are drawn.
         seed: of everything drawn.
         allocation: whether limits are allocated anew, and for which yield.
@@ -394,6 +428,7 @@ class ToleranceBudgetSpec(Spec):
     tolerances: Annotated[Named[ToleranceSpec], Field(min_length=1, max_length=300)]
     compensators: Annotated[Named[CompensatorSpec], NothingIsEmpty] = Field(default_factory=FrozenMap)
     merits: Annotated[Named[MeritSpec], Field(min_length=1, max_length=50)]
+    light: Literal["spectrum", "design"] | None = None
     samples: Annotated[Whole, Field(ge=20, le=MOST_RUNS)] = 1000
     seed: Seed = 0
     allocation: AllocationSpec | None = None

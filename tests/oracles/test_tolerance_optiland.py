@@ -1,4 +1,4 @@
-"""Tolerances of an on-axis telescope beside optiland's tolerancing: sensitivities, distributions, and time."""
+"""Tolerances of a three-mirror telescope beside optiland's tolerancing: sensitivities, distributions, and time."""
 
 import time
 import warnings
@@ -29,19 +29,31 @@ pytestmark = pytest.mark.oracle
 
 ARCSEC = np.pi / 648_000
 MM = 1e-3
-BUDGET = {
-    # motion, limit in the file and in SI; optiland's variable, surface and axis
-    "M1_radius": ("M1 radius", "1000 ppm", 1e-3, "radius", 1, None),
-    "M1_conic": ("M1 conic", "1.0e-2", 1e-2, "conic", 1, None),
-    "M2_radius": ("M2 radius", "3000 ppm", 3e-3, "radius", 2, None),
-    "M2_conic": ("M2 conic", "5.0e-2", 5e-2, "conic", 2, None),
-    "M2_x": ("M2 shift x", "150 um", 150e-6, "decenter", 2, "x"),
-    "M2_y": ("M2 shift y", "150 um", 150e-6, "decenter", 2, "y"),
-    "M2_z": ("M2 shift z", "2 mm", 2e-3, "decenter", 2, "z"),
-    "M2_tilt_x": ("M2 rotate x", "60 arcsec", 60.0 * ARCSEC, "tilt", 2, "x"),
-    "M2_tilt_y": ("M2 rotate y", "60 arcsec", 60.0 * ARCSEC, "tilt", 2, "y"),
-}
-"""So large that every one changes the refocused wavefront by more than a hundred times ``SETTLED``."""
+
+
+def _budget() -> dict[str, tuple[str, str, float, str, int, str | None]]:
+    """Name -> motion, limit in the file and in SI; optiland's variable, surface and axis."""
+    out: dict[str, tuple[str, str, float, str, int, str | None]] = {}
+    for number, (ppm, conic, move, despace, turn) in enumerate(
+        ((100, 1e-3, 50, 100, 20), (2000, 1e-2, 50, 100, 20), (5000, 1e-3, 300, None, 20)), start=1
+    ):
+        mirror = f"M{number}"
+        out[f"{mirror}_radius"] = f"{mirror} radius", f"{ppm} ppm", ppm * 1e-6, "radius", number, None
+        out[f"{mirror}_conic"] = f"{mirror} conic", f"{conic:.1e}", conic, "conic", number, None
+        for axis in "xy":
+            out[f"{mirror}_{axis}"] = f"{mirror} shift {axis}", f"{move} um", move * 1e-6, "decenter", number, axis
+        if despace is not None:
+            out[f"{mirror}_z"] = f"{mirror} shift z", f"{despace} um", despace * 1e-6, "decenter", number, "z"
+        for axis in "xy":
+            tilt = f"{mirror} rotate {axis}", f"{turn} arcsec", turn * ARCSEC, "tilt", number, axis
+            out[f"{mirror}_tilt_{axis}"] = tilt
+    return out
+
+
+BUDGET = _budget()
+"""Twenty, so large that every one changes the refocused wavefront by more than ``LEAST``."""
+LEAST = 1e-3
+"""Waves: a hundred times ``SETTLED``."""
 CLOSE = 0.01
 """Share of a change to which the two are to agree."""
 SETTLED = 1e-5
@@ -51,10 +63,10 @@ SAMPLES = 1200
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory) -> ToleranceSetup:
-    """The library's Ritchey-Chretien without all that stands before its pupil: optiland has no hole and no spider."""
+    """The library's anastigmat after Korsch without its baffle, which optiland does not have."""
     folder = tmp_path_factory.mktemp("tolerance")
-    camera = YAML(typ="safe").load((LIBRARY / CAMERAS / "ritchey_chretien.yaml").read_text("utf-8"))
-    del camera["mirrors"]["spider"], camera["mirrors"]["M1"]["edges"]
+    camera = YAML(typ="safe").load((LIBRARY / CAMERAS / "korsch.yaml").read_text("utf-8"))
+    del camera["mirrors"]["baffle"]
     YAML().dump(camera, folder / "telescope.yaml")
     lines = [f"  {k}: {{motion: {motion}, limit: {told}, law: uniform}}" for k, (motion, told, *_) in BUDGET.items()]
     head = ["instrument: telescope.yaml", "tolerances:", *lines]
@@ -83,11 +95,11 @@ class Peer:
         self.optic: Any = optiland_camera(model, unit=MM)
         self.optic.set_aperture("EPD", self.spec.entrance_pupil / MM)
         self.optic.fields.set_type("angle")
-        self.half = np.degrees([self.spec.field.x, self.spec.field.y])
-        for share in fields:
-            x, y = share * self.half
+        half, bias = np.degrees([self.spec.field.x, self.spec.field.y]), np.degrees([0.0, self.spec.field_bias])
+        angles = fields * half + bias
+        for x, y in angles:
             self.optic.fields.add(x=x, y=y)
-        self.shares = fields * self.half / self.optic.fields.max_field
+        self.shares = angles / self.optic.fields.max_field
         """Fields in optiland's units."""
         self._pupil = -float(self.optic.paraxial.XPL())
         disk = 0.5 * self.spec.entrance_pupil * self.nodes.points
@@ -100,7 +112,9 @@ class Peer:
 
     def squares(self, optic: Any) -> np.ndarray:
         """Mean squares of the wavefronts of all fields, waves^2, (F,)."""
-        rays = optiland_rays(self._launch / MM, self._along)
+        # the stop moves with the first mirror, and the beams with it
+        moved = np.array([float(getattr(optic.surfaces[1].geometry.cs, axis)) for axis in "xy"] + [0.0])
+        rays = optiland_rays(self._launch / MM + moved, self._along)
         optic.surfaces.trace(rays, record=False)
         beams = (-1, len(self.nodes.points))
         place = np.stack([rays.x, rays.y, rays.z], axis=-1).reshape(*beams, 3)
@@ -146,7 +160,7 @@ class Peer:
             out.add_operand("twin_worst", {"optic": self.optic}, target=0.0, weight=0.0)
         # optiland scales a place twice: a unit is 1 m then, and a step of its differences, 1e-8, is 10 nm
         scaler = LinearScaler(factor=np.sqrt(MM), offset=0.0)
-        out.add_compensator("decenter", surface_number=3, axis="z", scaler=scaler)
+        out.add_compensator("decenter", surface_number=len(self.model.surfaces) + 1, axis="z", scaler=scaler)
         return out
 
     def end(self, name: str, share: float) -> float:
@@ -199,7 +213,7 @@ def peer(bench: ToleranceBench) -> Iterator[Peer]:
 @pytest.mark.second
 @pytest.mark.filterwarnings("ignore")
 def test_sensitivities_are_those_of_optiland(bench: ToleranceBench, peer: Peer) -> None:
-    """Both ends of every tolerance, refocused. By symmetry the sign of a tilt shows in none of them."""
+    """Both ends of every tolerance, refocused."""
     from optiland.tolerancing import RangeSampler, SensitivityAnalysis
 
     ours = sensitivities(bench)
@@ -209,7 +223,7 @@ def test_sensitivities_are_those_of_optiland(bench: ToleranceBench, peer: Peer) 
     nominal.reset()
     assert ours.nominal[0] == pytest.approx(designed, abs=SETTLED)
     names, theirs = list(BUDGET), []
-    for group in (names[:5], names[5:]):  # optiland takes six at most
+    for group in (names[k : k + 6] for k in range(0, len(names), 6)):  # optiland takes six at most
         tolerancing = peer.tolerancing(precise=True)
         for name in group:
             peer.add(tolerancing, name, RangeSampler(peer.end(name, -1.0), peer.end(name, 1.0), 2))
@@ -218,7 +232,8 @@ def test_sensitivities_are_those_of_optiland(bench: ToleranceBench, peer: Peer) 
         theirs.append(run.get_results()[run.operand_names[1]].to_numpy().reshape(-1, 2))
     change = np.concatenate(theirs) - designed
     assert list(bench.entries) == names
-    assert np.abs(change).min() > 100.0 * SETTLED
+    assert len(names) == 20
+    assert np.abs(change).max(axis=1).min() > LEAST
     np.testing.assert_allclose(ours.values[:, :, 0] - ours.nominal[0], change, rtol=CLOSE, atol=0)
 
 
@@ -229,9 +244,9 @@ def test_cameras_are_distributed_as_optilands_and_come_faster(
 ) -> None:
     """As many as optiland makes in about a minute; and the processor time of each, without and with its own wavefronts.
 
-    Measured on a busy machine of two cores, processor time of a camera: twin 2.4 ms; optiland 52 ms where an operand of
-    ours traces all fields at once, 22 times as much; 1600 ms where each field is an operand of its own wavefront, as
-    its users have it, 660 times as much. Of the one a quarter is asked for, of the other a seventh.
+    Measured on a busy machine of two cores, processor time of a camera: twin 1.3 ms; optiland 56 ms where an operand of
+    ours traces all fields at once, 42 times as much; 1300 ms where each field is an operand of its own wavefront, as
+    its users have it, 990 times as much. Of the one a quarter is asked for, of the other a fifth.
     """
     draw_samples(setup, bench, backend, 200, 3, Workforce())  # kernels are compiled
     start = time.process_time()
@@ -250,5 +265,5 @@ def test_cameras_are_distributed_as_optilands_and_come_faster(
             f"twin {1e3 * ours:.2f} ms, optiland {1e3 * together:.1f} ms, with its own wavefronts {1e3 * each:.0f} ms"
         )
         print(f"\nprocessor time of a camera: {told}")  # noqa: T201 - the test's result
-    assert each > 100.0 * ours
-    assert together > 5.0 * ours
+    assert each > 200.0 * ours
+    assert together > 10.0 * ours

@@ -25,6 +25,7 @@ FOLDERS = {
     "examples/tolerance": "tolerance",
     "examples/asbuilt": "asbuilt",
     "examples/as_built": "as_built_instrument",
+    "examples/cassegrain": "camera",
     "examples/": "job",
     "lab/focus": "focus_test",
     "lab/distortion": "distortion_test",

@@ -14,13 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import checked_nodes
+from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve
-from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
 from scenes.yaml.errors import InputError
-from scenes.yaml.yaml_file import dump_yaml
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import YamlFile, dump_yaml
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.tolerance.allocation import CostCurve
 from twin.tolerance.merit_models import inverse_limits, sensitivities
 from twin.tolerance.samples import Workforce, draw_samples
 from twin.tolerance.tolerance_bench import ToleranceBench
@@ -111,7 +115,8 @@ def test_order_and_company_do_not_matter(bench: ToleranceBench, drawn: np.ndarra
     again = other.try_out(drawn[:, place] * other.sizes)
     np.testing.assert_allclose(again.parts, own.parts, rtol=1e-9, atol=1e-15)
     alone = np.concatenate([bench.try_out(row[None] * bench.sizes).parts for row in drawn[:3]])
-    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-9, atol=1e-15)
+    # matrix products of other sizes round otherwise, and a path of ten metres has no digits below 3e-9 waves
+    np.testing.assert_allclose(alone, own.parts[:3], rtol=1e-8, atol=1e-15)
 
 
 def test_a_compensator_without_a_range_changes_nothing(
@@ -126,7 +131,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     def squares(one: ToleranceBench, moves: np.ndarray) -> np.ndarray:
         amounts = np.concatenate([drawn * one.sizes, moves], axis=1)
         return np.sum(
-            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts))[0]) ** 2, axis=1
+            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts)).paths) ** 2, axis=1
         )
 
     tried = bench.try_out(drawn * bench.sizes)
@@ -141,6 +146,23 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     without = squares(fewer, fewer.try_out(drawn * fewer.sizes).moves)
     assert np.all(best <= without + 1e-10)
     assert np.any(best < 0.999 * without)
+
+
+@pytest.mark.parametrize("motion", ["M2 shift x", "focal_plane shift z"])
+def test_rays_go_through_the_stop_where_adjustments_have_brought_it(motion: str, backend, tmp_path) -> None:
+    """M2 is the stop; rays are aimed once where an adjustment leaves it alone."""
+    one = {"one": {"motion": motion, "range": "5 mm"}}
+    tolerances = {
+        "decentre": {"motion": "M3 shift x", "limit": "1 mm"},
+        "radius": {"motion": "M1 radius", "limit": "0.1 percent"},
+    }
+    bench = ToleranceBench(budget(tmp_path, compensators=one, tolerances=tolerances), backend)
+    amounts = np.eye(2) * bench.sizes
+    tried = bench.try_out(amounts, paths=True)
+    assert np.max(np.abs(tried.moves)) > 1e-4
+    states = states_of((*bench.numbers, *bench.compensators), np.concatenate([amounts, tried.moves], axis=1))
+    assert tried.paths is not None
+    np.testing.assert_allclose(tried.paths, bench._errors(states).paths, rtol=0, atol=1e-13)
 
 
 def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:
@@ -217,6 +239,25 @@ def test_an_obscured_camera_is_that_of_the_camera_program(backend, tmp_path) -> 
         assert values[1] == pytest.approx(least, abs=1e-4)
 
 
+@pytest.mark.second
+def test_the_example_of_a_zemax_file_is_collimated_by_its_secondary(backend) -> None:
+    """Its turns take out the coma of a decentre, and what it is tilted by itself."""
+    setup = resolve_tolerance(EXAMPLES / "tolerance_cassegrain.yaml")
+    focus = {"focus": setup.test.compensators["focus"]}
+    alone = setup.model_copy(update={"test": setup.test.model_copy(update={"compensators": FrozenMap(focus)})})
+    both, only = (ToleranceBench(one, backend) for one in (setup, alone))
+    names = list(both.entries)
+    x = np.zeros((3, len(both.numbers)))
+    for row, name in enumerate(("M2_decentre_x", "M2_tilt_y"), start=1):
+        x[row, both.entries[name][0]] = 1.0
+    with_turns, without = (one.values(one.try_out(x * one.sizes).parts)[:, 0] for one in (both, only))
+    assert names == list(setup.test.tolerances)
+    assert without[1] > 0.1
+    assert without[2] > 0.08
+    assert with_turns[1] < 0.03
+    assert with_turns[2] == pytest.approx(with_turns[0], abs=1e-5)
+
+
 def test_shares_of_a_figure_and_of_a_yield() -> None:
     shares = spectrum_shares(tuple(range(5, 37)), 3.0)
     assert np.sum(shares**2) == pytest.approx(1.0)
@@ -256,7 +297,62 @@ def test_the_yield_of_an_allocation_is_that_of_other_cameras(backend, tmp_path) 
     )
 
 
+def test_costs_of_grades_are_those_stated_and_fall_between_them() -> None:
+    stated = {"motion": "M2 shift z", "limit": "20 um", "costs": [["50 um", 1.0], ["10 um", 4.0], ["20 um", 1.5]]}
+    one = validate(ToleranceSpec, YamlFile("", stated, {}))
+    curve = CostCurve(one.cost_points)
+    for limit, cost in ((50.0, 1.0), (20.0, 1.5), (10.0, 4.0)):
+        assert np.exp(curve(np.log(limit / 20.0))[0]) == pytest.approx(cost)
+    level = np.linspace(np.log(0.1), np.log(10.0), 400)
+    told, slope = np.array([curve(x) for x in level]).T
+    assert np.all(np.diff(told) < 0.0)
+    inside = (level > np.log(0.52)) & (level < np.log(2.4))
+    np.testing.assert_allclose(np.gradient(told, level)[inside], slope[inside], atol=0.05)
+    # beyond the tightest as between the two tightest: twice as tight costs 4 / 1.5 as much
+    assert np.exp(curve(np.log(0.25))[0]) == pytest.approx(4.0 * 4.0 / 1.5)
+    plain = validate(ToleranceSpec, YamlFile("", {**stated, "costs": None, "cost": 3.0, "exponent": 2.0}, {}))
+    curve = CostCurve(plain.cost_points)
+    assert [np.exp(curve(np.log(x))[0]) for x in (0.1, 0.5, 1.0, 3.0)] == pytest.approx([300.0, 12.0, 3.0, 1.0 / 3.0])
+
+
+@pytest.mark.second
+def test_an_allocation_pays_where_it_is_cheap(backend, tmp_path) -> None:
+    """Two alike errors, of which one can hardly be bought: the other is tightened."""
+    ways = {"cheap": [["200 um", 1.0], ["50 um", 1.1], ["20 um", 1.2]], "dear": [["200 um", 1.0], ["50 um", 50.0]]}
+    tolerances = {
+        name: {"motion": f"M1 shift {axis}", "limit": "200 um", "costs": costs}
+        for axis, (name, costs) in zip("xy", ways.items(), strict=True)
+    }
+    changed = {
+        "tolerances": tolerances,
+        "merits": {"wavefront": {"kind": "wavefront", "at_most": 0.06, "fields": [[0.0, 0.0]]}},
+        "compensators": {"focus": BUDGET["compensators"]["focus"]},
+    }
+    loose = budget(tmp_path, **changed, samples=200, allocation={"target": 0.9})
+    run = run_tolerance(loose, backend)
+    assert run.allocation is not None
+    assert run.allocation.reached
+    ratio = dict(zip(tolerances, run.allocation.scales.tolist(), strict=True))
+    assert ratio["cheap"] < 0.5
+    assert ratio["dear"] > 2.0 * ratio["cheap"]
+    np.testing.assert_allclose(run.allocation.costs[0], [1.0, 1.0])
+
+
 BAD = {
+    "costs that rise with the limit": (
+        {"tolerances": {"a": {"motion": "M2 shift z", "limit": "1 um", "costs": [["1 um", 1.0], ["2 um", 3.0]]}}},
+        "costs no more",
+        "tolerances",
+    ),
+    "costs said twice": (
+        {
+            "tolerances": {
+                "a": {"motion": "M2 shift z", "limit": "1 um", "cost": 2.0, "costs": [["1 um", 3.0], ["2 um", 1.0]]}
+            }
+        },
+        "in place of cost",
+        "tolerances",
+    ),
     "no such body": ({"tolerances": {"a": {"motion": "M7 shift z", "limit": "1 um"}}}, "no such node", "tolerances"),
     "an amount in the motion": (
         {"tolerances": {"a": {"motion": "M2 shift z 3 um", "limit": "1 um"}}},

@@ -72,21 +72,24 @@ class BandPupils:
         return over_light
 
 
-def wavelengths_enough(spectrum: SpectrumSpec, first: int, values: Callable[[int], np.ndarray]) -> int:
+def wavelengths_enough(
+    spectrum: SpectrumSpec, first: int, values: Callable[[int], np.ndarray], largest: int = LARGEST_RULE
+) -> int:
     """How many wavelengths an MTF over a spectrum takes.
 
     Args:
         spectrum: the light.
         first: count of the first rule.
-        values: of the MTF by the rule of so many wavelengths.
+        values: of the MTF by the rule of so many wavelengths, or of other numbers of this kind.
+        largest: wavelengths of the last rule.
 
     Raises:
-        UnphysicalError: it still changes by more than ``WORST_CHANGE`` at ``LARGEST_RULE`` wavelengths.
+        UnphysicalError: it still changes by more than ``WORST_CHANGE`` at ``largest`` wavelengths.
     """
     if spectrum.lines or spectrum.ends[0] == spectrum.ends[1]:
         return first
     count, before, change = first, values(first), np.inf
-    while count < LARGEST_RULE:
+    while count < largest:
         count = 2 * count - 1
         after = values(count)
         change = float(np.max(np.abs(after - before)))

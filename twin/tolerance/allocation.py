@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize
 
 from optics.numerics.frozen_map import FrozenMap
@@ -49,7 +50,7 @@ class Allocation:
     Attributes:
         scales: of every entry, new limit over the old one, before and after rounding, (E,) each.
         limits: entry -> new limit as files have it.
-        cost: of all entries, before and after.
+        costs: of every entry, before and after, (2, E).
         predicted: yield of the old and of the new limits, by the model as it was corrected.
         reached: whether the yield of the new limits, as they are rounded, reaches what was asked.
         unrounded: whether that of the limits before rounding does.
@@ -58,10 +59,16 @@ class Allocation:
     scales: np.ndarray
     rounded: np.ndarray
     limits: Mapping[str, str | float]
-    cost: tuple[float, float]
+    costs: np.ndarray
     predicted: tuple[float, float]
     reached: bool
     unrounded: bool
+
+    @property
+    def cost(self) -> tuple[float, float]:
+        """Of all entries, before and after."""
+        before, after = np.sum(self.costs, axis=1)
+        return float(before), float(after)
 
 
 def allocate(
@@ -89,15 +96,21 @@ def allocate(
     total = np.zeros(len(costs.kept))
     low, high = -np.log(spec.tightest), np.log(spec.loosest)
     trade = _Trade(bench, model, samples, costs, share, samples.values)
-    first = trade.passing(total)
+    first, nothing = trade.passing(total), np.zeros(len(total))
+    cheapest = (costs.of_level(total), total, trade) if trade.quantile(nothing)[0] <= 0.0 else None
     for turn in range(ROUNDS):
         advance("allocation", turn, ROUNDS)
         bounds = np.clip([low - total, high - total], -np.log(BOUND), np.log(BOUND))
         step = trade.cheapest(np.where(costs.kept, 0.0, bounds[0]), np.where(costs.kept, 0.0, bounds[1]), total)
         total, trade = total + step, _Trade.at(bench, total + step, samples, costs, share)
+        price = costs.of_level(total)
+        if (cheapest is None or price < cheapest[0]) and trade.quantile(nothing)[0] <= 0.0:
+            cheapest = price, total, trade
         if np.max(np.abs(step)) < _SETTLED:
             break
-    nothing = np.zeros(len(total))
+    if cheapest is not None:
+        # what exact traces pass; the model knows nothing of adjustments at the end of their range, and may lead astray
+        _, total, trade = cheapest
     for _ in range(_LAST):
         if trade.quantile(nothing)[0] <= 0.0:
             break
@@ -111,7 +124,7 @@ def allocate(
             break
     predicted = final.passing(nothing)
     advance("allocation", ROUNDS, ROUNDS)
-    cost = costs.of_level(nothing), costs.of_level(np.log(rounded))
+    cost = np.stack([costs.of_each(nothing), costs.of_each(np.log(rounded))])
     return Allocation(
         np.exp(total),
         rounded,
@@ -123,31 +136,58 @@ def allocate(
     )
 
 
+class CostCurve:
+    """What a limit costs: through stated points a smooth line that never rises, straight beyond them, in logarithms.
+
+    Args:
+        points: limits over the stated one and their costs, ascending, two at least.
+    """
+
+    def __init__(self, points: Sequence[tuple[float, float]]) -> None:
+        self._x, self._y = np.log(np.array(points)).T
+        self._line = PchipInterpolator(self._x, self._y)
+        self._slope = self._line.derivative()
+
+    def __call__(self, level: float) -> tuple[float, float]:
+        """Logarithm of the cost, and its derivative, at the logarithm of a limit over the stated one."""
+        x, y = self._x, self._y
+        if x[0] <= level <= x[-1]:
+            return float(self._line(level)), float(self._slope(level))
+        near, inner = (0, 1) if level < x[0] else (-1, -2)
+        slope = float((y[near] - y[inner]) / (x[near] - x[inner]))
+        return float(y[near] + slope * (level - x[near])), slope
+
+
 @dataclass(frozen=True, eq=False)
 class _Costs:
     """What limits cost.
 
     Attributes:
-        cost, exponent: of every entry, (E,) each.
+        curves: logarithm of the cost of every entry by that of its limit over the stated one, E.
         kept: whether its limit stays: as stated, and where its distribution is not about zero.
     """
 
-    cost: np.ndarray
-    exponent: np.ndarray
+    curves: tuple[CostCurve, ...]
     kept: np.ndarray
 
     @classmethod
     def of(cls, setup: ToleranceSetup) -> _Costs:
         entries = list(setup.test.tolerances.values())
         kept = [one.kept or one.mean is not None or one.measured is not None for one in entries]
-        return cls(np.array([e.cost for e in entries]), np.array([e.exponent for e in entries]), np.array(kept))
+        return cls(tuple(CostCurve(one.cost_points) for one in entries), np.array(kept))
+
+    def of_each(self, level: np.ndarray) -> np.ndarray:
+        """Of every entry, (E,), with limits at exp(level) times the stated ones."""
+        return np.exp([curve(x)[0] for curve, x in zip(self.curves, level.tolist(), strict=True)])
 
     def of_level(self, level: np.ndarray) -> float:
-        """Of limits at exp(level) times the stated ones."""
-        return float(np.sum(self.cost * np.exp(-self.exponent * level)))
+        """Of all entries."""
+        return float(np.sum(self.of_each(level)))
 
     def slope(self, level: np.ndarray) -> np.ndarray:
-        return np.asarray(-self.exponent * self.cost * np.exp(-self.exponent * level))
+        """Derivatives of the costs by the level, (E,)."""
+        both = np.array([curve(x) for curve, x in zip(self.curves, level.tolist(), strict=True)])
+        return np.asarray(np.exp(both[:, 0]) * both[:, 1])
 
 
 class _Trade:
@@ -282,7 +322,7 @@ def _graded(
         return np.array([ladder[k][1] for ladder, k in zip(ladders, which, strict=True)]) / old
 
     if looser:
-        gain = trade.costs.cost * trade.costs.exponent
+        gain = -trade.costs.slope(total)
         for e in np.argsort(-gain, kind="stable"):
             for k in range(1, len(ladders[e])):
                 tried = chosen.copy()

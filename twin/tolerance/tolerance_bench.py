@@ -1,8 +1,8 @@
 """One camera on which tolerances are tried: exact traces of many cameras at once, with their adjustments.
 
 All wavefronts are those of the beams that the designed camera images at the merits' fields, traced through the same
-points of the stop. What bodies and edges take of a beam is that of the designed camera, but where it is itself the
-merit.
+points of the stop. What bodies and edges take of a beam is that of the designed camera, at its design wavelength, but
+where it is itself the merit.
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry.polygon import area
-from optics.geometry.tree import State
+from optics.geometry.tree import PlacedBodies, State
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError, UnphysicalError
@@ -24,18 +23,17 @@ from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.line_of_sight import line_change, line_tangents
 from optics.raytrace.system import assemble
 from optics.raytrace.trace import make_rays, trace
-from optics.waves.lit_stop import LitStop
-from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products, to_terms
-from optics.waves.transfer import transfer
-from optics.waves.varied_pupil import VariedTransfer
 from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import LAUNCH_DISTANCE
+from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass, lenses
 from scenes.specs.tolerance import OF_MONITOR, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
+from twin.targets.band_light import wavelengths_enough
+from twin.tolerance.adjustments import Adjustments, told
+from twin.tolerance.designed_light import Errors, LitRoots, fixed_transfers, light_of
 from twin.tolerance.merits import Merit, merits_of
 from twin.tolerance.monitor_merit import MonitorMerit
 from twin.tolerance.obstruction_merit import obstructed_shares, require_bodies
@@ -54,10 +52,10 @@ MOST_STEPS = 12
 
 GRIDS = ((5, 8), (7, 10), (10, 14))
 """Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
+FIRST_RULE, LARGEST_RULE = 3, 17
+"""Wavelengths of the first and of the last rule over a spectrum."""
 RESIDUAL = 1e-3
 """Rms of a wavefront that its polynomials may leave, waves."""
-TRANSFER = 1e-3
-"""By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""
 EVERY = 4
 """Distortion is told of each fourth point of the line."""
 _MOVE = 1e-3
@@ -73,7 +71,8 @@ class Tried:
         parts: of all merits, (S, P); NaN where the light is lost.
         problems: why it is lost, empty where it is not, (S,).
         settled: rms by which one further step would change the wavefront, waves, (S,).
-        paths: optical paths of the beams' rays less those of the chief rays, (S, F, N), metres; None if not asked for.
+        paths: optical paths of the beams' rays less those of the chief rays, of all traced wavelengths, (S, F, K N),
+            metres; None if not asked for.
     """
 
     moves: np.ndarray
@@ -108,6 +107,7 @@ class ToleranceBench:
         merits: that are asked.
         fields: of the wavefronts, (F, 2).
         monitor: of the instrument; None where no merit is about it.
+        colours, shares: wavelengths of the light of the wavefronts and MTFs, metres, and their shares, (C,) each.
 
     Raises:
         InputError: names that do not exist, a merit that the camera cannot have, or a camera without light.
@@ -133,6 +133,8 @@ class ToleranceBench:
         self.parts = self.merits[-1].parts.stop
         self.optics = CameraOptics.within(instrument, self.camera, backend)
         self.wavelength = float(self.optics.model.spec.wavelength)
+        self._moves_stop = self._adjusts_before_stop()
+        self.colours, self.shares = np.array([self.wavelength]), np.ones(1)
         self._wanted = {merit.spec.kind for merit in self.merits}
         require_bodies(setup, self.optics.path)
         if len(self.fields):
@@ -149,34 +151,81 @@ class ToleranceBench:
             raise test.error(unknown("no such camera", test.camera, names), ("camera",))
         return test.camera or names[0]
 
+    def _adjusts_before_stop(self) -> bool:
+        """Whether adjustments change where light meets the stop, so that rays have to be aimed anew after them."""
+        path = self.optics.path
+        chain = [path.assembly.elements[name] for name in path.assembly.sequences[f"{path.name}/to_stop"]]
+        bodies = {body for one in chain for body in (one.body, one.solid) if body is not None}
+        moved = {body for number in self.compensators for body in number.moves}
+        return any(body == own or body.startswith(f"{own}/") for body in bodies for own in moved)
+
     # what does not change from camera to camera
 
     @one_blas_thread()
     def _prepare(self) -> None:
-        path, model = self.optics.path, self.optics.model
+        """Look at the designed camera in the light of the budget, by as many wavelengths as its merits take."""
         self.directions = self.optics.directions(self.fields)
+        test, spectrum = self.setup.test, light_of(self.setup.test, self.optics.model.spec)
+        if spectrum is None:
+            self._prepare_in(np.array([self.wavelength]), np.ones(1))
+            return
+
+        def values(count: int) -> np.ndarray:
+            self._prepare_in(*spectrum.rule(count))
+            return self._designed_values()
+
+        try:
+            if wavelengths_enough(spectrum, FIRST_RULE, values, LARGEST_RULE) == FIRST_RULE:
+                self._prepare_in(*spectrum.rule(FIRST_RULE))
+        except UnphysicalError as error:
+            raise test.error(f"merits over the light: {error}", ("light",), allowed="light: design") from error
+
+    def _designed_values(self) -> np.ndarray:
+        """Rms wavefront errors and MTFs of the designed camera in its light, as it stands."""
+        squares = np.sum(self._residuals(self.designed[None]).reshape(len(self.fields), -1) ** 2, axis=-1)
+        mtfs = [one.known for rows in self._transfers.values() for row in rows for one in row]
+        return np.concatenate([np.sqrt(squares), mtfs])
+
+    def _prepare_in(self, colours: np.ndarray, shares: np.ndarray) -> None:
+        """Work out what does not change from camera to camera.
+
+        Args:
+            colours: wavelengths of the light, metres, (C,).
+            shares: of them, which sum to 1, (C,).
+        """
+        path, model = self.optics.path, self.optics.model
+        self.colours, self.shares = colours, shares
+        # mirrors image all wavelengths alike: one is traced for all, and their light differs in the MTF alone
+        traced = colours if lenses(model.spec) else np.array([self.wavelength])
+        self.traced_shares = shares if len(traced) == len(colours) else np.ones(1)
+        self._glass = [glass_steps(model.spec, path.root, float(colour)) for colour in traced]
         for rings, degree in GRIDS:
             self.nodes, self.degree = quadrature.disk(rings), degree
             self.points = np.concatenate([np.zeros((1, 2)), np.stack([self.nodes.x, self.nodes.y], axis=-1)])
             self._aim_nominal()
             self.radius = float(model.first_order.exit_pupil_distance[0])
-            position, direction, paths, valid = self._rays([{}])
+            (position, direction, paths, valid), _ = self._rays([{}])
             if not valid.all():
                 problem = "the beams of the fields are cut by what is not the stop and has no edges of its own"
                 raise self.setup.test.error(problem, ("merits",), allowed="fields whose light comes through whole")
-            self.designed = self._paths(position, direction, paths)[0]
-            self.chief = direction[0, :, 0]
+            self.designed = self._paths(position, direction, paths, self.radius)[0]
+            self.designed_eikonals = self._paths(position, direction, paths, np.inf)[0]
+            self.chief = self._chiefs(direction)[0]
             self.solve = to_terms(self.nodes, degree)
-            rest = self.designed - self.designed @ self.solve.T @ products(self.nodes.x, self.nodes.y, degree).T
+            own = self.designed.reshape(len(self.fields), len(traced), -1)
+            rest = own - own @ self.solve.T @ products(self.nodes.x, self.nodes.y, degree).T
             self.residual = float(np.sqrt(np.max(rest**2 @ self.nodes.share))) / self.wavelength
             if self.residual <= RESIDUAL:
                 break
         else:
             problem = f"wavefronts that polynomials do not follow: they leave {self.residual:.2g} waves"
             raise self.setup.test.error(problem, ("merits",), allowed="a sharper camera, or fields where it is")
-        self._roots = self._lit_roots(path.shadows_on_stop({}, self.directions)[0])
-        self._transfers = self._fixed_transfers(direction[0])
-        self._slope = self._adjustment_slope()
+        self._roots = LitRoots.of(path.shadows_on_stop({}, self.directions)[0], self.degree)
+        cosines, light = direction[0, :, :, 1:, 1::-1], (colours, shares)
+        self._transfers = fixed_transfers(
+            self.optics, self.setup.test, self.merits, self.fields, light, cosines, self.degree
+        )
+        self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
 
     def _aim_nominal(self) -> None:
         """Launch points and aiming of the designed camera's rays, from which all others are aimed."""
@@ -189,161 +238,124 @@ class ToleranceBench:
         axes = transverse_axes(self.directions, least)
         self._fan = RayFan(start[:, None], self.directions[:, None], axes[:, None], moves_position=True)
         self._target = path.stop.radius * self.points + np.array(path.stop.centre)
-        systems = assemble(path.assembly, [f"{path.name}/to_stop"]).take(np.zeros(len(start), dtype=int))
-        middle, slope = aim(self.backend, systems, self._fan, np.zeros((1, 2)))
+        systems = assemble(path.assembly, [f"{path.name}/to_stop"], self._coloured([{}])).take(self._owners(1))
+        middle, slope = aim(self.backend, systems, self._fan_for(1), np.zeros((1, 2)))
         near = middle + np.einsum("fnij,nj->fni", np.linalg.inv(slope), self._target)
         slopes = np.broadcast_to(slope, (*near.shape, 2))
-        self._aimed = aim(self.backend, systems, self._fan, self._target, near, slopes, AIM_TOLERANCE)
-
-    def _lit_roots(self, pieces: np.ndarray) -> np.ndarray:
-        """Matrices (F, K, K) of which the squares of products with a wavefront's coefficients are its mean square,
-        piston and tilt taken out over the light.
-        """
-        out = []
-        free = not pieces.shape[1] or not np.any(area(pieces) > SMALLEST)
-        for own in pieces if not free else [None] * len(self.fields):
-            if own is None:
-                nodes = quadrature.disk(self.degree)
-                x, y, share = nodes.x, nodes.y, nodes.share
-            else:
-                lit = LitStop.of(own[None], self.degree, max(6, self.degree // 2 + 2))
-                x, y, share = lit.x[0], lit.y[0], lit.weight[0] / np.sum(lit.weight)
-            table = products(x, y, self.degree)
-            level = np.stack([np.ones_like(x), x, y], axis=-1)
-            weighted = level * share[:, None]
-            table = table - level @ np.linalg.solve(level.T @ weighted, weighted.T @ table)
-            value, vector = np.linalg.eigh(table.T @ (table * share[:, None]))
-            out.append(np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T)
-        return np.stack(out)
-
-    def _fixed_transfers(self, direction: np.ndarray) -> dict[int, list[list[VariedTransfer]]]:
-        """For every merit of kind mtf its transfer functions, field by field and direction by direction."""
-        asked = [(k, merit) for k, merit in enumerate(self.merits) if merit.spec.kind == "mtf"]
-        if not asked:
-            return {}
-        test = self.setup.test
-        try:
-            pupils = self.optics.pupils(self.fields)
-        except UnphysicalError as error:
-            raise test.error(f"the designed camera has no MTF: {error}", ("merits", asked[0][1].name)) from error
-        cosines = direction[:, 1:, 1::-1]
-        out = {}
-        for k, merit in asked:
-            spec = merit.spec
-            size = self.optics.nyquist if spec.frequency is None else 1e3 * spec.frequency
-            axes = {"line": (0,), "track": (1,), "worse": (0, 1)}[spec.direction]
-            rows = []
-            for f in merit.fields:
-                row = []
-                for axis in axes:
-                    frequency = size * np.eye(2)[axis]
-                    fixed = VariedTransfer.of(pupils[f], frequency, self.wavelength, cosines[f], self.degree)
-                    if fixed is None:
-                        problem = f"{1e-3 * size:.4g} cycles per mm lie beyond the cut-off at a field"
-                        raise test.error(problem, ("merits", merit.name, "frequency"), allowed="a lower frequency")
-                    whole = abs(transfer(pupils[f], frequency[None], self.wavelength, np.zeros(1))[0, 0])
-                    if abs(abs(np.sum(fixed.phasors)) - whole) > TRANSFER:
-                        problem = "the MTF of the designed camera is not settled"
-                        raise test.error(problem, ("merits", merit.name), allowed="a sharper camera, or another merit")
-                    row.append(fixed)
-                rows.append(row)
-            out[k] = rows
-        return out
+        self._aimed = aim(self.backend, systems, self._fan_for(1), self._target, near, slopes, AIM_TOLERANCE)
 
     def _adjustment_slope(self) -> np.ndarray:
         """Derivatives of the residuals by the compensators, (R, C), waves per SI unit; 0 where the range is zero."""
         used = np.flatnonzero(self.ranges)
-        slope = np.zeros((self._roots.shape[0] * self._roots.shape[1], len(self.ranges)))
+        slope = np.zeros((self._residuals(self.designed[None]).shape[1], len(self.ranges)))
         if not used.size:
             return slope
         step = _MOVE * self.ranges[used]
         amounts = np.zeros((2 * len(used), len(self.ranges)))
         amounts[np.arange(len(used)), used] = step
         amounts[len(used) + np.arange(len(used)), used] = -step
-        residuals = self._residuals(self._errors(states_of(self.compensators, amounts))[0])
+        residuals = self._residuals(self._errors(states_of(self.compensators, amounts)).paths)
         ahead, behind = residuals[: len(used)], residuals[len(used) :]
         slope[:, used] = ((ahead - behind) / (2.0 * step[:, None])).T
         return slope
 
     # exact traces
 
-    def _rays(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position and direction (S, F, N, 3), path and validity (S, F, N) of the beams at the line CCD.
+    def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
+        """Where rays start that meet their points of the stop in coloured states, (S * K * F, N, 3).
 
         Raises:
             AimError: the light of some state does not reach the stop.
         """
-        path, count, fields = self.optics.path, len(states), len(self.fields)
-        placed = path.assembly.place(states)
-        every = np.repeat(np.arange(count), fields)
-        imaging, to_stop = (
-            assemble(path.assembly, [f"{path.name}/{way}"], states, placed=placed).take(every)
-            for way in ("imaging", "to_stop")
-        )
+        path, count = self.optics.path, len(states) // len(self._glass)
+        to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
+        near, slope = (np.tile(one, (count, *[1] * (one.ndim - 1))) for one in self._aimed)
+        systems, fan = to_stop.take(self._owners(count)), self._fan_for(count)
+        return fan.at(aim(self.backend, systems, fan, self._target, near, slope, AIM_TOLERANCE)[0])[0]
 
-        def all_of(array: np.ndarray) -> np.ndarray:
-            return np.tile(array, (count, *[1] * (array.ndim - 1)))
+    def _rays(
+        self, states: Sequence[State], aimed: np.ndarray | None = None
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """Position and direction (S, K, F, N, 3), path and validity (S, K, F, N) of the beams at the line CCD, in light
+        of K traced wavelengths, and where their rays start, (S, K, F, N, 3), which is found where it is not given.
 
-        fan = RayFan(all_of(self._fan.position), all_of(self._fan.direction), all_of(self._fan.axes), True)
-        near, slope = (all_of(one) for one in self._aimed)
-        q, _ = aim(self.backend, to_stop, fan, self._target, near, slope, AIM_TOLERANCE)
-        traced = trace(self.backend, imaging, make_rays(self.backend, *fan.at(q))).numpy()
-        shape = (count, fields, len(self.points))
-        return tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)  # type: ignore[return-value]
+        Raises:
+            AimError: the light of some state does not reach the stop.
+        """
+        path, count = self.optics.path, len(states)
+        coloured = self._coloured(states)
+        placed = path.assembly.place(coloured)
+        aimed = self._aimed_at_stop(coloured, placed) if aimed is None else aimed
+        imaging = assemble(path.assembly, [f"{path.name}/imaging"], coloured, placed=placed).take(self._owners(count))
+        along = np.tile(self.directions[:, None], (count * len(self._glass), 1, 1))
+        rays = make_rays(self.backend, aimed.reshape(len(along), -1, 3), along)
+        traced = trace(self.backend, imaging, rays).numpy()
+        shape = (count, len(self._glass), len(self.fields), len(self.points))
+        told = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
+        return told, aimed.reshape(*shape, 3)  # type: ignore[return-value]
 
-    def _paths(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray) -> np.ndarray:
-        """Optical paths (S, F, N - 1) to the spheres about the chief rays' images, less those of the chief rays."""
-        to_sphere = path_to_sphere(position, direction, paths, position[..., :1, :], self.radius)
-        return np.asarray(to_sphere[..., 1:] - to_sphere[..., :1])
+    def _coloured(self, states: Sequence[State]) -> list[State]:
+        """The states as each traced wavelength meets them, camera by camera, S * K."""
+        return [in_glass(state, steps) for state in states for steps in self._glass]
+
+    def _owners(self, count: int) -> np.ndarray:
+        """Number of the coloured state of each beam of so many cameras, (S * K * F,)."""
+        return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
+
+    def _fan_for(self, count: int) -> RayFan:
+        """The fan of all beams of so many cameras."""
+        times = count * len(self._glass)
+
+        def every(array: np.ndarray) -> np.ndarray:
+            return np.tile(array, (times, *[1] * (array.ndim - 1)))
+
+        return RayFan(every(self._fan.position), every(self._fan.direction), every(self._fan.axes), True)
+
+    def _paths(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray, radius: float) -> np.ndarray:
+        """Optical paths to the spheres of a radius about the images of the chief rays, of all wavelengths about the
+        mean of these, less those of the chief rays, (S, F, K (N - 1)).
+        """
+        middle = np.einsum("k,skfx->sfx", self.traced_shares, position[:, :, :, 0])
+        to_sphere = path_to_sphere(position, direction, paths, middle[:, None, :, None], radius)
+        longer = to_sphere[..., 1:] - to_sphere[..., :1]
+        return np.asarray(np.moveaxis(longer, 1, 2).reshape(len(paths), len(self.fields), -1))
+
+    def _chiefs(self, direction: np.ndarray) -> np.ndarray:
+        """Chief rays' directions, their mean over the light, (S, F, 3)."""
+        return np.asarray(np.einsum("k,skfx->sfx", self.traced_shares, direction[:, :, :, 0]))
 
     @one_blas_thread()
-    def _errors(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray]:
-        """Optical paths (S, F, N - 1), metres, and chief rays' directions (S, F, 3) at the line CCD.
+    def _errors(self, states: Sequence[State], aimed: np.ndarray | None = None) -> Errors:
+        """What the light of states comes to at the line CCD.
+
+        Args:
+            states: S of them.
+            aimed: where their rays start, as of ``Errors``; None to aim them.
 
         Raises:
             PhysicalError: the light of some state is lost.
         """
-        paths, chiefs = [], []
-        for start in range(0, len(states), AT_ONCE):
-            position, direction, path, valid = self._rays(states[start : start + AT_ONCE])
+        found, step = [], max(1, AT_ONCE // len(self._glass))
+        for start in range(0, len(states), step):
+            some = slice(start, start + step)
+            traced, own = self._rays(states[some], None if aimed is None else aimed[some])
+            position, direction, path, valid = traced
             if not valid.all():
                 raise UnphysicalError("a surface's edge stops light of a field")
-            paths.append(self._paths(position, direction, path))
-            chiefs.append(direction[:, :, 0])
-        return np.concatenate(paths), np.concatenate(chiefs)
+            paths = self._paths(position, direction, path, self.radius)
+            plane = "mtf" in self._wanted and np.isfinite(self.radius)
+            eikonals = self._paths(position, direction, path, np.inf) if plane else paths
+            found.append(Errors(paths, eikonals, self._chiefs(direction), own))
+        return Errors(*(np.concatenate(own) for own in zip(*found, strict=True)))
 
     def _residuals(self, paths: np.ndarray) -> np.ndarray:
-        """Residuals (S, R) whose squares sum to the mean squares of the wavefronts over all fields, waves."""
-        terms = paths @ self.solve.T / self.wavelength
-        return np.asarray(np.einsum("fjk,sfk->sfj", self._roots, terms).reshape(len(paths), -1))
+        """Residuals (S, R) whose squares sum to the mean squares of the wavefronts over all fields and over the light,
+        waves of the design wavelength.
+        """
+        terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.solve.T
+        return self._roots.residuals(terms / self.wavelength, self.traced_shares)
 
     # adjustments
-
-    def _stepped(self, residuals: np.ndarray, moves: np.ndarray, free: np.ndarray) -> np.ndarray:
-        """Amounts (S, C) of the compensators that make linearised residuals least, within ranges; others than those
-        that are free (C,) stay.
-        """
-        size = np.where(self.ranges > 0.0, self.ranges, 1.0)
-        slope = self._slope * size
-        normal = slope.T @ slope
-        normal = normal + 1e-12 * np.trace(normal) * np.eye(len(size))
-        pull = -residuals @ slope
-        start = moves / size
-        held = np.broadcast_to(~free | (self.ranges == 0.0), start.shape).copy()
-        target = start.copy()
-        for _ in range(len(size) + 1):
-            # of those that are held the change is known, and the others follow it
-            known = np.where(held, target - start, 0.0)
-            rest = np.where(held, 0.0, pull - known @ normal)
-            mask = ~held
-            matrix = normal * mask[:, :, None] * mask[:, None, :] + np.eye(len(size)) * held[:, :, None]
-            change = known + np.linalg.solve(matrix, rest[..., None])[..., 0] * mask
-            target = np.clip(start + change, -1.0, 1.0)
-            beyond = mask & (np.abs(start + change) > 1.0)
-            if not beyond.any():
-                break
-            held |= beyond
-        return np.asarray(target * size)
 
     def try_out(self, amounts: np.ndarray, errors: np.ndarray | None = None, paths: bool = False) -> Tried:
         """Trace cameras, adjust them, and work out their merits.
@@ -369,7 +381,7 @@ class ToleranceBench:
         except PhysicalError as error:
             if len(amounts) == 1:
                 lost = np.full((1, self.parts), np.nan)
-                paths = np.full((1, len(self.fields), len(self.points) - 1), np.nan) if len(self.fields) else None
+                paths = np.full((1, *self.designed.shape), np.nan) if len(self.fields) else None
                 moves = np.full((1, len(self.ranges)), np.nan)
                 return Tried(moves, lost, (str(error) or "lost",), np.full(1, np.nan), paths)
         half = len(amounts) // 2
@@ -382,59 +394,57 @@ class ToleranceBench:
         count = len(amounts)
         moves, settled = np.zeros((count, len(self.ranges))), np.zeros(count)
 
-        def state(moves: np.ndarray) -> list[State]:
-            return states_of((*self.numbers, *self.compensators), np.concatenate([amounts, moves], axis=1))
+        def state(moves: np.ndarray, which: np.ndarray | slice = slice(None)) -> list[State]:
+            own = np.concatenate([amounts[which], moves[which]], axis=1)
+            return states_of((*self.numbers, *self.compensators), own)
 
         if not len(self.fields):
-            return Tried(moves, self._parts(state(moves), amounts, moves, None, None), ("",) * count, settled)
+            return Tried(moves, self._parts(state(moves), amounts, moves, None), ("",) * count, settled)
         states = state(moves)
-        paths, chiefs = self._errors(states)
+        light = self._errors(states)
+
+        def again(own: Sequence[State], which: np.ndarray) -> Errors:
+            """Those of cameras that were adjusted, whose rays start where they did if no adjustment aims them anew."""
+            return self._errors(own, None if self._moves_stop else light.aimed[which])
+
         if np.any(self.ranges > 0.0):
             every = np.ones(len(self.ranges), dtype=bool)
+            residuals = self._residuals(light.paths)
+            slopes = np.tile(self._adjust.slope, (count, 1, 1))
             for _ in range(MOST_STEPS):
-                residuals = self._residuals(paths)
-                target = self._stepped(residuals, moves, every)
-                settled = np.sqrt(np.sum(((target - moves) @ self._slope.T) ** 2, axis=1) / len(self.fields))
+                target = self._adjust.best(slopes, residuals, moves, every)
+                expected = told(slopes, target - moves)
+                settled = np.sqrt(np.sum(expected**2, axis=1) / len(self.fields))
                 # what has settled stays, so that a camera's numbers do not depend on the others
                 going = settled > SETTLED * 1e-2
                 if not going.any():
                     break
-                moves = np.where(going[:, None], target, moves)
                 some = np.flatnonzero(going)
-                own = state(moves)
-                for k in some:
-                    states[k] = own[k]
-                paths[some], chiefs[some] = self._errors([own[k] for k in some])
-            if errors is not None and np.any((self.grid_steps > 0.0) | (self.accuracies > 0.0)):
-                moves = self._made(self._residuals(paths), moves, errors)
+                change, moves = target[some] - moves[some], np.where(going[:, None], target, moves)
+                own = state(moves, some)
+                for k, one in zip(some, own, strict=True):
+                    states[k] = one
+                anew = again(own, some)
+                for known, new in zip(light[:3], anew[:3], strict=True):
+                    known[some] = new
+                arrived = self._residuals(anew.paths)
+                miss = arrived - residuals[some] - expected[some]
+                slopes[some], residuals[some] = self._adjust.corrected(slopes[some], change, miss), arrived
+            if errors is not None and not self._adjust.exact:
+                moves = self._adjust.made(slopes, residuals, moves, errors)
                 states = state(moves)
-                paths, chiefs = self._errors(states)
-        return Tried(moves, self._parts(states, amounts, moves, paths, chiefs), ("",) * count, settled, paths)
-
-    def _made(self, residuals: np.ndarray, moves: np.ndarray, errors: np.ndarray) -> np.ndarray:
-        """Moves as they are made: by whole steps and with errors, one after the other."""
-        free = np.ones(len(self.ranges), dtype=bool)
-        wanted, made = moves.copy(), moves.copy()
-        for c, (step, accuracy) in enumerate(zip(self.grid_steps, self.accuracies, strict=True)):
-            if self.ranges[c] == 0.0:
-                continue
-            own = wanted[:, c]
-            own = np.round(own / step) * step if step else own
-            made = wanted.copy()
-            made[:, c] = own + accuracy * errors[:, c]
-            free[c] = False
-            residuals = residuals + (made - wanted) @ self._slope.T
-            wanted = self._stepped(residuals, made, free)
-            residuals = residuals + (wanted - made) @ self._slope.T
-        return wanted
+                light = again(states, np.arange(count))
+        return Tried(moves, self._parts(states, amounts, moves, light), ("",) * count, settled, light.paths)
 
     # merits
 
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
         """Parts of all merits (S, P) of cameras in any states, as they are. Raises PhysicalError: the light is lost."""
-        if not len(self.fields):
-            return self._parts(states, None, None)
-        return self._parts(states, *self._errors(states))
+        return self._parts(states, *self._still(states), self._errors(states) if len(self.fields) else None)
+
+    def _still(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray]:
+        """Amounts and moves of the bench's own numbers in states that say all themselves: none."""
+        return np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
 
     def numbers_of(self, states: Sequence[State]) -> np.ndarray:
         """Numbers (S, R) of cameras whose squares sum to their merits' mean squares over fields or points, each in
@@ -443,9 +453,9 @@ class ToleranceBench:
         They change linearly with small motions. Raises PhysicalError: the light is lost.
         """
         count = len(states)
-        paths, chiefs = self._errors(states) if len(self.fields) else (None, None)
-        terms = None if paths is None else self._residuals(paths).reshape(count, len(self.fields), -1)
-        parts = self._parts(states, paths, chiefs)
+        light = self._errors(states) if len(self.fields) else None
+        terms = None if light is None else self._residuals(light.paths).reshape(count, len(self.fields), -1)
+        parts = self._parts(states, *self._still(states), light)
         out = []
         for merit in self.merits:
             if merit.spec.kind in ("wavefront", "mtf"):
@@ -465,7 +475,7 @@ class ToleranceBench:
         Mean squares and MTFs bend because they are functions of a wavefront that hardly does.
 
         Args:
-            slopes: of the optical paths by the numbers, metres, (K, F, N).
+            slopes: of the optical paths by the numbers, metres, (L, F, K N).
         """
         out = np.zeros((self.parts, len(slopes), len(slopes)))
         residuals = self._residuals(slopes).reshape(len(slopes), len(self.fields), -1) if len(self.fields) else None
@@ -481,12 +491,7 @@ class ToleranceBench:
         return out
 
     def _parts(
-        self,
-        states: Sequence[State],
-        amounts: np.ndarray,
-        moves: np.ndarray,
-        paths: np.ndarray | None,
-        chiefs: np.ndarray | None,
+        self, states: Sequence[State], amounts: np.ndarray, moves: np.ndarray, light: Errors | None
     ) -> np.ndarray:
         """Parts of all merits, (S, P)."""
         out = np.empty((len(states), self.parts))
@@ -498,8 +503,8 @@ class ToleranceBench:
             start = np.asarray(self._fan.position)[:, 0]
             taken = obstructed_shares(self.optics.path, states, self.directions, start)
         squares = None
-        if paths is not None and "wavefront" in self._wanted:
-            terms = self._residuals(paths).reshape(len(states), len(self.fields), -1)
+        if light is not None and "wavefront" in self._wanted:
+            terms = self._residuals(light.paths).reshape(len(states), len(self.fields), -1)
             squares = np.sum(terms**2, axis=-1)
         line = self._line(states)
         for k, merit in enumerate(self.merits):
@@ -508,11 +513,11 @@ class ToleranceBench:
                 assert squares is not None
                 own = squares[:, merit.fields]
             elif kind == "mtf":
-                assert paths is not None
-                own = self._modulations(k, merit, paths)
+                assert light is not None
+                own = self._modulations(k, merit, light.eikonals)
             elif kind == "chief_ray":
-                assert chiefs is not None
-                turn = chiefs[:, merit.fields, :2] - self.chief[merit.fields, :2]
+                assert light is not None
+                turn = light.chiefs[:, merit.fields, :2] - self.chief[merit.fields, :2]
                 own = turn.reshape(len(states), -1)
             elif kind == "obstruction":
                 assert taken is not None
@@ -524,8 +529,8 @@ class ToleranceBench:
             out[:, merit.parts] = own
         return out
 
-    def _modulations(self, k: int, merit: Merit, paths: np.ndarray) -> np.ndarray:
-        longer = paths - self.designed
+    def _modulations(self, k: int, merit: Merit, eikonals: np.ndarray) -> np.ndarray:
+        longer = eikonals - self.designed_eikonals
         return np.stack(
             [
                 one.modulation(longer[:, f])

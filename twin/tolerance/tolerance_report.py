@@ -76,6 +76,7 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     facts = (
         ("camera", run.bench.camera),
+        ("light", _light(run)),
         ("tolerances", str(len(test.tolerances))),
         ("compensators", str(len(test.compensators)) or "none"),
         ("cameras drawn", str(len(run.samples.problems))),
@@ -83,6 +84,14 @@ def tolerance_report(run: ToleranceRun) -> Report:
     )
     title = f"Tolerances of {run.bench.camera}"
     return Report(title, told, more, facts, _summary(run), sections, warnings=run.warnings)
+
+
+def _light(run: ToleranceRun) -> str:
+    """Wavelengths in which wavefronts and MTFs are told."""
+    colours = 1e9 * run.bench.colours
+    if len(colours) == 1:
+        return f"{colours[0]:.4g} nm"
+    return f"{colours.min():.4g} to {colours.max():.4g} nm, {len(colours)} wavelengths"
 
 
 def _percent(share: float) -> str:
@@ -288,14 +297,12 @@ def _allocation_sections(run: ToleranceRun) -> tuple[Section, ...]:
                 _scaled_limit(one.limit, float(found.scales[e])),
                 str(found.limits[name]),
                 float(found.rounded[e]),
-                one.cost,
-                one.cost * float(found.rounded[e]) ** -one.exponent,
+                float(found.costs[0, e]),
+                float(found.costs[1, e]),
             ]
         )
     heads = ("tolerance", "motion", "limit", "chosen", "rounded", "ratio", "cost", "new cost")
-    caption = (
-        "Limits as stated, as the least cost asks for, and rounded to the grades; costs go with the inverse limit."
-    )
+    caption = "Limits as stated, as the least cost asks for, and rounded to the grades, with what they cost."
     table = Table(
         "allocation", "Limits before and after", caption, heads, rows, (None, None, None, None, None, 3, 2, 2)
     )

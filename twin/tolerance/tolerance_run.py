@@ -404,7 +404,7 @@ def _perturb(motion: Any) -> dict[str, Any]:
             out[kind] = [amount_text(value, kind) for value in values]
     if any(motion.figure.values()):
         out["figure"] = {f"Z{j}": amount_text(value, "figure") for j, value in motion.figure.items() if value}
-    for kind in ("radius", "conic", "index"):
+    for kind in ("radius", "conic", "index", "abbe"):
         if getattr(motion, kind):
             out[kind] = amount_text(getattr(motion, kind), kind)
     return out
@@ -533,6 +533,8 @@ TOLERANCE: Record[ToleranceRun] = Record(
     "tolerance.json: a tolerance budget.",
     Quantity("instrument", lambda run: run.setup.test.instrument),
     Quantity("camera", lambda run: run.bench.camera, "the camera that is judged"),
+    Quantity("wavelengths_nm", lambda run: run.bench.colours, "of the light of wavefronts and MTFs"),
+    Quantity("weights", lambda run: run.bench.shares, "share of the light at each of these wavelengths"),
     Quantity("samples", lambda run: len(run.samples.problems), "cameras that were drawn"),
     Quantity("lost", lambda run: sum(map(bool, run.samples.problems)), "cameras without light, which count as failed"),
     Quantity("yield", lambda run: _yield_plain(run.passing), "share of cameras that meet all requirements"),

@@ -27,7 +27,7 @@ from scenes.yaml.errors import InputError, KeyPath, Problem, shown
 from scenes.yaml.spec import Spec
 
 HEAT = ("temperature", "gradient")
-SHAPE = ("scale", "stretch", "radius", "conic", "index")
+SHAPE = ("scale", "stretch", "radius", "conic", "index", "abbe")
 """Numbers of a motion that are neither rigid nor a figure."""
 
 

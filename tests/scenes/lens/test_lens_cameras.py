@@ -27,7 +27,7 @@ from scenes.lens.zemax_writer import zemax_text
 from scenes.models.camera_model import collimated, derive_camera, field_direction
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.camera import CameraSpec
-from scenes.specs.load import load_camera, load_instrument
+from scenes.specs.load import EXAMPLES, load_camera, load_instrument
 from scenes.yaml.errors import InputError
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import parse_yaml
@@ -283,6 +283,14 @@ def run(*arguments: object) -> tuple[int, str]:
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result.exit_code, result.output
+
+
+def test_the_example_of_a_zemax_file_is_what_is_read_of_it(tmp_path: Path, backend) -> None:
+    """The camera beside it, which a tolerance budget names."""
+    out = tmp_path / "cassegrain_zmx.yaml"
+    code, said = run("read", EXAMPLES / "cassegrain.zmx", "--out", out)
+    assert code == 0, said
+    assert load_camera(out).plain() == load_camera(EXAMPLES / "cassegrain_zmx.yaml").plain()
 
 
 @pytest.mark.second

@@ -397,7 +397,7 @@ def _numbers(what: PerturbationSpec) -> dict[str, Any]:
         "shift": list(what.shift),
         "pivot": what.pivot,
         "figure": dict(what.figure),
-        **{name: getattr(what, name) for name in ("scale", "radius", "conic", "index")},
+        **{name: getattr(what, name) for name in ("scale", "radius", "conic", "index", "abbe")},
         "temperature": None if heat is None else {**dict(heat), "gradient": list(heat.gradient)},
         "deformation": what.deformation,
     }
@@ -428,7 +428,7 @@ def _spec(parts: Mapping[str, Any]) -> PerturbationSpec:
         shift=tuple(parts["shift"]),
         pivot=parts["pivot"],
         figure=FrozenMap(parts["figure"]),
-        **{name: parts[name] for name in ("scale", "radius", "conic", "index")},
+        **{name: parts[name] for name in ("scale", "radius", "conic", "index", "abbe")},
         temperature=None
         if heat is None
         else TableTemperatureSpec.model_construct(**{**heat, "gradient": tuple(heat["gradient"])}),

@@ -1,0 +1,303 @@
+"""Tolerances of cameras with lenses in light of several wavelengths, against a trace of our own of altered glasses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from optics.numerics.backend import Backend
+from scenes.models.camera_model import CameraModel, coloured, field_direction
+from scenes.specs.camera import CameraSpec
+from scenes.specs.job import checked_nodes
+from scenes.specs.resolved import resolve
+from scenes.specs.tolerance import ToleranceSetup, resolve_tolerance
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from tests.scenes.lens.colour_cameras import colour_camera
+from twin.camera.camera_optics import CameraOptics
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.tolerance.samples import Workforce, draw_samples
+from twin.tolerance.tolerance_bench import ToleranceBench
+from twin.tolerance.tolerance_run import TOLERANCE, run_tolerance, worst_jobs
+from twin.tolerance.variations import states_of
+
+D_LINE = 587.5618e-9
+FIELDS = [[0.0, 0.0], [1.0, 0.0]]
+BUDGET: dict[str, Any] = {
+    "instrument": "lens.yaml",
+    "tolerances": {
+        "crown_abbe": {"motion": "L1 abbe", "limit": "1 percent"},
+        "flint_abbe": {"motion": "L3 abbe", "limit": "0.8 percent", "law": "uniform"},
+        "flint_index": {"motion": "L3 index", "limit": 5e-4},
+        "decentre": {"motion": "L3 shift x", "carrying": ["L4"], "limit": "50 um"},
+    },
+    "compensators": {"focus": {"motion": "focal_plane shift z", "range": "10 mm"}},
+    "merits": {
+        "wavefront": {"kind": "wavefront", "at_most": 0.2, "fields": FIELDS},
+        "mtf": {"kind": "mtf", "at_least": 0.3, "fields": FIELDS, "frequency": 30.0},
+    },
+    "samples": 20,
+}
+
+
+def budget(folder: Path, camera: CameraSpec | None = None, **changes: Any) -> ToleranceSetup:
+    """The budget of a camera, an achromat by default, with other keys at its top."""
+    (folder / "lens.yaml").write_text(dump_yaml((camera or colour_camera("achromat")).plain()), "utf-8")
+    (folder / "budget.yaml").write_text(dump_yaml({**BUDGET, **changes}), "utf-8")
+    return resolve_tolerance(folder / "budget.yaml")
+
+
+@pytest.fixture(scope="module")
+def bench(backend: Backend, tmp_path_factory: pytest.TempPathFactory) -> ToleranceBench:
+    return ToleranceBench(budget(tmp_path_factory.mktemp("light")), backend)
+
+
+class OwnTrace:
+    """The achromat in plain NumPy: spheres, Snell's law, paths, the wavefronts of all lines about one point.
+
+    Of the twin it takes the prescription, the catalogue's indices, the stop's radius and the exit pupil's distance.
+    """
+
+    def __init__(self, model: CameraModel, stop: float) -> None:
+        self.spec, self.stop = model.spec, stop
+        self.radius = float(model.first_order.exit_pupil_distance[0])
+        s, w = np.polynomial.legendre.leggauss(7)
+        angle = 2.0 * np.pi * (np.arange(31) + 0.3) / 31
+        r = np.sqrt(0.5 * (1.0 + s))[:, None]
+        inner = np.stack([(r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()], axis=-1)
+        self.points, self.share = np.concatenate([np.zeros((1, 2)), inner]), np.repeat(w / w.sum() / 31, 31)
+
+    def _index(self, face: str, line: float, errors: Mapping[str, float]) -> float:
+        """Behind a face where light enters glass: of another Abbe number and another index."""
+        glass = self.spec.mirrors[face].glass
+        assert glass is not None
+        at_d, here = glass.index(D_LINE, "air"), glass.index(line, "air")
+        return at_d + (here - at_d) / (1.0 + errors.get(f"{face} abbe", 0.0)) + errors.get(f"{face} index", 0.0)
+
+    def _beam(self, field: list[float], line: float, errors: Mapping[str, float], focus: float) -> tuple:
+        along = field_direction(self.spec, field[0] * self.spec.field.x, field[1] * self.spec.field.y)
+        names = list(self.spec.mirrors)
+        surface = self.spec.mirrors[names[0]]
+        x, y = self.stop * self.points.T
+        p = np.stack([x, y, surface.radius - np.sqrt(surface.radius**2 - x**2 - y**2)], axis=-1)
+        d = np.tile(along, (len(p), 1))
+        path, n = p @ along, 1.0
+        for name in names:
+            one = self.spec.mirrors[name]
+            x_off = errors.get("decentre", 0.0) if name in ("L3", "L4") else 0.0
+            centre = np.array([x_off, 0.0, one.z + one.radius])
+            # where the ray meets the sphere, on the side of the vertex
+            b = np.sum(d * (p - centre), axis=-1)
+            root = np.sqrt(b**2 - np.sum((p - centre) ** 2, axis=-1) + one.radius**2)
+            t = -b - np.sign(one.radius) * root
+            p, path = p + t[:, None] * d, path + n * t
+            after = self._index(name, line, errors) if one.glass is not None else 1.0
+            normal = (p - centre) / one.radius
+            normal = normal * np.sign(np.sum(d * normal, axis=-1))[:, None]
+            ratio, cosine = n / after, np.sum(d * normal, axis=-1)
+            d = ratio * d + (np.sqrt(1.0 - ratio**2 * (1.0 - cosine**2)) - ratio * cosine)[:, None] * normal
+            n = after
+        t = (self.spec.image.z + focus - p[:, 2]) / d[:, 2]
+        return p + t[:, None] * d, d, path + t
+
+    def square(self, field: list[float], errors: Mapping[str, float], focus: float) -> float:
+        """Mean square error over the light, waves of the design wavelength: piston is taken out of every line by
+        itself, tilt out of all together.
+        """
+        assert self.spec.spectrum is not None
+        lines, weights = self.spec.spectrum.rule(1)
+        beams = [self._beam(field, float(line), errors, focus) for line in lines]
+        middle = np.sum([w * p[0] for w, (p, _, _) in zip(weights, beams, strict=True)], axis=0)
+        rows, right, each = [], [], []
+        for k, (position, direction, path) in enumerate(beams):
+            offset = position - middle
+            along = np.sum(direction * offset, axis=-1)
+            # back along the ray to the sphere about the middle
+            back = along + np.sqrt(along**2 + self.radius**2 - np.sum(offset**2, axis=-1)) - self.radius
+            error = (path - back)[1:] / self.spec.wavelength
+            rows.append(np.column_stack([np.eye(len(lines))[np.full(len(error), k)], self.points[1:]]))
+            right.append(error - error.mean())
+            each.append(weights[k] * self.share)
+        table, value, weight = np.concatenate(rows), np.concatenate(right), np.concatenate(each)
+        root = np.sqrt(weight)
+        fit, *_ = np.linalg.lstsq(table * root[:, None], value * root, rcond=None)
+        return float(weight @ (value - table @ fit) ** 2)
+
+    def adjusted(self, errors: Mapping[str, float]) -> tuple[float, list[float]]:
+        """Focus that makes the sum over the fields least, metres along z, and their mean squares."""
+        found = minimize_scalar(
+            lambda focus: sum(self.square(field, errors, focus) for field in FIELDS),
+            bracket=(-1e-4, 1e-4),
+            options={"xtol": 1e-9},
+        )
+        return float(found.x), [self.square(field, errors, float(found.x)) for field in FIELDS]
+
+
+ALTERED: dict[str, tuple[dict[str, float], dict[str, float]]] = {
+    "as designed": ({}, {}),
+    "crown of another Abbe number": ({"crown_abbe": 1.0}, {"L1 abbe": 0.01}),
+    "flint of another Abbe number": ({"flint_abbe": -1.0}, {"L3 abbe": -0.008}),
+    "flint of another index": ({"flint_index": 1.0}, {"L3 index": 5e-4}),
+    "all, decentred": (
+        {"crown_abbe": -0.7, "flint_abbe": 0.9, "flint_index": -0.5, "decentre": 1.0},
+        {"L1 abbe": -0.007, "L3 abbe": 0.0072, "L3 index": -2.5e-4, "decentre": 50e-6},
+    ),
+}
+
+
+@pytest.mark.parametrize("case", ALTERED)
+def test_wavefronts_over_the_light_are_those_of_our_own_trace(case: str, bench: ToleranceBench) -> None:
+    """With focus refound. A lens that is moved along the camera's x moves along the line."""
+    drawn, errors = ALTERED[case]
+    x = np.array([[drawn.get(number.name, 0.0) for number in bench.numbers]])
+    tried = bench.try_out(x * bench.sizes)
+    model = bench.optics.model
+    turned = {key: value for key, value in errors.items() if key != "decentre"}
+    if "decentre" in errors:
+        body = bench.instrument.assembly.nominal_pose(f"{bench.optics.path.root}/L3").rotation[:, 0]
+        root = bench.instrument.assembly.nominal_pose(bench.optics.path.root).rotation
+        way = model.camera_frame.rotation @ root.T @ body
+        np.testing.assert_allclose(np.abs(way), [1.0, 0.0, 0.0], atol=1e-12)
+        turned["decentre"] = float(way[0]) * errors["decentre"]
+    focus, squares = OwnTrace(model, bench.optics.path.stop.radius).adjusted(turned)
+    # rays aimed to 1e-8 m, wavefronts by polynomials that leave a thousandth of a wave at most
+    np.testing.assert_allclose(np.sqrt(tried.parts[0, :2]), np.sqrt(squares), rtol=2e-4)
+    assert abs(abs(tried.moves[0, 0]) - abs(focus)) < 2e-6
+
+
+def test_an_abbe_number_changes_other_wavelengths_alone(bench: ToleranceBench) -> None:
+    """The index at the d line stays, and the Abbe number is another by what is stated."""
+    spec, assembly = bench.optics.model.spec, bench.instrument.assembly
+    lens = f"{bench.optics.path.root}/L1"
+    state = states_of(bench.numbers, np.array([[0.03, 0.0, 0.0, 0.0]]))[0]
+    lines = (D_LINE, 486.1327e-9, 656.2725e-9)
+    n_d, n_f, n_c = (assembly.index(lens, coloured(spec, bench.optics.path.root, state, line)[lens]) for line in lines)
+    plain = [spec.index_behind("L1", line) for line in lines]
+    assert n_d == pytest.approx(plain[0], abs=1e-15)
+    assert (n_d - 1.0) / (n_f - n_c) == pytest.approx(1.03 * (plain[0] - 1.0) / (plain[1] - plain[2]), rel=1e-12)
+
+
+def test_an_abbe_number_acts_at_a_design_wavelength_beside_the_d_line(backend: Backend, tmp_path: Path) -> None:
+    """The camera of one line, C, is one whose crown has another index there."""
+    red = colour_camera("achromat").model_copy(update={"wavelength": 656.2725e-9, "spectrum": None})
+    own, twin_index = red.index_behind("L1"), red.index_behind("L1", D_LINE)
+    change = (own - twin_index) * (1.0 / 1.01 - 1.0)
+    merits = {"wavefront": BUDGET["merits"]["wavefront"]}
+    tolerances = {
+        "abbe": {"motion": "L1 abbe", "limit": "1 percent"},
+        "index": {"motion": "L1 index", "limit": abs(change)},
+    }
+    one = ToleranceBench(budget(tmp_path, red, merits=merits, tolerances=tolerances, compensators={}), backend)
+    both = one.try_out(np.array([[1.0, 0.0], [0.0, np.sign(change)], [0.0, 0.0]]) * one.sizes).parts
+    np.testing.assert_allclose(both[0], both[1], rtol=1e-9)
+    assert np.max(np.abs(both[0] - both[2])) > 1e-3
+
+
+def test_mtfs_over_the_light_are_those_of_the_camera_program(bench: ToleranceBench) -> None:
+    x = np.array([[0.0] * 4, [0.8, -0.9, 0.0, 1.0], [0.8, -0.9, 0.6, 1.0]])
+    tried = bench.try_out(x * bench.sizes)
+    values = bench.values(tried.parts)[:, 1]
+    states = states_of((*bench.numbers, *bench.compensators), np.concatenate([x * bench.sizes, tried.moves], axis=1))
+    frequency = np.array([0.0, 30e3])
+    # the last has another focal length by 4e-4, and with it another cut-off, which a tolerance run leaves as designed
+    for state, value, close in zip(states, values, (1e-7, 2e-5, 4e-4), strict=True):
+        mtfs = bench.optics.in_state(state).mtfs(bench.fields, frequency, bench.colours, bench.shares)
+        assert value == pytest.approx(min(float(np.min(mtf.values[:, 1])) for mtf in mtfs), abs=close)
+    assert values[1] < values[0] - 0.01
+
+
+def test_light_of_a_band_takes_as_many_wavelengths_as_it_needs(backend: Backend, tmp_path: Path) -> None:
+    camera = colour_camera("achromat", "[500 nm, 640 nm]")
+    merits = {"wavefront": {"kind": "wavefront", "at_most": 0.2, "fields": [[0.0, 0.0]]}}
+    band = ToleranceBench(budget(tmp_path, camera, merits=merits), backend)
+    values = band.values(band.try_out(np.zeros((1, 4))).parts)[0]
+    assert len(band.colours) > 3
+    assert camera.light is not None
+    band._prepare_in(*camera.light.rule(2 * len(band.colours)))
+    fine = band.values(band.try_out(np.zeros((1, 4))).parts)[0]
+    np.testing.assert_allclose(values, fine, rtol=0, atol=5e-4)
+    design = ToleranceBench(budget(tmp_path, camera, merits=merits, light="design"), backend)
+    assert design.colours.tolist() == [D_LINE]
+    alone = design.values(design.try_out(np.zeros((1, 4))).parts)[0]
+    assert alone[0] < 0.8 * values[0]
+
+
+@pytest.mark.second
+def test_mirrors_have_their_mtf_over_a_spectrum_where_it_is_asked(backend: Backend, tmp_path: Path) -> None:
+    """Their wavefronts are the same at all wavelengths, and traced once."""
+    merits = {
+        "w": {"kind": "wavefront", "at_most": 0.1, "fields": [[0.0, 0.0]]},
+        "m": {"kind": "mtf", "at_least": 0.1, "fields": [[0.0, 0.0]]},
+    }
+    tolerances = {"despace": {"motion": "M2 shift z", "limit": "20 um"}}
+    plain: dict[str, Any] = {"instrument": "gf7", "merits": merits, "tolerances": tolerances, "compensators": {}}
+    one = ToleranceBench(budget(tmp_path, **plain), backend)
+    light = ToleranceBench(budget(tmp_path, light="spectrum", **plain), backend)
+    ours, wide = (bench.values(bench.try_out(bench.sizes[None]).parts)[0] for bench in (one, light))
+    assert len(one.colours) == 1
+    assert ours[0] == wide[0]
+    state = states_of(light.numbers, light.sizes[None])[0]
+    camera = CameraOptics.within(light.instrument, "gf7", backend, state)
+    (mtf,) = camera.mtfs([(0.0, 0.0)], np.array([0.0, camera.nyquist]), light.colours, light.shares)
+    assert wide[1] == pytest.approx(float(np.min(mtf.values[:, 1])), abs=1e-4)
+    assert abs(wide[1] - ours[1]) > 1e-3
+
+
+def test_the_worst_camera_is_said_as_a_job_with_its_abbe_numbers(bench: ToleranceBench, backend: Backend) -> None:
+    found = draw_samples(bench.setup, bench, backend, 20, 3, Workforce())
+    file = Path(bench.setup.test.source.file).parent / "worst.yaml"
+    file.write_text(next(iter(worst_jobs(bench.setup, bench, found).values())), "utf-8")
+    experiment = MonitorExperiment(resolve(file), backend)
+    job = checked_nodes(experiment.resolved.job, experiment.instrument.nodes)
+    optics = bench.optics.in_state(experiment.state(job))
+    worst = int(np.argmax(bench.worst_margins(found.values)))
+    mtfs = optics.mtfs(bench.fields, np.array([0.0, 30e3]), bench.colours, bench.shares)
+    assert found.values[worst, 1] == pytest.approx(min(float(np.min(m.values[:, 1])) for m in mtfs), abs=5e-4)
+    body = next(path for path in job.perturb if path.endswith("L1"))
+    assert job.perturb[body].abbe is not None
+
+
+def test_a_run_tells_its_light(backend: Backend, tmp_path: Path) -> None:
+    told = TOLERANCE(run_tolerance(budget(tmp_path), backend))
+    assert told["wavelengths_nm"] == pytest.approx([486.1327, 587.5618, 656.2725])
+    assert told["weights"] == pytest.approx([0.25, 0.5, 0.25])
+    shares = told["merits"]["wavefront"]["variance_shares"]
+    assert shares["crown_abbe"] > 0.01
+
+
+BAD: dict[str, tuple[dict[str, Any], dict[str, Any], str, str]] = {
+    "no spectrum": ({"light": "spectrum"}, {"spectrum": None}, "no spectrum", "light"),
+    "an Abbe number of a glass of one index": (
+        {"tolerances": {"a": {"motion": "L2 abbe", "limit": "1 percent"}}},
+        {},
+        "does not allow abbe",
+        "tolerances",
+    ),
+    "an Abbe number that is not known": (
+        {"tolerances": {"a": {"motion": "L1 abbe", "limit": "20 percent"}}},
+        {},
+        "no Abbe number is that uncertain",
+        "tolerances",
+    ),
+    "an Abbe number as a length": (
+        {"tolerances": {"a": {"motion": "L1 abbe", "limit": "20 um"}}},
+        {},
+        "percent",
+        "tolerances",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_told_with_its_key(case: str, backend: Backend, tmp_path: Path) -> None:
+    changes, camera, words, key = BAD[case]
+    with pytest.raises(InputError) as caught:
+        ToleranceBench(budget(tmp_path, colour_camera("achromat").model_copy(update=camera), **changes), backend)
+    assert words in str(caught.value)
+    assert key in str(caught.value)
+    assert "budget.yaml:" in str(caught.value)

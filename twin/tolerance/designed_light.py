@@ -1,0 +1,174 @@
+"""The light in which wavefronts and MTFs of a tolerance run are told, and what of it does not change from camera to
+camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from optics.geometry.polygon import area
+from optics.numerics import quadrature
+from optics.numerics.physical_error import UnphysicalError
+from optics.waves.lit_stop import LitStop
+from optics.waves.pupil_shadow import SMALLEST
+from optics.waves.pupil_terms import products
+from optics.waves.transfer import polychromatic_transfer
+from optics.waves.varied_pupil import VariedTransfer
+from scenes.models.camera_model import lenses
+from scenes.specs.camera import CameraSpec
+from scenes.specs.spectrum import SpectrumSpec
+from scenes.specs.tolerance import ToleranceBudgetSpec
+from twin.camera.camera_optics import CameraOptics
+from twin.tolerance.merits import Merit
+
+TRANSFER = 1e-3
+"""By how much an MTF at fixed nodes may differ from that of the designed pupil by itself."""
+
+
+def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | None:
+    """The spectrum in which a budget judges a camera; None for its design wavelength.
+
+    Raises:
+        InputError: a spectrum is asked for that the camera does not have.
+    """
+    if test.light == "spectrum" and camera.light is None:
+        raise test.error(
+            "the camera has no spectrum", ("light",), allowed="light: design, or a `spectrum` of the camera"
+        )
+    if test.light == "design" or (test.light is None and not lenses(camera)):
+        return None
+    return camera.light
+
+
+class Errors(NamedTuple):
+    """Light of states at the line CCD.
+
+    Attributes:
+        paths: optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N),
+            metres.
+        eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where no MTF is asked.
+        chiefs: directions of chief rays, (S, F, 3).
+        aimed: where rays start, (S, K, F, N, 3), world, metres.
+    """
+
+    paths: np.ndarray
+    eikonals: np.ndarray
+    chiefs: np.ndarray
+    aimed: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LitRoots:
+    """From coefficients of a wavefront (T,) to what it is worth over the light that comes through.
+
+    Attributes:
+        rest: matrices (F, T, T) of which the squares of products with the coefficients are the mean square, piston and
+            tilt taken out.
+        tilt: likewise (F, 2, T) that of the tilt.
+    """
+
+    rest: np.ndarray
+    tilt: np.ndarray
+
+    @classmethod
+    def of(cls, pieces: np.ndarray, degree: int) -> LitRoots:
+        """Make them.
+
+        Args:
+            pieces: polygons on the stop's unit disk that the beams of F fields lack, (F, K, V, 2).
+            degree: of the polynomials over the stop.
+        """
+        rest, tilt = [], []
+        free = not pieces.shape[1] or not np.any(area(pieces) > SMALLEST)
+        for own in pieces if not free else [None] * len(pieces):
+            if own is None:
+                nodes = quadrature.disk(degree)
+                x, y, share = nodes.x, nodes.y, nodes.share
+            else:
+                lit = LitStop.of(own[None], degree, max(6, degree // 2 + 2))
+                x, y, share = lit.x[0], lit.y[0], lit.weight[0] / np.sum(lit.weight)
+            table = products(x, y, degree)
+            level = np.stack([np.ones_like(x), x, y], axis=-1)
+            weighted = level * share[:, None]
+            normal = level.T @ weighted
+            # the plane through a wavefront, in functions that are orthonormal over the light; the first is piston
+            tilt.append(np.linalg.solve(np.linalg.cholesky(normal), weighted.T @ table)[1:])
+            table = table - level @ np.linalg.solve(normal, weighted.T @ table)
+            value, vector = np.linalg.eigh(table.T @ (table * share[:, None]))
+            rest.append(np.sqrt(np.maximum(value, 0.0))[:, None] * vector.T)
+        return cls(np.stack(rest), np.stack(tilt))
+
+    def residuals(self, terms: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        """Residuals (S, R) whose squares sum to the mean squares over all fields and over the light.
+
+        Tilt is taken out of all wavelengths together: where they stand apart in the image, that blurs it.
+
+        Args:
+            terms: coefficients of K wavelengths about one point of the image, (S, F, K, T).
+            shares: of the wavelengths, which sum to 1, (K,).
+        """
+        out = terms @ np.swapaxes(self.rest, 1, 2)
+        if len(shares) > 1:
+            tilt = terms @ np.swapaxes(self.tilt, 1, 2)
+            tilt = tilt - np.einsum("k,sfkj->sfj", shares, tilt)[:, :, None]
+            out = np.concatenate([out, tilt], axis=-1) * np.sqrt(shares)[:, None]
+        return np.asarray(out.reshape(len(terms), -1))
+
+
+def fixed_transfers(
+    optics: CameraOptics,
+    test: ToleranceBudgetSpec,
+    merits: Sequence[Merit],
+    fields: np.ndarray,
+    light: tuple[np.ndarray, np.ndarray],
+    cosines: np.ndarray,
+    degree: int,
+) -> dict[int, list[list[VariedTransfer]]]:
+    """For every merit of kind mtf its transfer functions, field by field and direction by direction.
+
+    Args:
+        optics: the designed camera.
+        test: the budget, for messages.
+        merits: of it.
+        fields: (F, 2).
+        light: wavelengths, metres, and their shares, (C,) each.
+        cosines: direction cosines of the traced rays, (C or 1, F, N, 2).
+        degree: of the polynomials over the stop.
+
+    Raises:
+        InputError: no MTF, or none at that frequency.
+    """
+    asked = [(k, merit) for k, merit in enumerate(merits) if merit.spec.kind == "mtf"]
+    if not asked:
+        return {}
+    try:
+        pupils = optics.colour_pupils(fields, light[0])
+    except UnphysicalError as error:
+        raise test.error(f"the designed camera has no MTF: {error}", ("merits", asked[0][1].name)) from error
+    out = {}
+    for k, merit in asked:
+        spec = merit.spec
+        size = optics.nyquist if spec.frequency is None else 1e3 * spec.frequency
+        axes = {"line": (0,), "track": (1,), "worse": (0, 1)}[spec.direction]
+        rows = []
+        for f in merit.fields:
+            row = []
+            for axis in axes:
+                frequency = size * np.eye(2)[axis]
+                fixed = VariedTransfer.of(pupils[f], frequency, *light, cosines[:, f], degree)
+                if fixed is None:
+                    problem = f"{1e-3 * size:.4g} cycles per mm lie beyond the cut-off at a field"
+                    raise test.error(problem, ("merits", merit.name, "frequency"), allowed="a lower frequency")
+                own = pupils[f] if len(pupils[f]) > 1 else pupils[f][0]
+                whole = abs(polychromatic_transfer(own, frequency[None], *light, np.zeros(1))[0, 0])
+                if abs(fixed.known - whole) > TRANSFER:
+                    problem = "the MTF of the designed camera is not settled"
+                    raise test.error(problem, ("merits", merit.name), allowed="a sharper camera, or another merit")
+                row.append(fixed)
+            rows.append(row)
+        out[k] = rows
+    return out
