@@ -284,9 +284,9 @@ def estimate_state(
     """
     if not groups:
         raise UndeterminedError("nothing was measured")
-    unit = np.zeros(prior.root.shape[1])
+    unit: Array = np.zeros(prior.root.shape[1])
     if start is not None:
-        unit = np.linalg.lstsq(prior.root, start - prior.mean, rcond=None)[0]
+        unit = np.asarray(np.linalg.lstsq(prior.root, start - prior.mean, rcond=None)[0], np.float64)
     out: dict[str, list[str]] = {}
     left_out: list[tuple[str, str, Agreement]] = []
     count = len({(g.name, b) for g in groups for b in g.blocks})
@@ -359,7 +359,7 @@ def _settle(
             # no way down along the step: the estimate stands, and what is left of the step says how well
             moved = moved if moved < SETTLED else max(moved, SETTLED)
             break
-        unit, residual = trial, ahead
+        unit, residual = np.asarray(trial), ahead
         moved = max(moved * share, 0.0) if share == 1.0 else np.inf
     return _judged(prior, groups, whiteners, unit, table, residual, steps, moved)
 

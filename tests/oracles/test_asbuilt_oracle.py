@@ -73,7 +73,7 @@ def test_rigid_motions_of_lsst_in_annular_terms_as_batoids(lsst, part, kind) -> 
             move = sign * step * (OVER * axis) @ frame
             pair = (np.zeros(3), move) if kind == "shift" else (move, np.zeros(3))
             ours.append(rigid(optics, bodies, *pair, about))
-        paths, _ = beams.paths(ours)
+        paths = beams.light(ours).paths
         found = np.einsum("ftn,sfn->sft", rows, paths)
         slope = (found[0] - found[1]) / (2.0 * step)
         theirs = []
@@ -146,7 +146,7 @@ def test_derivatives_of_an_off_axis_pupil_as_by_batoid_and_an_own_fit(backend) -
             does = {"figure": {int(axis[1:]): amount}} if kind == "figure" else {kind: amount}
             states.append({f"camera/{body}": Motion(**({kind: along} if axis in tuple("xyz") else does))})
             theirs.append(-peer.waves({(body, kind, axis): amount}) @ fit.T)
-        paths, _ = beams.paths(states)
+        paths = beams.light(states).paths
         ours = np.einsum("ftn,sfn->sft", rows, paths)
         found, wanted = (ours[0] - ours[1]) / (2.0 * size), (theirs[0] - theirs[1]) / (2.0 * size)
         assert np.max(np.abs(wanted)) > 0.0

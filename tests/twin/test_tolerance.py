@@ -131,7 +131,7 @@ def test_adjustments_are_the_best_and_more_of_them_are_better(bench: ToleranceBe
     def squares(one: ToleranceBench, moves: np.ndarray) -> np.ndarray:
         amounts = np.concatenate([drawn * one.sizes, moves], axis=1)
         return np.sum(
-            one._residuals(one._errors(states_of((*one.numbers, *one.compensators), amounts)).paths) ** 2, axis=1
+            one._residuals(one.beams.light(states_of((*one.numbers, *one.compensators), amounts)).paths) ** 2, axis=1
         )
 
     tried = bench.try_out(drawn * bench.sizes)
@@ -162,7 +162,7 @@ def test_rays_go_through_the_stop_where_adjustments_have_brought_it(motion: str,
     assert np.max(np.abs(tried.moves)) > 1e-4
     states = states_of((*bench.numbers, *bench.compensators), np.concatenate([amounts, tried.moves], axis=1))
     assert tried.paths is not None
-    np.testing.assert_allclose(tried.paths, bench._errors(states).paths, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(tried.paths, bench.beams.light(states).paths, rtol=0, atol=1e-13)
 
 
 def test_ranges_steps_and_errors_are_kept(backend, tmp_path) -> None:

@@ -207,7 +207,7 @@ def test_bodies_take_what_image_quality_says(bench: ToleranceBench, backend) -> 
         np.testing.assert_allclose(found, said, atol=1e-6)
     tried = bench.values(bench.try_out(x[:, : len(bench.numbers)]).parts)[:, 4]
     merit = next(one for one in bench.merits if one.name == "shadow")
-    shares = obstructed_shares(path, states[:2], bench.directions, np.asarray(bench._fan.position)[:, 0])
+    shares = obstructed_shares(path, states[:2], bench.beams.directions, bench.beams.start)
     np.testing.assert_allclose(tried[:2], shares[:, merit.fields].max(axis=1), atol=1e-6)
     assert abs(tried[1] - tried[0]) > 5e-4
 

@@ -253,7 +253,7 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     ]
     heads = ("actuator", "motion", "stands at", "move by", "range", "step")
     caption = "Stands at: what all moves so far have come to, as estimated."
-    tables = [Table("move", "Next move", caption, heads, rows)]
+    tables: list[Table] = [Table("move", "Next move", caption, heads, rows)]
     if step.worth:
         worth: list[list[Cell]] = [
             [name, value] for name, value in sorted(step.worth.items(), key=lambda item: -item[1])
@@ -264,9 +264,9 @@ def _move_sections(run: AsBuiltRun) -> tuple[Section, ...]:
     if told:
         lines: list[list[Cell]] = [[name, one["response"], one["sigma"]] for name, one in told.items()]
         caption = "Of what was traced, from the moves that were made and measured."
-        heads = ("actuator", "response", "sigma")
-        tables.append(Table("responses", "Responses of the actuators", caption, heads, lines, (None, 3, 3)))
-    text = (
+        told_by = ("actuator", "response", "sigma")
+        tables.append(Table("responses", "Responses of the actuators", caption, told_by, lines, (None, 3, 3)))
+    text: tuple[str, ...] = (
         f"The move makes the expected sum of squares of all merits least, each in units of its requirement: "
         f"{step.before:.3g} before and {step.after:.3g} after it, over states of the posterior and the errors of the "
         f"move, by exact traces. {step.ignorance:.3g} of it could be mended if the state were known.",

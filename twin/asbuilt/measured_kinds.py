@@ -164,7 +164,7 @@ class WavefrontReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Terms, field after field."""
-        paths, _ = self.beams.paths(view.states)
+        paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("ftn,sfn->sft", self.rows, paths).reshape(len(view.states), -1))
 
     def covariance(self) -> np.ndarray:
@@ -212,7 +212,7 @@ class FocusReadings(MeasuredKind):
 
     def predict(self, view: View) -> np.ndarray:
         """Of each field."""
-        paths, _ = self.beams.paths(view.states)
+        paths = self.beams.light(view.states).paths
         return np.asarray(np.einsum("fn,sfn->sf", self.rows, paths))
 
     def covariance(self) -> np.ndarray:

@@ -91,12 +91,12 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
     both = [float(np.mean(expected(bench, draws, after, own))) for own in (None, made)]
     _, by_state, by_actuators = bench.merit_slopes(found.mean, after)
     unit_slope = by_state @ found.prior.root
-    candidates = {}
+    candidates: dict[str, np.ndarray] = {}
     for kind in bench.candidates:
         rows = bench.slope(found.mean, [kind], [after])
         white = kind.group(np.zeros(len(kind.labels))).whitener()
         candidates[kind.name] = white @ rows @ found.prior.root
-    everything = {"": np.linalg.pinv(found.root) * 1e6}
+    everything: dict[str, np.ndarray] = {"": np.asarray(np.linalg.pinv(found.root) * 1e6)}
     worth = measurement_worth(found.root, unit_slope, bench.actuators, by_actuators, {**candidates, **everything})
     ignorance = worth.pop("")
     return Advice(move, both[0], both[1], ignorance, worth)

@@ -6,15 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from optics.geometry.polygon import area
-from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
-from optics.waves.lit_stop import LitStop
-from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_terms import products
 from optics.waves.transfer import polychromatic_transfer
 from optics.waves.varied_pupil import VariedTransfer
@@ -44,23 +39,6 @@ def light_of(test: ToleranceBudgetSpec, camera: CameraSpec) -> SpectrumSpec | No
     return camera.light
 
 
-class Errors(NamedTuple):
-    """Light of states at the line CCD.
-
-    Attributes:
-        paths: optical paths of the beams' rays less those of the chief rays, of all K traced wavelengths, (S, F, K N),
-            metres.
-        eikonals: likewise to planes, as transfer functions take them, (S, F, K N); the paths where no MTF is asked.
-        chiefs: directions of chief rays, (S, F, 3).
-        aimed: where rays start, (S, K, F, N, 3), world, metres.
-    """
-
-    paths: np.ndarray
-    eikonals: np.ndarray
-    chiefs: np.ndarray
-    aimed: np.ndarray
-
-
 @dataclass(frozen=True, eq=False)
 class LitRoots:
     """From coefficients of a wavefront (T,) to what it is worth over the light that comes through.
@@ -75,22 +53,15 @@ class LitRoots:
     tilt: np.ndarray
 
     @classmethod
-    def of(cls, pieces: np.ndarray, degree: int) -> LitRoots:
+    def of(cls, lit: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], degree: int) -> LitRoots:
         """Make them.
 
         Args:
-            pieces: polygons on the stop's unit disk that the beams of F fields lack, (F, K, V, 2).
+            lit: of F fields nodes x, y and shares of a quadrature over the light, as of ``VariedBeams.lit``.
             degree: of the polynomials over the stop.
         """
         rest, tilt = [], []
-        free = not pieces.shape[1] or not np.any(area(pieces) > SMALLEST)
-        for own in pieces if not free else [None] * len(pieces):
-            if own is None:
-                nodes = quadrature.disk(degree)
-                x, y, share = nodes.x, nodes.y, nodes.share
-            else:
-                lit = LitStop.of(own[None], degree, max(6, degree // 2 + 2))
-                x, y, share = lit.x[0], lit.y[0], lit.weight[0] / np.sum(lit.weight)
+        for x, y, share in lit:
             table = products(x, y, degree)
             level = np.stack([np.ones_like(x), x, y], axis=-1)
             weighted = level * share[:, None]

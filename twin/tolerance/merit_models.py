@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scenes.specs.tolerance import OF_MONITOR
+from twin.camera.varied_beams import AT_ONCE
 from twin.run.procedure import Advance, silent
-from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench, Tried
+from twin.tolerance.tolerance_bench import ToleranceBench, Tried
 
 MOST_PAIRED = 600
 """Numbers up to which the second order has products of two: of more they would fill the memory."""

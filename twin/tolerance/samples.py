@@ -16,6 +16,7 @@ from scenes.specs.study import StudySpec
 from scenes.specs.tolerance import ToleranceSetup, ToleranceSpec, resolve_tolerance
 from scenes.yaml.spec import Spec, validate
 from scenes.yaml.yaml_file import YamlFile
+from twin.camera.varied_beams import AT_ONCE
 from twin.run import durable, memory, run_folder
 from twin.run.procedure import Advance, silent
 from twin.study.runs import cluster
@@ -24,7 +25,7 @@ from twin.study.runs.chunk_store import ChunkStore
 from twin.study.runs.engine import Engine, Progress, fit_workers
 from twin.study.runs.plan import Plan
 from twin.study.runs.setup import StudySetup
-from twin.tolerance.tolerance_bench import AT_ONCE, ToleranceBench
+from twin.tolerance.tolerance_bench import ToleranceBench
 
 KIND = "tolerance"
 DRAWS = "draws"

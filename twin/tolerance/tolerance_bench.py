@@ -14,48 +14,33 @@ from functools import cached_property
 
 import numpy as np
 
-from optics.geometry.tree import PlacedBodies, State
-from optics.numerics import quadrature
+from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError, UnphysicalError
 from optics.numerics.threads import one_blas_thread
-from optics.raytrace.aim import RayFan, aim, transverse_axes
 from optics.raytrace.line_of_sight import line_change, line_tangents
-from optics.raytrace.system import assemble
-from optics.raytrace.trace import make_rays, trace
-from optics.waves.pupil_terms import products, to_terms
-from optics.waves.wavefront import path_to_sphere
-from scenes.models.camera_model import LAUNCH_DISTANCE, glass_steps, in_glass, lenses
+from scenes.models.camera_model import lenses
 from scenes.specs.tolerance import OF_MONITOR, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.camera.camera_optics import CameraOptics
+from twin.camera.varied_beams import AT_ONCE, BeamLight, CutError, RoughError, VariedBeams
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import LINE_POINTS, line_points
 from twin.targets.band_light import wavelengths_enough
 from twin.tolerance.adjustments import Adjustments, told
-from twin.tolerance.designed_light import Errors, LitRoots, fixed_transfers, light_of
+from twin.tolerance.designed_light import LitRoots, fixed_transfers, light_of
 from twin.tolerance.merits import Merit, merits_of
 from twin.tolerance.monitor_merit import MonitorMerit
 from twin.tolerance.obstruction_merit import obstructed_shares, require_bodies
 from twin.tolerance.variations import VariedNumber, compensator_numbers, states_of, tolerance_numbers
-
-AT_ONCE = 200
-"""Cameras traced in one launch, to bound memory."""
-
-AIM_TOLERANCE = 1e-8
-"""Distance of a ray from its point of the stop, metres: a wavefront error of ten waves changes by 1e-6 of one there."""
 
 SETTLED = 1e-3
 """Rms wavefront error that the next step of the adjustments would still change, waves; in the worst of three times as
 many steps as any camera of the library has needed."""
 MOST_STEPS = 12
 
-GRIDS = ((5, 8), (7, 10), (10, 14))
-"""Rings of the stop's quadrature and degree of the polynomials for the wavefront, the coarsest first."""
 FIRST_RULE, LARGEST_RULE = 3, 17
 """Wavelengths of the first and of the last rule over a spectrum."""
-RESIDUAL = 1e-3
-"""Rms of a wavefront that its polynomials may leave, waves."""
 EVERY = 4
 """Distortion is told of each fourth point of the line."""
 _MOVE = 1e-3
@@ -164,7 +149,6 @@ class ToleranceBench:
     @one_blas_thread()
     def _prepare(self) -> None:
         """Look at the designed camera in the light of the budget, by as many wavelengths as its merits take."""
-        self.directions = self.optics.directions(self.fields)
         test, spectrum = self.setup.test, light_of(self.setup.test, self.optics.model.spec)
         if spectrum is None:
             self._prepare_in(np.array([self.wavelength]), np.ones(1))
@@ -182,7 +166,7 @@ class ToleranceBench:
 
     def _designed_values(self) -> np.ndarray:
         """Rms wavefront errors and MTFs of the designed camera in its light, as it stands."""
-        squares = np.sum(self._residuals(self.designed[None]).reshape(len(self.fields), -1) ** 2, axis=-1)
+        squares = np.sum(self._residuals(self.beams.designed.paths).reshape(len(self.fields), -1) ** 2, axis=-1)
         mtfs = [one.known for rows in self._transfers.values() for row in rows for one in row]
         return np.concatenate([np.sqrt(squares), mtfs])
 
@@ -193,166 +177,51 @@ class ToleranceBench:
             colours: wavelengths of the light, metres, (C,).
             shares: of them, which sum to 1, (C,).
         """
-        path, model = self.optics.path, self.optics.model
+        model = self.optics.model
         self.colours, self.shares = colours, shares
         # mirrors image all wavelengths alike: one is traced for all, and their light differs in the MTF alone
         traced = colours if lenses(model.spec) else np.array([self.wavelength])
         self.traced_shares = shares if len(traced) == len(colours) else np.ones(1)
-        self._glass = [glass_steps(model.spec, path.root, float(colour)) for colour in traced]
-        for rings, degree in GRIDS:
-            self.nodes, self.degree = quadrature.disk(rings), degree
-            self.points = np.concatenate([np.zeros((1, 2)), np.stack([self.nodes.x, self.nodes.y], axis=-1)])
-            self._aim_nominal()
-            self.radius = float(model.first_order.exit_pupil_distance[0])
-            (position, direction, paths, valid), _ = self._rays([{}])
-            if not valid.all():
-                problem = "the beams of the fields are cut by what is not the stop and has no edges of its own"
-                raise self.setup.test.error(problem, ("merits",), allowed="fields whose light comes through whole")
-            self.designed = self._paths(position, direction, paths, self.radius)[0]
-            self.designed_eikonals = self._paths(position, direction, paths, np.inf)[0]
-            self.chief = self._chiefs(direction)[0]
-            self.solve = to_terms(self.nodes, degree)
-            own = self.designed.reshape(len(self.fields), len(traced), -1)
-            rest = own - own @ self.solve.T @ products(self.nodes.x, self.nodes.y, degree).T
-            self.residual = float(np.sqrt(np.max(rest**2 @ self.nodes.share))) / self.wavelength
-            if self.residual <= RESIDUAL:
-                break
-        else:
-            problem = f"wavefronts that polynomials do not follow: they leave {self.residual:.2g} waves"
-            raise self.setup.test.error(problem, ("merits",), allowed="a sharper camera, or fields where it is")
-        self._roots = LitRoots.of(path.shadows_on_stop({}, self.directions)[0], self.degree)
-        cosines, light = direction[0, :, :, 1:, 1::-1], (colours, shares)
+        try:
+            self.beams = VariedBeams(self.optics, self.fields, traced, self.traced_shares, "mtf" in self._wanted)
+        except CutError as error:
+            allowed = "fields whose light comes through whole"
+            raise self.setup.test.error(str(error), ("merits",), allowed=allowed) from error
+        except RoughError as error:
+            allowed = "a sharper camera, or fields where it is"
+            raise self.setup.test.error(str(error), ("merits",), allowed=allowed) from error
+        self._roots = LitRoots.of(self.beams.lit(), self.beams.degree)
         self._transfers = fixed_transfers(
-            self.optics, self.setup.test, self.merits, self.fields, light, cosines, self.degree
+            self.optics,
+            self.setup.test,
+            self.merits,
+            self.fields,
+            (colours, shares),
+            self.beams.cosines,
+            self.beams.degree,
         )
         self._adjust = Adjustments(self.ranges, self.grid_steps, self.accuracies, self._adjustment_slope())
-
-    def _aim_nominal(self) -> None:
-        """Launch points and aiming of the designed camera's rays, from which all others are aimed."""
-        path = self.optics.path
-        start = np.asarray(
-            path.assembly.nominal_pose(f"{path.root}/{path.model.mirrors[0]}").translation
-            - LAUNCH_DISTANCE * self.directions
-        )
-        least = np.eye(3)[np.argmin(np.abs(self.directions), axis=-1)]
-        axes = transverse_axes(self.directions, least)
-        self._fan = RayFan(start[:, None], self.directions[:, None], axes[:, None], moves_position=True)
-        self._target = path.stop.radius * self.points + np.array(path.stop.centre)
-        systems = assemble(path.assembly, [f"{path.name}/to_stop"], self._coloured([{}])).take(self._owners(1))
-        middle, slope = aim(self.backend, systems, self._fan_for(1), np.zeros((1, 2)))
-        near = middle + np.einsum("fnij,nj->fni", np.linalg.inv(slope), self._target)
-        slopes = np.broadcast_to(slope, (*near.shape, 2))
-        self._aimed = aim(self.backend, systems, self._fan_for(1), self._target, near, slopes, AIM_TOLERANCE)
 
     def _adjustment_slope(self) -> np.ndarray:
         """Derivatives of the residuals by the compensators, (R, C), waves per SI unit; 0 where the range is zero."""
         used = np.flatnonzero(self.ranges)
-        slope = np.zeros((self._residuals(self.designed[None]).shape[1], len(self.ranges)))
+        slope = np.zeros((self._residuals(self.beams.designed.paths).shape[1], len(self.ranges)))
         if not used.size:
             return slope
         step = _MOVE * self.ranges[used]
         amounts = np.zeros((2 * len(used), len(self.ranges)))
         amounts[np.arange(len(used)), used] = step
         amounts[len(used) + np.arange(len(used)), used] = -step
-        residuals = self._residuals(self._errors(states_of(self.compensators, amounts)).paths)
+        residuals = self._residuals(self.beams.light(states_of(self.compensators, amounts)).paths)
         ahead, behind = residuals[: len(used)], residuals[len(used) :]
         slope[:, used] = ((ahead - behind) / (2.0 * step[:, None])).T
         return slope
-
-    # exact traces
-
-    def _aimed_at_stop(self, states: Sequence[State], placed: PlacedBodies) -> np.ndarray:
-        """Where rays start that meet their points of the stop in coloured states, (S * K * F, N, 3).
-
-        Raises:
-            AimError: the light of some state does not reach the stop.
-        """
-        path, count = self.optics.path, len(states) // len(self._glass)
-        to_stop = assemble(path.assembly, [f"{path.name}/to_stop"], states, placed=placed)
-        near, slope = (np.tile(one, (count, *[1] * (one.ndim - 1))) for one in self._aimed)
-        systems, fan = to_stop.take(self._owners(count)), self._fan_for(count)
-        return fan.at(aim(self.backend, systems, fan, self._target, near, slope, AIM_TOLERANCE)[0])[0]
-
-    def _rays(
-        self, states: Sequence[State], aimed: np.ndarray | None = None
-    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Position and direction (S, K, F, N, 3), path and validity (S, K, F, N) of the beams at the line CCD, in light
-        of K traced wavelengths, and where their rays start, (S, K, F, N, 3), which is found where it is not given.
-
-        Raises:
-            AimError: the light of some state does not reach the stop.
-        """
-        path, count = self.optics.path, len(states)
-        coloured = self._coloured(states)
-        placed = path.assembly.place(coloured)
-        aimed = self._aimed_at_stop(coloured, placed) if aimed is None else aimed
-        imaging = assemble(path.assembly, [f"{path.name}/imaging"], coloured, placed=placed).take(self._owners(count))
-        along = np.tile(self.directions[:, None], (count * len(self._glass), 1, 1))
-        rays = make_rays(self.backend, aimed.reshape(len(along), -1, 3), along)
-        traced = trace(self.backend, imaging, rays).numpy()
-        shape = (count, len(self._glass), len(self.fields), len(self.points))
-        told = tuple(one.reshape(*shape, *one.shape[2:]) for one in traced)
-        return told, aimed.reshape(*shape, 3)  # type: ignore[return-value]
-
-    def _coloured(self, states: Sequence[State]) -> list[State]:
-        """The states as each traced wavelength meets them, camera by camera, S * K."""
-        return [in_glass(state, steps) for state in states for steps in self._glass]
-
-    def _owners(self, count: int) -> np.ndarray:
-        """Number of the coloured state of each beam of so many cameras, (S * K * F,)."""
-        return np.repeat(np.arange(count * len(self._glass)), len(self.fields))
-
-    def _fan_for(self, count: int) -> RayFan:
-        """The fan of all beams of so many cameras."""
-        times = count * len(self._glass)
-
-        def every(array: np.ndarray) -> np.ndarray:
-            return np.tile(array, (times, *[1] * (array.ndim - 1)))
-
-        return RayFan(every(self._fan.position), every(self._fan.direction), every(self._fan.axes), True)
-
-    def _paths(self, position: np.ndarray, direction: np.ndarray, paths: np.ndarray, radius: float) -> np.ndarray:
-        """Optical paths to the spheres of a radius about the images of the chief rays, of all wavelengths about the
-        mean of these, less those of the chief rays, (S, F, K (N - 1)).
-        """
-        middle = np.einsum("k,skfx->sfx", self.traced_shares, position[:, :, :, 0])
-        to_sphere = path_to_sphere(position, direction, paths, middle[:, None, :, None], radius)
-        longer = to_sphere[..., 1:] - to_sphere[..., :1]
-        return np.asarray(np.moveaxis(longer, 1, 2).reshape(len(paths), len(self.fields), -1))
-
-    def _chiefs(self, direction: np.ndarray) -> np.ndarray:
-        """Chief rays' directions, their mean over the light, (S, F, 3)."""
-        return np.asarray(np.einsum("k,skfx->sfx", self.traced_shares, direction[:, :, :, 0]))
-
-    @one_blas_thread()
-    def _errors(self, states: Sequence[State], aimed: np.ndarray | None = None) -> Errors:
-        """What the light of states comes to at the line CCD.
-
-        Args:
-            states: S of them.
-            aimed: where their rays start, as of ``Errors``; None to aim them.
-
-        Raises:
-            PhysicalError: the light of some state is lost.
-        """
-        found, step = [], max(1, AT_ONCE // len(self._glass))
-        for start in range(0, len(states), step):
-            some = slice(start, start + step)
-            traced, own = self._rays(states[some], None if aimed is None else aimed[some])
-            position, direction, path, valid = traced
-            if not valid.all():
-                raise UnphysicalError("a surface's edge stops light of a field")
-            paths = self._paths(position, direction, path, self.radius)
-            plane = "mtf" in self._wanted and np.isfinite(self.radius)
-            eikonals = self._paths(position, direction, path, np.inf) if plane else paths
-            found.append(Errors(paths, eikonals, self._chiefs(direction), own))
-        return Errors(*(np.concatenate(own) for own in zip(*found, strict=True)))
 
     def _residuals(self, paths: np.ndarray) -> np.ndarray:
         """Residuals (S, R) whose squares sum to the mean squares of the wavefronts over all fields and over the light,
         waves of the design wavelength.
         """
-        terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.solve.T
+        terms = paths.reshape(len(paths), len(self.fields), len(self.traced_shares), -1) @ self.beams.solve.T
         return self._roots.residuals(terms / self.wavelength, self.traced_shares)
 
     # adjustments
@@ -381,7 +250,7 @@ class ToleranceBench:
         except PhysicalError as error:
             if len(amounts) == 1:
                 lost = np.full((1, self.parts), np.nan)
-                paths = np.full((1, *self.designed.shape), np.nan) if len(self.fields) else None
+                paths = np.full((1, *self.beams.designed.paths.shape[1:]), np.nan) if len(self.fields) else None
                 moves = np.full((1, len(self.ranges)), np.nan)
                 return Tried(moves, lost, (str(error) or "lost",), np.full(1, np.nan), paths)
         half = len(amounts) // 2
@@ -401,11 +270,11 @@ class ToleranceBench:
         if not len(self.fields):
             return Tried(moves, self._parts(state(moves), amounts, moves, None), ("",) * count, settled)
         states = state(moves)
-        light = self._errors(states)
+        light = self.beams.light(states)
 
-        def again(own: Sequence[State], which: np.ndarray) -> Errors:
+        def again(own: Sequence[State], which: np.ndarray) -> BeamLight:
             """Those of cameras that were adjusted, whose rays start where they did if no adjustment aims them anew."""
-            return self._errors(own, None if self._moves_stop else light.aimed[which])
+            return self.beams.light(own, None if self._moves_stop else light.aimed[which])
 
         if np.any(self.ranges > 0.0):
             every = np.ones(len(self.ranges), dtype=bool)
@@ -440,7 +309,7 @@ class ToleranceBench:
 
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
         """Parts of all merits (S, P) of cameras in any states, as they are. Raises PhysicalError: the light is lost."""
-        return self._parts(states, *self._still(states), self._errors(states) if len(self.fields) else None)
+        return self._parts(states, *self._still(states), self.beams.light(states) if len(self.fields) else None)
 
     def _still(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray]:
         """Amounts and moves of the bench's own numbers in states that say all themselves: none."""
@@ -453,7 +322,7 @@ class ToleranceBench:
         They change linearly with small motions. Raises PhysicalError: the light is lost.
         """
         count = len(states)
-        light = self._errors(states) if len(self.fields) else None
+        light = self.beams.light(states) if len(self.fields) else None
         terms = None if light is None else self._residuals(light.paths).reshape(count, len(self.fields), -1)
         parts = self._parts(states, *self._still(states), light)
         out = []
@@ -491,7 +360,7 @@ class ToleranceBench:
         return out
 
     def _parts(
-        self, states: Sequence[State], amounts: np.ndarray, moves: np.ndarray, light: Errors | None
+        self, states: Sequence[State], amounts: np.ndarray, moves: np.ndarray, light: BeamLight | None
     ) -> np.ndarray:
         """Parts of all merits, (S, P)."""
         out = np.empty((len(states), self.parts))
@@ -500,8 +369,7 @@ class ToleranceBench:
             known = self.monitor.variances(np.concatenate([amounts, moves], axis=1), states)
         taken = None
         if "obstruction" in self._wanted:
-            start = np.asarray(self._fan.position)[:, 0]
-            taken = obstructed_shares(self.optics.path, states, self.directions, start)
+            taken = obstructed_shares(self.optics.path, states, self.beams.directions, self.beams.start)
         squares = None
         if light is not None and "wavefront" in self._wanted:
             terms = self._residuals(light.paths).reshape(len(states), len(self.fields), -1)
@@ -517,7 +385,7 @@ class ToleranceBench:
                 own = self._modulations(k, merit, light.eikonals)
             elif kind == "chief_ray":
                 assert light is not None
-                turn = light.chiefs[:, merit.fields, :2] - self.chief[merit.fields, :2]
+                turn = light.chiefs[:, merit.fields, :2] - self.beams.designed.chiefs[0, merit.fields, :2]
                 own = turn.reshape(len(states), -1)
             elif kind == "obstruction":
                 assert taken is not None
@@ -530,7 +398,7 @@ class ToleranceBench:
         return out
 
     def _modulations(self, k: int, merit: Merit, eikonals: np.ndarray) -> np.ndarray:
-        longer = eikonals - self.designed_eikonals
+        longer = eikonals - self.beams.designed.eikonals[0]
         return np.stack(
             [
                 one.modulation(longer[:, f])
