@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
-from optics.geometry.polygon import area, compact, intersect, sides, widened
+from optics.geometry.polygon import area, area_in_disk, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
@@ -60,6 +60,10 @@ class StopOutlines:
         """The edges of both."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
+    def take(self, which: np.ndarray | slice) -> StopOutlines:
+        """Those of the images of the given indices."""
+        return StopOutlines(tuple(one[which] for one in self.clear), tuple(one[which] for one in self.blocked))
+
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """What edges and other shadows take of ``count`` pupils.
 
@@ -81,14 +85,14 @@ class StopOutlines:
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
         """``shadows`` of one image, (K, W, 2)."""
         some = slice(number, number + 1)
-        lit, rim = _window(1), sides(_window(1, 1.0, RIM_SIDES))
+        lit = _window(1)
         for polygon in self.clear:
             lit = compact(intersect(lit, *sides(polygon[some])))
         # what is dark already outside of the clear edges is no matter of the others
         dark = [intersect(polygon[some], *sides(lit)) for polygon in (*self.blocked, *further)]
         beyond = _outside([lit], 1) if self.clear else []
         dark, beyond = (
-            [compact(piece) for piece in kind if area(intersect(piece, *rim))[0] > SMALLEST] for kind in (dark, beyond)
+            [compact(piece) for piece in kind if area_in_disk(piece)[0] > SMALLEST] for kind in (dark, beyond)
         )
         pieces, _ = separate(dark, fewest=True)
         every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
@@ -142,8 +146,7 @@ def _few_enough(pieces: np.ndarray) -> np.ndarray:
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
     """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
-    _, _, areas = nodes_in_shadows(pieces, 2)
-    return np.asarray(np.sum(areas, axis=-1) / np.pi)
+    return np.asarray(np.sum(area_in_disk(pieces), axis=-1) / np.pi)
 
 
 def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -188,6 +188,22 @@ class PupilStack:
             None if self.shadow is None else self.shadow.take(which),
         )
 
+    def functions(self) -> tuple[PupilFunction, ...]:
+        """Each pupil by itself."""
+        return tuple(
+            PupilFunction(
+                self.centre[i],
+                self.axes[i],
+                PupilEdge(self.harmonics[:, i]),
+                self.eikonal_terms[i],
+                self.amplitude_terms[i],
+                float(self.residual[i]),
+                float(self.amplitude_residual[i]),
+                None if self.shadow is None else self.shadow.take(slice(i, i + 1)),
+            )
+            for i in range(len(self.centre))
+        )
+
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Polychromatic transfer functions in the plane of the traced detector.
 
@@ -472,19 +488,7 @@ def fit_pupils(
             f"polynomials of degree {used} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
             f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}): it is too rough for a pupil"
         )
-    return tuple(
-        PupilFunction(
-            stack.centre[i],
-            stack.axes[i],
-            PupilEdge(stack.harmonics[:, i]),
-            stack.eikonal_terms[i],
-            stack.amplitude_terms[i],
-            float(stack.residual[i]),
-            float(stack.amplitude_residual[i]),
-            None if stack.shadow is None else stack.shadow.take(slice(i, i + 1)),
-        )
-        for i in range(len(field.u))
-    )
+    return stack.functions()
 
 
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:

@@ -29,7 +29,7 @@ from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
-from optics.waves.line_transfer import CutPupil, cut_pupils, lit_at
+from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
 from optics.waves.pupil_shadow import SMALLEST
 from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
@@ -38,9 +38,6 @@ from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
-
-LINE_SIDES = 192
-"""Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
 
 SMOOTH = 1e-6
 """Rms eikonal that the polynomials of a wavefront leave which is smooth, wavelengths."""
