@@ -90,10 +90,8 @@ class StopOutlines:
             lit = compact(intersect(lit, *sides(polygon[some])))
         # what is dark already outside of the clear edges is no matter of the others
         dark = [intersect(polygon[some], *sides(lit)) for polygon in (*self.blocked, *further)]
-        beyond = _outside([lit], 1) if self.clear else []
-        dark, beyond = (
-            [compact(piece) for piece in kind if area_in_disk(piece)[0] > SMALLEST] for kind in (dark, beyond)
-        )
+        dark = [compact(piece) for piece in dark if area_in_disk(piece)[0] > SMALLEST]
+        beyond = [compact(piece[None]) for piece in _around(lit[0])] if self.clear else []
         pieces, _ = separate(dark, fewest=True)
         every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
         width = max((len(piece) for piece in every), default=3)
@@ -377,6 +375,28 @@ def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np
     ways = step * np.eye(2)
     rise = np.stack([(value(at + way) - value(at - way)) / (2.0 * step) for way in ways], axis=-1)
     return value(at), rise
+
+
+def _around(lit: np.ndarray) -> np.ndarray:
+    """What the stop has outside of a convex polygon (V, 2) in the window, counterclockwise: a convex piece beyond each
+    side, (K, W, 2), without those that lie beyond the stop.
+    """
+    lit = compact(lit[None])[0]
+    if area(lit) < SMALLEST:
+        return _window(1)
+    (normal,), (limit,) = sides(lit[None])
+    middle = np.mean(lit, axis=0)
+    # the polygon grows about its middle until it holds the stop
+    size = float(np.max((1.0 - normal @ middle) / np.maximum(limit - normal @ middle, _THINNEST)))
+    far = middle + max(size, 1.0) * (lit - middle)
+    pieces = np.stack([lit, far, np.roll(far, -1, axis=0), np.roll(lit, -1, axis=0)], axis=1)
+    pieces = pieces[area_in_disk(pieces) > SMALLEST]
+    normal, limit = sides(_window(1))
+    return intersect(pieces, *(np.broadcast_to(part, (len(pieces), *part.shape[1:])) for part in (normal, limit)))
+
+
+_THINNEST = 1e-6
+"""Distance of a polygon's middle from its sides, in radii of the stop, below which the polygon is a line."""
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:

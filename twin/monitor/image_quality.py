@@ -38,8 +38,8 @@ from optics.waves.edge_shadow import StopOutlines
 from optics.waves.imaging import ImagingRays, imaging_rays
 from optics.waves.line_transfer import LINE_SIDES, cut_pupils, line_transfers
 from optics.waves.pupil_edge import WORST_BEND
-from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
-from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
+from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
+from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models import shadow
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
@@ -340,8 +340,6 @@ class _CameraBench:
         assert isinstance(stop, Circle)
         self.stop = stop
         self.refracts = len(self.colours) > 1 and bool(lenses(spec))
-        self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
-        self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
         self.nodes = quadrature.disk(CUT_RINGS if self.model.edges else RINGS)
         self.assembly = instrument.assembly
 
@@ -490,12 +488,11 @@ class _CameraBench:
         # per length of the nominal CCD, in which the pixels keep their pitch
         v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
         path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
-        for degree in self.degrees:
-            pupils = PupilStack.fit(
-                u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides, free
-            )
-            if np.all(pupils.residual <= CUT_RESIDUAL * colour):
-                break
+        traced = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
+        if free is None:
+            pupils = PupilStack.fit(*traced, DEGREE, taken, FEW_SIDES)
+        else:
+            pupils = PupilStack.followed(*traced, colour, taken, free)
         return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(
