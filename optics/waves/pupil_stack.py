@@ -33,19 +33,18 @@ every Zernike term to seventh order on each mirror it leaves 2e-5."""
 
 CUT_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
 """Degrees of the polynomials of a pupil with cut edges; the first that fits is used, or the best if none does. Light
-that edges leave comes from near the rims of fast aspheres, where no polynomial of a round pupil is the best one.
-"""
+that edges leave comes from near the rims of fast aspheres, where no polynomial of a round pupil is the best one."""
 
 MORE_DEGREES = (24, 28)
-"""Further ones of a pupil of which shadows are not taken off again: what these say of the dark is too large for that."""
+"""Further ones of a pupil of which no shadows are taken off again: what they say of the dark is too large for that."""
 
 CUT_RINGS = 20
 """Rings of the quadrature of a pupil with cut edges: a thin ring or a crescent of light has to hold rays enough for
 polynomials."""
 
 CUT_RESIDUAL = 1e-4
-"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; those of the best of CUT_DEGREES
-may leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the best of CUT_DEGREES may
+leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
 """
 
 WORST_RESIDUAL = 1e-3
@@ -185,8 +184,14 @@ class PupilStack:
         which leaves the least.
 
         Args:
-            u, v, eikonal, amplitude, nodes, shadows, lit: as of ``fit``.
+            u: as of ``fit``, and so are those below.
+            v: as of ``fit``.
+            eikonal: as of ``fit``.
+            amplitude: as of ``fit``.
+            nodes: as of ``fit``.
             wavelength: of the light, metres.
+            shadows: as of ``fit``.
+            lit: as of ``fit``.
         """
         best: PupilStack | None = None
         for degree in CUT_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
@@ -517,8 +522,9 @@ def fit_pupils(
             stack = PupilStack.followed(*traced, field.wavelength, shadows, lit)
     worst = int(np.argmax(stack.residual))
     if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
+        used, left = stack.eikonal_terms.shape[-1] - 1, stack.residual[worst] / field.wavelength
         raise UnphysicalError(
-            f"polynomials of degree {stack.eikonal_terms.shape[-1] - 1} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
+            f"polynomials of degree {used} leave {left:.2g} wavelengths rms of "
             f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}): it is too rough for a pupil"
         )
     return stack.functions()

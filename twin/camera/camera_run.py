@@ -237,13 +237,13 @@ def run_camera(
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
     except UnphysicalError as error:  # of a pupil that edges cut, or whose wavefront is too rough
         mtfs, sharp, why = (), False, f"of this pupil: {error}"
-    focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
+    focus = field_maps.through_focus(optics, MTF_FIELDS, sharp)
     curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     colours, light = None, camera.light
     if light is not None and light.ends[0] < light.ends[1]:
         advance("colours", 0, 1)
-        colours = judge_colours(optics, backend, light, MTF_FIELDS, bool(mtfs))
+        colours = judge_colours(optics, light, MTF_FIELDS, bool(mtfs))
         advance("colours", 1, 1)
     return CameraRun(
         setup=setup,
@@ -360,6 +360,12 @@ _MTF: Record[Mtf] = Record(
     Quantity("field", lambda m: m.field, "shares of the half field, along the line and along the track"),
     Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
     Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
+    Quantity(
+        "accuracy",
+        lambda m: m.accuracy or None,
+        "of a pupil that edges cut: change of the curve by a third of the lines through it, at most",
+        where_known=True,
+    ),
 )
 _DISTORTION: Record[field_maps.Distortion] = Record(
     "Where the camera images directions, against the nearest perfect camera: over the field, and along its line.",
