@@ -454,13 +454,13 @@ class _CameraBench:
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
                 outlines = None if traced.outlines is None else traced.outlines.take(lit[good])
-                some = [None if one is None else one[good] for one in (taken, free)]
+                dark_in, lit_in = (None if one is None else one[good] for one in (taken, free))
                 if self.refracts:
-                    otf, known = self._in_colours(traced, origin, lit[good], *some, outlines)
+                    otf, known = self._in_colours(traced, origin, lit[good], dark_in, lit_in, outlines)
                 else:
                     own = pupils if len(good) == len(lit) else pupils.take(good)
                     seen = tuple(part[good] for part in cosines)
-                    otf, known = self._transfer(own, seen, some[1], outlines, self.colours, self.weights)
+                    otf, known = self._transfer(own, seen, lit_in, outlines, self.colours, self.weights)
                 good, otf = good[known], otf[known]
                 hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
