@@ -29,6 +29,24 @@ def area(polygons: np.ndarray) -> np.ndarray:
     return np.asarray(0.5 * np.sum(x[..., :-1] * y[..., 1:] - x[..., 1:] * y[..., :-1], axis=-1))
 
 
+def area_in_disk(polygons: np.ndarray) -> np.ndarray:
+    """Areas within the unit disk, positive counterclockwise, (...), of polygons (..., V, D).
+
+    It is the sum over the sides of what lies between each and the middle: a triangle where the side runs within the
+    disk, a sector where it runs outside.
+    """
+    start = polygons[..., 0] + 1j * polygons[..., 1]
+    end = np.roll(start, -1, axis=-1)
+    way = end - start
+    size = np.abs(way)
+    unit = way / np.where(size > _SAME, size, 1.0)
+    along = (np.conj(unit) * start).real  # of the start, from the foot of the middle's perpendicular on the side
+    half = np.sqrt(np.maximum(1.0 - np.abs(start - along * unit) ** 2, 0.0))
+    first, second = (start + (np.clip(place, along, along + size) - along) * unit for place in (-half, half))
+    sectors = np.angle(np.conj(start) * first) + np.angle(np.conj(second) * end)
+    return np.asarray(0.5 * np.sum((np.conj(first) * second).imag + sectors, axis=-1))
+
+
 def covered(polygons: np.ndarray, points: np.ndarray, smallest: float = 0.0) -> np.ndarray:
     """Which points (N, 2) lie in any of the convex counterclockwise polygons (B, K, V, 2), (B, N).
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
-from optics.geometry.polygon import area, compact, intersect, sides, widened
+from optics.geometry.polygon import area, area_in_disk, compact, intersect, sides, widened
 from optics.numerics.physical_error import UnphysicalError
 from optics.numerics.quadrature import PupilNodes
 from optics.waves.pupil_shadow import RIM_SIDES, SMALLEST, quadrature_within, separate, tiled, without
@@ -60,6 +60,10 @@ class StopOutlines:
         """The edges of both."""
         return StopOutlines(self.clear + other.clear, self.blocked + other.blocked)
 
+    def take(self, which: np.ndarray | slice) -> StopOutlines:
+        """Those of the images of the given indices."""
+        return StopOutlines(tuple(one[which] for one in self.clear), tuple(one[which] for one in self.blocked))
+
     def shadows(self, count: int, further: Sequence[np.ndarray] = ()) -> np.ndarray:
         """What edges and other shadows take of ``count`` pupils.
 
@@ -81,15 +85,13 @@ class StopOutlines:
     def _of_one(self, number: int, further: Sequence[np.ndarray]) -> np.ndarray:
         """``shadows`` of one image, (K, W, 2)."""
         some = slice(number, number + 1)
-        lit, rim = _window(1), sides(_window(1, 1.0, RIM_SIDES))
+        lit = _window(1)
         for polygon in self.clear:
             lit = compact(intersect(lit, *sides(polygon[some])))
         # what is dark already outside of the clear edges is no matter of the others
         dark = [intersect(polygon[some], *sides(lit)) for polygon in (*self.blocked, *further)]
-        beyond = _outside([lit], 1) if self.clear else []
-        dark, beyond = (
-            [compact(piece) for piece in kind if area(intersect(piece, *rim))[0] > SMALLEST] for kind in (dark, beyond)
-        )
+        dark = [compact(piece) for piece in dark if area_in_disk(piece)[0] > SMALLEST]
+        beyond = [compact(piece[None]) for piece in _around(lit[0])] if self.clear else []
         pieces, _ = separate(dark, fewest=True)
         every = [*(pieces[0] if dark else ()), *(piece[0] for piece in beyond)]
         width = max((len(piece) for piece in every), default=3)
@@ -142,8 +144,7 @@ def _few_enough(pieces: np.ndarray) -> np.ndarray:
 
 def shares_of_stop(pieces: np.ndarray) -> np.ndarray:
     """Shares of the stop that pieces of shadows (B, K, V, 2), which do not overlap, take, (B,)."""
-    _, _, areas = nodes_in_shadows(pieces, 2)
-    return np.asarray(np.sum(areas, axis=-1) / np.pi)
+    return np.asarray(np.sum(area_in_disk(pieces), axis=-1) / np.pi)
 
 
 def nodes_in_shadows(pieces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -374,6 +375,28 @@ def _followed(terms: np.ndarray, at: np.ndarray, step: float = 1e-5) -> tuple[np
     ways = step * np.eye(2)
     rise = np.stack([(value(at + way) - value(at - way)) / (2.0 * step) for way in ways], axis=-1)
     return value(at), rise
+
+
+def _around(lit: np.ndarray) -> np.ndarray:
+    """What the stop has outside of a convex polygon (V, 2) in the window, counterclockwise: a convex piece beyond each
+    side, (K, W, 2), without those that lie beyond the stop.
+    """
+    lit = compact(lit[None])[0]
+    if area(lit) < SMALLEST:
+        return _window(1)
+    (normal,), (limit,) = sides(lit[None])
+    middle = np.mean(lit, axis=0)
+    # the polygon grows about its middle until it holds the stop
+    size = float(np.max((1.0 - normal @ middle) / np.maximum(limit - normal @ middle, _THINNEST)))
+    far = middle + max(size, 1.0) * (lit - middle)
+    pieces = np.stack([lit, far, np.roll(far, -1, axis=0), np.roll(lit, -1, axis=0)], axis=1)
+    pieces = pieces[area_in_disk(pieces) > SMALLEST]
+    normal, limit = sides(_window(1))
+    return intersect(pieces, *(np.broadcast_to(part, (len(pieces), *part.shape[1:])) for part in (normal, limit)))
+
+
+_THINNEST = 1e-6
+"""Distance of a polygon's middle from its sides, in radii of the stop, below which the polygon is a line."""
 
 
 def _outside(clear: list[np.ndarray], count: int) -> list[np.ndarray]:

@@ -39,6 +39,9 @@ from optics.waves.transfer import WORST_TRANSFER
 RIM_SIDES = 2048
 """Of the polygon with the area of the pupil that stands for its edge: within 4e-7 of it, to both sides alike."""
 
+LINE_SIDES = 192
+"""Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
+
 LINES = (400, 720, 1440, 3240)
 """Across the pupil, the first that do."""
 

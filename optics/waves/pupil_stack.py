@@ -32,16 +32,18 @@ DEGREE = 8
 every Zernike term to seventh order on each mirror it leaves 2e-5."""
 
 CUT_DEGREES = (DEGREE, 10, 12, 14, 16, 18, 20)
-"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used. Light that edges leave comes from
-near the rims of fast aspheres, where no polynomial of a round pupil is the best one.
-"""
+"""Degrees of the polynomials of a pupil with cut edges; the first that fits is used, or the best if none does. Light
+that edges leave comes from near the rims of fast aspheres, where no polynomial of a round pupil is the best one."""
+
+MORE_DEGREES = (24, 28)
+"""Further ones of a pupil of which no shadows are taken off again: what they say of the dark is too large for that."""
 
 CUT_RINGS = 20
 """Rings of the quadrature of a pupil with cut edges: a thin ring or a crescent of light has to hold rays enough for
 polynomials."""
 
 CUT_RESIDUAL = 1e-4
-"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the last of CUT_DEGREES may
+"""Rms eikonal that the polynomials of a pupil that edges cut should leave, wavelengths; the best of CUT_DEGREES may
 leave more. Their errors are largest along the edges, at which the overlap of a pupil with itself ends.
 """
 
@@ -166,6 +168,43 @@ class PupilStack:
         span, amplitude_rest = np.ptp(bent, axis=-1), rest[:, 1] / mean
         return cls(centre, axes, harmonics, table[0], table[1], span, rest[:, 0], amplitude_rest, shadow)
 
+    @classmethod
+    def followed(
+        cls,
+        u: np.ndarray,
+        v: np.ndarray,
+        eikonal: np.ndarray,
+        amplitude: np.ndarray,
+        nodes: PupilNodes,
+        wavelength: float,
+        shadows: np.ndarray | None,
+        lit: np.ndarray,
+    ) -> PupilStack:
+        """``fit`` to pupils that edges cut, by polynomials of the first degree that follows all of them, or of that
+        which leaves the least.
+
+        Args:
+            u: as of ``fit``, and so are those below.
+            v: as of ``fit``.
+            eikonal: as of ``fit``.
+            amplitude: as of ``fit``.
+            nodes: as of ``fit``.
+            wavelength: of the light, metres.
+            shadows: as of ``fit``.
+            lit: as of ``fit``.
+        """
+        best: PupilStack | None = None
+        for degree in CUT_DEGREES + (() if shadows is not None and shadows.shape[1] else MORE_DEGREES):
+            if (degree + 1) * (degree + 2) // 2 > nodes.count:
+                break
+            stack = cls.fit(u, v, eikonal, amplitude, nodes, degree, shadows, RIM_SIDES, lit)
+            if best is None or np.max(stack.residual) < np.max(best.residual):
+                best = stack
+            if np.all(stack.residual <= CUT_RESIDUAL * wavelength):
+                break
+        assert best is not None
+        return best
+
     @property
     def bend(self) -> np.ndarray:
         """How far each edge is from an ellipse, (B,); ``transfer`` needs at most
@@ -186,6 +225,22 @@ class PupilStack:
             self.residual[which],
             self.amplitude_residual[which],
             None if self.shadow is None else self.shadow.take(which),
+        )
+
+    def functions(self) -> tuple[PupilFunction, ...]:
+        """Each pupil by itself."""
+        return tuple(
+            PupilFunction(
+                self.centre[i],
+                self.axes[i],
+                PupilEdge(self.harmonics[:, i]),
+                self.eikonal_terms[i],
+                self.amplitude_terms[i],
+                float(self.residual[i]),
+                float(self.amplitude_residual[i]),
+                None if self.shadow is None else self.shadow.take(slice(i, i + 1)),
+            )
+            for i in range(len(self.centre))
         )
 
     def transfer(self, frequency: np.ndarray, wavelengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -460,31 +515,19 @@ def fit_pupils(
             f"edges leave light at {int(np.sum(lit[which]))} of {nodes.count} rays of image {which}: too few to follow"
         )
     with one_blas_thread():
-        for used in (degree,) if lit is None else CUT_DEGREES:
-            stack = PupilStack.fit(
-                field.u, field.v, field.eikonal, field.amplitude, nodes, used, shadows, RIM_SIDES, lit
-            )
-            if np.all(stack.residual <= CUT_RESIDUAL * field.wavelength):
-                break
+        traced = field.u, field.v, field.eikonal, field.amplitude, nodes
+        if lit is None:
+            stack = PupilStack.fit(*traced, degree, shadows, RIM_SIDES)
+        else:
+            stack = PupilStack.followed(*traced, field.wavelength, shadows, lit)
     worst = int(np.argmax(stack.residual))
     if stack.residual[worst] > WORST_RESIDUAL * field.wavelength:
+        used, left = stack.eikonal_terms.shape[-1] - 1, stack.residual[worst] / field.wavelength
         raise UnphysicalError(
-            f"polynomials of degree {used} leave {stack.residual[worst] / field.wavelength:.2g} wavelengths rms of "
+            f"polynomials of degree {used} leave {left:.2g} wavelengths rms of "
             f"the wavefront of image {worst} (at most {WORST_RESIDUAL:g}): it is too rough for a pupil"
         )
-    return tuple(
-        PupilFunction(
-            stack.centre[i],
-            stack.axes[i],
-            PupilEdge(stack.harmonics[:, i]),
-            stack.eikonal_terms[i],
-            stack.amplitude_terms[i],
-            float(stack.residual[i]),
-            float(stack.amplitude_residual[i]),
-            None if stack.shadow is None else stack.shadow.take(slice(i, i + 1)),
-        )
-        for i in range(len(field.u))
-    )
+    return stack.functions()
 
 
 def circular_pupil(f_number: float, eikonal_terms: np.ndarray | None = None) -> PupilFunction:

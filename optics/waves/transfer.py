@@ -204,7 +204,7 @@ def _pieces(
         start += len(some)
 
 
-FINER = (4, 8, 16, 32)
+FINER = (4, 8, 16, 32, 64)
 """Further nodes that are tried."""
 
 SETTLED = 2e-4

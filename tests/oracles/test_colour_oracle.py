@@ -69,7 +69,7 @@ def test_axial_colour_of_batoids_beams(case, backend) -> None:
     optics, peer = case
     model, nodes = optics.model, disk(FOCUS_RINGS)
     stop = np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)])
-    own = axial_colour(optics, backend, FIELDS, COLOURS)
+    own = axial_colour(optics, FIELDS, COLOURS)
     plane = FocalPlane.of(model.spec)
     for f, field in enumerate(FIELDS):
         for k, colour in enumerate(COLOURS):

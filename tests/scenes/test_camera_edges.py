@@ -110,7 +110,7 @@ def test_every_table_tells_one_wavefront_error_of_a_cut_beam(backend, cut) -> No
     mapped = FieldBeams.field_errors(cut.model, backend, fields, 5)
     np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
     np.testing.assert_allclose(field_curves(cut, False, 3).error[[0, 2]], rms[:2], **close)
-    focus = through_focus(cut, backend, fields, False)
+    focus = through_focus(cut, fields, False)
     np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], mapped, **close)
     assert all(wave.accuracy < 1e-4 for wave in waves)
     for wave in waves:

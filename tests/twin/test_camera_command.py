@@ -150,7 +150,7 @@ def test_distortion_is_that_of_the_papers_formula(gf7_alone) -> None:
 def test_focus_along_the_line_and_through_focus(backend, gf7_alone) -> None:
     """The best focus of curves is where the error through focus is least, and both fans stand about it."""
     curves = field_curves(gf7_alone, sharp=True, count=3)
-    near = through_focus(gf7_alone, backend, ((0.0, 0.0), (1.0, 0.0)), sharp=True)
+    near = through_focus(gf7_alone, ((0.0, 0.0), (1.0, 0.0)), sharp=True)
     for k, share in enumerate((1, 2)):
         least = np.polyfit(near.defocus, near.error[k] ** 2, 2)
         assert -least[1] / (2.0 * least[0]) == pytest.approx(curves.focus[share], abs=0.3e-6)

@@ -107,7 +107,7 @@ def test_what_prisms_take_is_missing_in_every_table(backend, gf7_pair) -> None:
     # maps are of 10 000 rays
     mapped = FieldBeams.field_errors(view.model, backend, fields, 5, view.cut)
     np.testing.assert_allclose(mapped, rms, rtol=RAYS_ACCURACY)
-    focus = through_focus(view, backend, fields, False)
+    focus = through_focus(view, fields, False)
     np.testing.assert_allclose(focus.error[:, len(focus.defocus) // 2], mapped, rtol=1e-6)
     quality = image_quality(gf7_pair, backend, [{}], fields=(0.0,)).cameras["forward"]
     taken = sum(float(share[0, 0]) for share in quality.bodies.values())

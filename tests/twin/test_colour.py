@@ -48,7 +48,7 @@ def test_colour_of_a_thin_achromat(achromat, backend) -> None:
     n = np.array([[spec.index_behind(face, w) for w in lines] for face in ("L1", "L3")])
     spread = n[:, 0] - n[:, 2]
     abbe, partial = (n[:, 1] - 1.0) / spread, (n[:, 0] - n[:, 1]) / spread
-    found = judge_colours(achromat, backend, spec.spectrum, ((0.0, 0.0),), False)
+    found = judge_colours(achromat, spec.spectrum, ((0.0, 0.0),), False)
     focal = float(achromat.model.first_order.focal_length[0])
     assert found.axial is not None
     # what is not achromatic of it is a little of what one lens has, f / V; that is taken off the blue line's focus
@@ -121,7 +121,7 @@ def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
     optics = CameraOptics.alone(gf7, backend)
     light, field = gf7.spec.light, (1.0, 1.0)
     assert light is not None
-    found = judge_colours(optics, backend, light, (field,), False)
+    found = judge_colours(optics, light, (field,), False)
     assert found.lateral is None
     assert found.axial_secondary is None
     wavelengths, weights = light.rule(9)
@@ -149,7 +149,7 @@ def test_no_colours_without_named_glass(achromat, backend) -> None:
     with pytest.raises(ValueError, match="name its glass"):
         old.at(500e-9)
     with pytest.raises(ValueError, match="name its glass"):
-        axial_colour(old, backend, [(0.0, 0.0)], np.array([500e-9]))
+        axial_colour(old, [(0.0, 0.0)], np.array([500e-9]))
 
 
 @pytest.mark.second

@@ -41,7 +41,7 @@ from scenes.models.camera_model import (
     field_direction,
     lenses,
 )
-from scenes.models.camera_sharpness import FIELDS, Cut, stop_nodes
+from scenes.models.camera_sharpness import FIELDS, Cut, FieldBeams, FocalPlane, stop_nodes
 from scenes.models.instrument_model import Instrument
 from scenes.models.shadow import ImagingShadows, imaging_shadows
 from scenes.specs.camera import CameraSpec
@@ -287,41 +287,52 @@ class CameraOptics:
         """Spot at one field, as ``spots``."""
         return self.spots([field], defocus)[0]
 
-    @one_blas_thread()
-    def errors(
-        self, fields: Sequence[Field] | np.ndarray, defocus: Sequence[float] | np.ndarray = (0.0,)
-    ) -> np.ndarray:
-        """Rms wavefront errors alone, piston and tilt taken out, waves, (F, Z).
+    def beams(self, fields: Sequence[Field] | np.ndarray, rings: int = RINGS) -> FieldBeams:
+        """Beams of fields (F, 2) near the image, in the prescription's frame.
+
+        In a state they stand to the line CCD as they do to the moved one, but this is where it was designed to be.
 
         Args:
-            fields: (F, 2).
-            defocus: Z shifts of the line CCD downstream, metres.
+            fields: where.
+            rings: of the quadrature over the stop.
+
+        Raises:
+            AimError, BeamMissedError: as ``rays``.
+            InputError: edges stop all of a field's light.
+        """
+        places = tuple((float(x), float(y)) for x, y in np.asarray(fields, dtype=np.float64))
+        if not self.state and not self.built:
+            return FieldBeams.trace(self.model, self.path.backend, places, rings, self.cut, wavelength=self.wavelength)
+        nodes = stop_nodes(self.model, rings, self.cut is not None)
+        rays = self.rays(fields, np.concatenate([np.zeros((1, 2)), np.stack([nodes.x, nodes.y], axis=-1)]))
+        plane = self.model.focal_plane
+        position, direction = plane.apply(rays.position), rays.direction @ plane.rotation.T
+        room = np.sum(
+            (position[:, 0] - self.model.mirror_pose(self.model.mirrors[-1]).translation) * direction[:, 0], -1
+        )
+        return FieldBeams(
+            self.model.spec,
+            np.array(places),
+            nodes,
+            position,
+            direction,
+            rays.path,
+            float(self.model.first_order.exit_pupil_distance[0]),
+            room,
+            rays.valid[:, 1:] if self.model.edges or self.cut is not None else None,
+        )
+
+    @one_blas_thread()
+    def errors(self, fields: Sequence[Field] | np.ndarray) -> np.ndarray:
+        """Rms wavefront errors alone at fields (F, 2), piston and tilt taken out, waves of the design wavelength, (F,).
 
         Raises:
             AimError, BeamMissedError: as ``rays``.
         """
-        nodes = stop_nodes(self.model, RINGS, self.cut is not None)
-        stop = np.concatenate([[[0.0, 0.0]], np.stack([nodes.x, nodes.y], axis=-1)])
-        level = zernike.basis(3, nodes.x, nodes.y)
-        radius = float(self.model.first_order.exit_pupil_distance[0])
-        every, step = np.asarray(fields, dtype=np.float64), max(1, MOST_RAYS // len(stop))
-        out = []
-        for start in range(0, len(every), step):
-            rays = self.rays(every[start : start + step], stop)
-            along = rays.direction[..., 2]
-            lit = rays.valid[:, 1:] * nodes.share
-            share = lit / np.sum(lit, axis=-1, keepdims=True)
-            weighted = np.swapaxes(level * share[..., None], 1, 2)
-            rows = []
-            for dz in defocus:
-                way = dz * np.sign(along) / along
-                place = rays.position + way[..., None] * rays.direction
-                path = path_to_sphere(place, rays.direction, rays.path + way, place[:, :1], radius)
-                error = (path[:, 1:] - path[:, :1]) / self.wavelength
-                tilt = np.linalg.solve(weighted @ level, weighted @ error[..., None])
-                rows.append(np.sqrt(np.sum(share * (error - np.squeeze(level @ tilt, -1)) ** 2, axis=-1)))
-            out.append(np.stack(rows, axis=-1))
-        return np.concatenate(out)
+        every, plane = np.asarray(fields, dtype=np.float64), FocalPlane.of(self.model.spec)
+        step = max(1, MOST_RAYS // stop_nodes(self.model, RINGS, self.cut is not None).count)
+        parts = [every[start : start + step] for start in range(0, len(every), step)]
+        return np.concatenate([self.beams(part).errors(plane) for part in parts])
 
     def pupils(self, fields: Sequence[Field] | np.ndarray) -> tuple[PupilFunction, ...]:
         """Exit pupils as the images of fields (F, 2) see them, axes along the line and along the track.

@@ -226,6 +226,9 @@ def _mtf(run: CameraRun) -> Section:
         f"Of the optics alone, at {1e9 * run.camera.wavelength:.0f} nm: pixels, charge and motion come on top of it. "
         f"Nyquist is {1e-3 * run.optics.nyquist:.4g} cycles/mm."
     )
+    change = max(mtf.accuracy for mtf in run.mtfs)
+    if change:
+        text += f" Edges cut the pupil; a third of the lines through it changes a curve by {change:.1g} at most."
     caption = "Along the line and along the track; dashed what diffraction allows."
     figure = _figure("mtf", "MTF by field", caption, plots.mtf_figure, run)
     return Section(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -230,13 +231,13 @@ def run_camera(
         mtfs = optics.mtfs(MTF_FIELDS) if sharp else ()
     except UnphysicalError as error:  # of a pupil that edges cut, or whose wavefront is too rough
         mtfs, sharp, why = (), False, f"of this pupil: {error}"
-    focus = field_maps.through_focus(optics, backend, MTF_FIELDS, sharp)
+    focus = field_maps.through_focus(optics, MTF_FIELDS, sharp)
     curves = field_maps.field_curves(optics, sharp)
     advance("MTF", 1, 1)
     colours, light = None, camera.light
     if light is not None and light.ends[0] < light.ends[1]:
         advance("colours", 0, 1)
-        colours = judge_colours(optics, backend, light, MTF_FIELDS, bool(mtfs))
+        colours = judge_colours(optics, light, MTF_FIELDS, bool(mtfs))
         advance("colours", 1, 1)
     return CameraRun(
         setup=setup,
@@ -320,6 +321,8 @@ def perturbed_text(run: CameraRun) -> str:
     return f"{text}. {_OF_THE_DRAWING}"
 
 
+_LONG = re.compile(r"-?\d+\.\d{3,}(e-?\d+)?")
+"""Numbers with more digits than a sentence bears."""
 _OF_THE_DRAWING = "First-order data and layout are those of the camera as designed."
 
 
@@ -327,6 +330,7 @@ def built_text(run: CameraRun) -> str:
     """How the camera's instrument was built, empty for one as drawn."""
     instrument = run.setup.instrument
     words = "" if instrument is None or not instrument.as_built else in_words(instrument.as_built)
+    words = _LONG.sub(lambda number: f"{float(number.group()):.4g}", words)
     if not words:
         return ""
     return f"As built: {words}." if run.perturbed is not None else f"As built: {words}. {_OF_THE_DRAWING}"
@@ -365,6 +369,12 @@ _MTF: Record[Mtf] = Record(
     Quantity("field", lambda m: m.field, "shares of the half field, along the line and along the track"),
     Quantity("along_line", lambda m: m.at(m.nyquist)[0]),
     Quantity("along_track", lambda m: m.at(m.nyquist)[1]),
+    Quantity(
+        "accuracy",
+        lambda m: m.accuracy or None,
+        "of a pupil that edges cut: change of the curve by a third of the lines through it, at most",
+        where_known=True,
+    ),
 )
 _DISTORTION: Record[field_maps.Distortion] = Record(
     "Where the camera images directions, against the nearest perfect camera: over the field, and along its line.",

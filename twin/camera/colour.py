@@ -18,13 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from optics.numerics.backend import Backend
 from optics.numerics.quadrature import gauss, nodes_for
 from optics.waves.diffraction import Grid, PupilField, image
 from optics.waves.pupil_stack import SHADOW_NODES, PupilFunction
 from optics.waves.transfer import LEAST_ACROSS
 from scenes.models.camera_model import lenses
-from scenes.models.camera_sharpness import FieldBeams, FocalPlane
+from scenes.models.camera_sharpness import FocalPlane
 from scenes.specs.spectrum import SpectrumSpec
 from twin.camera.camera_optics import CameraOptics
 from twin.camera.camera_results import Field, Mtf
@@ -147,12 +146,10 @@ def lateral_colour(
     return np.stack([places(float(wavelength)) - start for wavelength in wavelengths], axis=1)
 
 
-def axial_colour(
-    optics: CameraOptics, backend: Backend, fields: Sequence[Field], wavelengths: np.ndarray
-) -> np.ndarray:
+def axial_colour(optics: CameraOptics, fields: Sequence[Field], wavelengths: np.ndarray) -> np.ndarray:
     """Best focus of each field by itself at each wavelength (K,), from the focal plane, downstream positive, metres.
 
-    It is that of the camera as designed, along the prescription's z, on a plane with the focal plane's tilt.
+    It is along the prescription's z, on a plane with the focal plane's tilt; in a state as the focal plane has moved.
 
     Returns:
         (F, K).
@@ -165,9 +162,7 @@ def axial_colour(
     out = np.empty((len(fields), len(wavelengths)))
     for f, place in enumerate(fields):
         for k, wavelength in enumerate(wavelengths):
-            beams = FieldBeams.trace(
-                optics.model, backend, (place,), FOCUS_RINGS, optics.cut, wavelength=float(wavelength)
-            )
+            beams = optics.at(float(wavelength)).beams((place,), FOCUS_RINGS)
             downstream = float(np.sign(np.mean(beams.direction[..., 2])))
             out[f, k] = downstream * (beams.best_plane().z - own.z)
     return out
@@ -266,9 +261,7 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
     return PupilField(u, v, eikonal, amplitude * weight * scale, wavelength)
 
 
-def judge_colours(
-    optics: CameraOptics, backend: Backend, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool
-) -> Colours:
+def judge_colours(optics: CameraOptics, spectrum: SpectrumSpec, fields: tuple[Field, ...], sharp: bool) -> Colours:
     """Look at a camera over its light; without MTF for a camera that is not ``sharp``.
 
     Raises:
@@ -277,7 +270,7 @@ def judge_colours(
     reference, wavelengths = reference_wavelength(optics, spectrum), spectrum.even(CURVE_POINTS)
     out = Colours(spectrum, reference, wavelengths, fields, None, None, None)
     if lenses(optics.model.spec):
-        both = axial_colour(optics, backend, fields, np.append(wavelengths, reference))
+        both = axial_colour(optics, fields, np.append(wavelengths, reference))
         lateral = lateral_colour(optics, fields, wavelengths, reference)
         out = replace(out, lateral=lateral, axial=both[:, :-1], axial_reference=both[:, -1])
     if not sharp:

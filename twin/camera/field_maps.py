@@ -8,9 +8,8 @@ import numpy as np
 
 from analysis.orientation.distortion_model import principal_distance, principal_distance_and_point
 from analysis.short_repr import shows
-from optics.numerics.backend import Backend
 from optics.waves.transfer import polychromatic_transfer
-from scenes.models.camera_sharpness import FieldBeams, FocalPlane
+from scenes.models.camera_sharpness import FocalPlane
 from twin.camera.camera_optics import CameraOptics, rim, solid_angle
 from twin.camera.camera_results import Field
 
@@ -209,13 +208,11 @@ class ThroughFocus:
     best: float
 
 
-def through_focus(optics: CameraOptics, backend: Backend, fields: tuple[Field, ...], sharp: bool) -> ThroughFocus:
+def through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool) -> ThroughFocus:
     """Move the detector through focus."""
     spec = optics.model.spec
     f_number = optics.spot().airy / (1.22 * spec.wavelength)
-    if optics.state or optics.built:
-        return _moved_through_focus(optics, fields, sharp, FOCUS_DEPTHS * 2.0 * spec.wavelength * f_number**2)
-    beams = FieldBeams.trace(optics.model, backend, fields, 6, optics.cut)
+    beams = optics.beams(fields, 6)
     own, best = FocalPlane.of(spec), beams.best_plane()
     downstream = float(np.sign(np.mean(beams.direction[..., 2])))
     away = downstream * (best.z - own.z)
@@ -237,15 +234,3 @@ def _mtf_through_focus(optics: CameraOptics, fields: tuple[Field, ...], defocus:
             values = polychromatic_transfer(pupil, optics.nyquist * np.eye(2), wavelength, np.ones(1), defocus)
             mtf[k] = np.abs(values).T
     return mtf
-
-
-def _moved_through_focus(optics: CameraOptics, fields: tuple[Field, ...], sharp: bool, reach: float) -> ThroughFocus:
-    """Through focus of a camera that stands apart from its prescription: its line CCD moves in its state."""
-    # the mean square error is a parabola of the defocus, so that three places tell its lowest
-    three = reach * np.array([-1.0, 0.0, 1.0])
-    a, b, _ = np.polyfit(three, np.mean(optics.errors(fields, three) ** 2, axis=0), 2)
-    best = float(-0.5 * b / a) if a > 0.0 else np.nan
-    defocus = np.linspace(-1.0, 1.0, FOCUS_STEPS) * (max(reach, 1.3 * abs(best)) if np.isfinite(best) else reach)
-    return ThroughFocus(
-        fields, defocus, optics.errors(fields, defocus), _mtf_through_focus(optics, fields, defocus, sharp), best
-    )

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from analysis.short_repr import shows
-from optics.geometry.aperture import Aperture, Circle, Rectangle
+from optics.geometry.aperture import Aperture, Circle, Ellipse, Rectangle
 from optics.numerics import quadrature
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
@@ -27,7 +27,8 @@ EARLIER = 6.0
 """How far before its launch point light is looked at for what stands in it, metres."""
 
 _FIELDS = tuple((x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0))
-_RINGS = 6
+_RAYS = 1000
+"""Evenly over the stop, by which shares of a beam are told: to some 0.2 %."""
 
 
 @shows()
@@ -69,7 +70,7 @@ def ray_paths(
 
 def obstacles(model: CameraModel) -> dict[str, Aperture]:
     """What of a camera may stand in its own light, in each body's own x and y: mirrors and lenses with their edges, and
-    the line CCDs with as much of an edge.
+    the line CCDs with as much of an edge. A mirror about its own axis is round, as mirrors are made.
     """
     spec, margin = model.spec, model.spec.edge_margin
     out: dict[str, Aperture] = {}
@@ -77,7 +78,7 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
         if spec.mirrors[name].light == "passes":
             continue  # a stop's plate stands where its hole is not
         # the other mirrors' clear apertures have the margin already
-        out[name] = _body(model, name, Circle(edge.radius + margin) if isinstance(edge, Circle) else edge)
+        out[name] = _body(model, name, Circle(edge.radius + margin) if isinstance(edge, Circle) else _made(edge))
     lines = [(spec.line.pixels * spec.line.pitch, 0.0)]
     lines += [(band.pixels * band.pitch, band.offset) for band in spec.bands.values()]
     half = 0.5 * max(length for length, _ in lines) + margin
@@ -86,6 +87,17 @@ def obstacles(model: CameraModel) -> dict[str, Aperture]:
     centre = model.image_body.inverse().apply(model.focal_plane.translation)
     out[IMAGE] = Rectangle(half, 0.5 * (high - low), (float(centre[0]), float(centre[1] + 0.5 * (high + low))))
     return out
+
+
+def _made(edge: Aperture) -> Aperture:
+    """The outline of a mirror with a clear aperture: an ellipse where its vertex is well within that."""
+    if not isinstance(edge, Rectangle) or np.hypot(*edge.centre) > _ABOUT_AXIS * min(edge.half_x, edge.half_y):
+        return edge
+    return Ellipse(edge.half_x, edge.half_y, edge.centre)
+
+
+_ABOUT_AXIS = 0.5
+"""Distance of a clear aperture's middle from the vertex, of its half-width, up to which the mirror is round."""
 
 
 def _body(model: CameraModel, name: str, edge: Aperture) -> Aperture:
@@ -121,7 +133,7 @@ def obscuration(model: CameraModel, backend: Backend) -> InTheWay:
     A mirror through whose middle light goes, and whose middle reflects none, has a hole there, whether its file states
     one or not: the first mirror of a telescope about its axis, whose second one shadows that place.
     """
-    nodes = quadrature.disk(_RINGS)
+    nodes = quadrature.even_disk(_RAYS)
     paths = ray_paths(model, backend, _FIELDS, np.stack([nodes.x, nodes.y], axis=-1), EARLIER)
     edges, bare = obstacles(model), model.bare_assembly(apertures=False)
     blocked: dict[str, np.ndarray] = {}
@@ -149,7 +161,7 @@ LEAST_SHARE = 0.005
 
 def unstated_shadows(model: CameraModel, in_the_way: InTheWay) -> str:
     """What of a camera stands in its beam while its file states no shadow at all, and what that means; empty if nothing
-    does. A file that states one is taken at its word: the outlines of bodies are squares about their clear apertures.
+    does. A file that states one is taken at its word: the outlines of bodies are those of their clear apertures.
     """
     if any(edge.blocks for edges in model.edges.values() for edge in edges):
         return ""
@@ -161,6 +173,10 @@ def unstated_shadows(model: CameraModel, in_the_way: InTheWay) -> str:
         "those of a pupil without that shadow; a plane before them with `light: passes` and `edges: [{blocks: circle, "
         "radius: ...}]` states it"
     )
+
+
+_SLIVER = 0.01
+"""Share of a mirror's light that its hole may take: along the rim of a shadow that turns with the field."""
 
 
 def _holes(
@@ -184,7 +200,7 @@ def _holes(
         used = bare.nominal_pose(body).inverse().apply(paths.points[1 + paths.names.index(body)])[left]
         if met.size and used.size:
             radius = float(np.max(np.hypot(met[:, 0], met[:, 1])))
-            if radius < float(np.min(np.hypot(used[:, 0], used[:, 1]))):
+            if float(np.mean(np.hypot(used[:, 0], used[:, 1]) < radius)) < _SLIVER:
                 out[body] = radius
     return out
 

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from analysis.short_repr import shows
-from optics.geometry import zernike
 from optics.geometry.aperture import Circle
 from optics.geometry.polygon import covered
 from optics.geometry.tree import State
@@ -35,11 +34,12 @@ from optics.raytrace.assembly import points_to_world
 from optics.raytrace.line_of_sight import chief_rays
 from optics.raytrace.system import SystemBatch, assemble
 from optics.raytrace.trace import BeamMissedError
+from optics.waves.edge_shadow import StopOutlines
 from optics.waves.imaging import ImagingRays, imaging_rays
+from optics.waves.line_transfer import LINE_SIDES, cut_pupils, line_transfers
 from optics.waves.pupil_edge import WORST_BEND
-from optics.waves.pupil_shadow import FEW_SIDES, RIM_SIDES, SMALLEST
-from optics.waves.pupil_stack import CUT_DEGREES, CUT_RESIDUAL, CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
-from optics.waves.pupil_terms import products, smooth_terms, to_terms
+from optics.waves.pupil_shadow import FEW_SIDES, SMALLEST
+from optics.waves.pupil_stack import CUT_RINGS, DEGREE, WORST_RESIDUAL, PupilStack
 from optics.waves.wavefront import eikonal, path_to_sphere
 from scenes.models import shadow
 from scenes.models.camera_model import LAUNCH_DISTANCE, coloured, lenses, line_body
@@ -48,6 +48,7 @@ from scenes.specs.camera import CameraSpec
 from scenes.specs.instrument import BASE
 from scenes.specs.resolved import target_band
 from scenes.specs.spectrum import SpectrumSpec
+from twin.monitor.pupil_mean import PupilMean
 from twin.run.quantity import Quantity, Record
 from twin.sensors.line_ccd import band_factors
 
@@ -65,9 +66,6 @@ RINGS = 7
 
 MOST_BLUR = 10.0
 """Wavefront error beyond which a pupil that edges cut gets no MTF, waves rms."""
-
-CUT_MEAN_DEGREE = 14
-"""Degree of the polynomials that continue the wavefront of a beam that edges of surfaces cut."""
 
 _DARKEST = 0.99
 """Share of the light that bodies may take: of less no image is told."""
@@ -292,12 +290,14 @@ class _Traced:
         rays: at the design wavelength.
         size: of the line CCD in each, (B,).
         shadows: in them; None for free beams.
+        outlines: of edges and bodies on their stops; None for a camera whose surfaces have no edges.
         again: the same beams in light of another wavelength, metres.
     """
 
     rays: ImagingRays
     size: np.ndarray
     shadows: shadow.Shadows | None
+    outlines: StopOutlines | None
     again: Callable[[float], ImagingRays]
 
 
@@ -340,10 +340,7 @@ class _CameraBench:
         assert isinstance(stop, Circle)
         self.stop = stop
         self.refracts = len(self.colours) > 1 and bool(lenses(spec))
-        self.sides = RIM_SIDES if self.model.edges else FEW_SIDES
-        self.degrees = CUT_DEGREES if self.model.edges else (DEGREE,)
         self.nodes = quadrature.disk(CUT_RINGS if self.model.edges else RINGS)
-        self.tilts = zernike.basis(3, self.nodes.x, self.nodes.y)
         self.assembly = instrument.assembly
 
     def fill(self, states: list[State], which: np.ndarray, out: np.ndarray, reasons: list[str]) -> None:
@@ -418,11 +415,13 @@ class _CameraBench:
         imaging, rays = sent(self.model.spec.wavelength)
         beams = shadow.TracedBeams(assembly, placed, every, imaging, rays, heading, self.nodes)
         shadows = None if self.shadows is None else self.shadows.cast(beams)
+        outlines = None
         if self.model.edges:
             free = shadow.no_shadows(len(every)) if shadows is None else shadows
             seen = shadow.SeenEdges.of(beams, self.model, self.name, self.backend)
+            outlines = seen.outlines(LINE_SIDES) + StopOutlines((), tuple(np.moveaxis(free.pieces, 1, 0)))
             shadows = free.and_edges(seen.outlines, f"edges of {name}")
-        return _Traced(rays, imaging.size, shadows, lambda colour: sent(colour)[1])
+        return _Traced(rays, imaging.size, shadows, outlines, lambda colour: sent(colour)[1])
 
     def _numbers(self, traced: _Traced, which: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Values (V, B) of _COLUMNS, the share of each beam that is cut, and whether an MTF is not to be had."""
@@ -433,7 +432,7 @@ class _CameraBench:
         free = None
         if self.model.edges and shadows is not None:
             free = ~covered(shadows.pieces, np.stack([self.nodes.x, self.nodes.y], axis=-1), SMALLEST)
-        mean = _Mean(self, None if shadows is None or not shadows.owners else shadows, free)
+        mean = PupilMean(self.nodes, None if shadows is None or not shadows.owners else shadows, free)
         error = -mean.flat(error)
         focus = mean.flat(np.abs(rays.direction[..., 2]))
         defocus = mean(error * focus) / mean(focus**2)
@@ -447,20 +446,22 @@ class _CameraBench:
         if len(lit):
             taken = None if pieces is None else pieces[lit]
             free = None if free is None else free[lit]
-            pupils, smooth = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
+            pupils, smooth, cosines = self._pupils(rays, size, origin, lit, taken, free, float(np.min(self.colours)))
             lost[lit] = 1.0 - pupils.light
             if self.model.edges:
                 # as many nodes as such a phase takes would be minutes, for a contrast that is next to nothing
                 smooth &= wfe[lit] * self.wavelength <= MOST_BLUR * float(np.min(self.colours))
             good = np.flatnonzero(smooth & (pupils.bend <= WORST_BEND) & (pupils.light >= 1.0 - _DARKEST))
             if len(good):
+                outlines = None if traced.outlines is None else traced.outlines.take(lit[good])
+                dark_in, lit_in = (None if one is None else one[good] for one in (taken, free))
                 if self.refracts:
-                    otf, smooth = self._in_colours(traced, origin, lit, taken, free)
-                    good = good[smooth[good]]
-                    otf = otf[good]
+                    otf, known = self._in_colours(traced, origin, lit[good], dark_in, lit_in, outlines)
                 else:
-                    smooth_ones = pupils if len(good) == len(lit) else pupils.take(good)
-                    otf = smooth_ones.transfer(self.frequency, self.colours, self.weights)
+                    own = pupils if len(good) == len(lit) else pupils.take(good)
+                    seen = tuple(part[good] for part in cosines)
+                    otf, known = self._transfer(own, seen, lit_in, outlines, self.colours, self.weights)
+                good, otf = good[known], otf[known]
                 hold_within(f"an MTF of the optics of camera {self.name}", np.abs(otf), 0.0, 1.0, _MTF_ROUNDING)
                 mtf[:, lit[good]] = (np.abs(otf) * self.detector).T
             self._note(pupils, lit, which)
@@ -479,33 +480,67 @@ class _CameraBench:
         taken: np.ndarray | None,
         free: np.ndarray | None,
         colour: float,
-    ) -> tuple[PupilStack, np.ndarray]:
-        """Pupils of the beams ``lit``, and which of them are smooth for light of a wavelength, metres."""
+    ) -> tuple[PupilStack, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+        """Pupils of the beams ``lit``, which of them are smooth for light of a wavelength, metres, and the direction
+        cosines of their rays, (B, N) each.
+        """
         # the image's first axis runs along the line, Y', the second along the track, X'
         # per length of the nominal CCD, in which the pixels keep their pitch
         v, u = np.moveaxis(size[lit, None, None] * rays.direction[lit, :, :2], -1, 0)
         path = eikonal(rays.position[lit], rays.direction[lit], rays.path[lit], origin[lit])
-        for degree in self.degrees:
-            pupils = PupilStack.fit(
-                u, v, path - path[:, :1], rays.amplitude[lit], self.nodes, degree, taken, self.sides, free
-            )
-            if np.all(pupils.residual <= CUT_RESIDUAL * colour):
-                break
-        return pupils, pupils.residual <= WORST_RESIDUAL * colour
+        traced = u, v, path - path[:, :1], rays.amplitude[lit], self.nodes
+        if free is None:
+            pupils = PupilStack.fit(*traced, DEGREE, taken, FEW_SIDES)
+        else:
+            pupils = PupilStack.followed(*traced, colour, taken, free)
+        return pupils, pupils.residual <= WORST_RESIDUAL * colour, (u, v)
 
     def _in_colours(
-        self, traced: _Traced, origin: np.ndarray, lit: np.ndarray, taken: np.ndarray | None, free: np.ndarray | None
+        self,
+        traced: _Traced,
+        origin: np.ndarray,
+        lit: np.ndarray,
+        taken: np.ndarray | None,
+        free: np.ndarray | None,
+        outlines: StopOutlines | None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Transfer functions of beams through lenses, complex (B, M): each wavelength by its own rays, all about one
-        place, so that lateral colour blurs; and which are smooth at all wavelengths.
+        """``_transfer`` of beams ``lit`` through lenses: each wavelength by its own rays, all about one place, so that
+        lateral colour blurs.
         """
-        total, smooth = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
+        total, known = np.zeros((len(lit), len(self.frequency)), complex), np.ones(len(lit), bool)
         for colour, weight in zip(self.colours, self.weights / np.sum(self.weights), strict=True):
             rays = traced.again(float(colour))
-            pupils, good = self._pupils(rays, traced.size, origin, lit, taken, free, float(colour))
-            smooth &= good & (pupils.bend <= WORST_BEND)
-            total += weight * pupils.transfer(self.frequency, np.array([colour]), np.ones(1))
-        return total, smooth
+            pupils, good, cosines = self._pupils(rays, traced.size, origin, lit, taken, free, float(colour))
+            otf, told = self._transfer(pupils, cosines, free, outlines, np.array([colour]), np.ones(1))
+            known &= good & told & (pupils.bend <= WORST_BEND)
+            total += weight * otf
+        return total, known
+
+    def _transfer(
+        self,
+        pupils: PupilStack,
+        cosines: tuple[np.ndarray, ...],
+        free: np.ndarray | None,
+        outlines: StopOutlines | None,
+        colours: np.ndarray,
+        weights: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Transfer functions, complex (B, M), and which of them are known, (B,): of pupils that edges cut by lines."""
+        known = np.ones(len(pupils.centre), bool)
+        if outlines is None or free is None:
+            return pupils.transfer(self.frequency, colours, weights), known
+        total, shares = np.zeros((len(known), len(self.frequency)), complex), weights / np.sum(weights)
+        for k, pupil in enumerate(pupils.functions()):
+            one = slice(k, k + 1)
+            u, v = (part[one] for part in cosines)
+            try:
+                cut = cut_pupils([pupil], u, v, self.nodes, outlines.take(one), free[one])
+                for colour, share in zip(colours, shares, strict=True):
+                    (ways,) = line_transfers(cut, [float(colour)], np.eye(2), self.nyquist, 2)
+                    total[k] += share * np.array([way.values[1] for way in ways])
+            except UnphysicalError:
+                known[k] = False
+        return total, known
 
     def _hold(self, values: np.ndarray, dark: np.ndarray, shadows: shadow.Shadows | None) -> None:
         """Hold numbers (V, B) of _COLUMNS to what any camera has.
@@ -550,51 +585,3 @@ class _CameraBench:
         for k, s in enumerate(which):
             own = [where.get(b) for b in range(k * count, (k + 1) * count)]
             self.pupils[int(s)] = tuple(PupilOutline(axes[b], pieces[b]) for b in own if b is not None)
-
-
-class _Mean:
-    """Mean over the free part of each stop, of values at the bench's nodes.
-
-    Polynomials continue the values into the shadows, where they are taken off. They stand for the rays in the dark of
-    edges, too, which may pass the rims of lenses far outside.
-    """
-
-    def __init__(self, bench: _CameraBench, shadows: shadow.Shadows | None, free: np.ndarray | None = None) -> None:
-        self._free, self._nodes = free, bench.nodes
-        self._share, self._tilts = bench.nodes.share[None], bench.tilts[None]
-        self._added: np.ndarray | None = None
-        if shadows is None:
-            return
-        points, weight = shadows.points, shadows.weights
-        count = len(points)
-        all_weights = np.concatenate([np.broadcast_to(bench.nodes.weight, (count, bench.nodes.count)), -weight], axis=1)
-        self._share = all_weights / np.maximum(np.sum(all_weights, axis=1, keepdims=True), _SOME)
-        own = zernike.basis(3, points.real.ravel(), points.imag.ravel()).reshape(*points.shape, 3)
-        self._tilts = np.concatenate([np.broadcast_to(bench.tilts, (count, *bench.tilts.shape)), own], axis=1)
-        degree = DEGREE if free is None else CUT_MEAN_DEGREE
-        self._to_terms = to_terms(bench.nodes, degree)
-        self._on_stop = products(bench.nodes.x, bench.nodes.y, degree)
-        self._added = products(points.real, points.imag, degree)
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        """Mean (B,) of values as ``flat`` gives them."""
-        return np.asarray(np.sum(values * self._share, axis=-1))
-
-    def flat(self, values: np.ndarray) -> np.ndarray:
-        """Values (B, N) less piston and tilt, (B, N + Q): also at nodes in the shadows."""
-        values = values - values[:, :1]
-        if self._added is not None:
-            if self._free is None:
-                terms = values @ self._to_terms.T
-            else:
-                terms = smooth_terms(self._on_stop, self._nodes.weight, self._free, values[..., None])[..., 0]
-                values = np.where(self._free, values, terms @ self._on_stop.T)
-            values = np.concatenate([values, np.squeeze(self._added @ terms[..., None], -1)], axis=1)
-        weighted = self._tilts * self._share[..., None]
-        turned = np.swapaxes(weighted, 1, 2)
-        level = np.linalg.solve(turned @ self._tilts, turned @ values[..., None])
-        return np.asarray(values - np.squeeze(self._tilts @ level, -1))
-
-
-_SOME = 1e-3
-"""Smallest lit area of a stop, in units of its radius squared, for which a mean is defined."""

@@ -29,9 +29,9 @@ from optics.targets.collimator import Collimator
 from optics.waves.diffraction import PupilField
 from optics.waves.edge_shadow import StopOutlines, settled_shadows
 from optics.waves.imaging import ImagingRays, aim_collimated, imaging_rays, pupil_field
-from optics.waves.line_transfer import CutPupil, cut_pupils, lit_at
+from optics.waves.line_transfer import LINE_SIDES, CutPupil, cut_pupils, lit_at
 from optics.waves.pupil_shadow import SMALLEST
-from optics.waves.pupil_stack import CUT_RINGS, DEGREE, PupilFunction, fit_pupils
+from optics.waves.pupil_stack import CUT_RESIDUAL, CUT_RINGS, DEGREE, PupilFunction, fit_pupils
 from optics.waves.transfer import with_nodes_enough
 from scenes.models.camera_model import LAUNCH_DISTANCE, CameraModel, coloured, line_body
 from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
@@ -39,8 +39,8 @@ from scenes.models.shadow import ImagingShadows, SeenEdges, TracedBeams
 RINGS = 14
 """Rings of the pupil's quadrature: exact for wavefronts to order 55, far beyond what mirrors and figures make."""
 
-LINE_SIDES = 192
-"""Of the polygon that stands for a round edge, has its area and is within 1e-4 of its radius of it, to both sides."""
+MORE_RINGS = 28
+"""Of the quadrature of a pupil that edges leave a wavefront which polynomials through fewer rays do not follow."""
 
 SMOOTH = 1e-6
 """Rms eikonal that the polynomials of a wavefront leave which is smooth, wavelengths."""
@@ -295,14 +295,16 @@ class TargetPath:
     ) -> tuple[CutPupil, ...]:
         """Pupils of a camera with edges for ``optics.waves.line_transfer``; arguments and exceptions as ``pupils``.
 
-        A smooth wavefront needs no more nodes than a free pupil's; any other is traced at those of ``nodes``.
+        A smooth wavefront needs no more nodes than a free pupil's; any other is traced at those of ``nodes``, and at
+        more where polynomials through these do not follow it.
         """
         colour = self.model.spec.wavelength if wavelength is None else wavelength
-        with suppress(UnphysicalError):
-            few = self._cut_pupils(state, directions, places, colour, quadrature.disk(RINGS))
-            if all(one.pupil.eikonal_residual <= SMOOTH * colour for one in few):
-                return few
-        return self._cut_pupils(state, directions, places, colour, self.nodes)
+        for nodes, rest in ((quadrature.disk(RINGS), SMOOTH), (self.nodes, CUT_RESIDUAL)):
+            with suppress(UnphysicalError):
+                cut = self._cut_pupils(state, directions, places, colour, nodes)
+                if all(one.pupil.eikonal_residual <= rest * colour for one in cut):
+                    return cut
+        return self._cut_pupils(state, directions, places, colour, quadrature.disk(MORE_RINGS))
 
     def _cut_pupils(
         self, state: State, directions: np.ndarray, places: np.ndarray, colour: float, nodes: PupilNodes
