@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from analysis.units import ARCSEC
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
+from scenes.specs.load import is_path
 from scenes.specs.tolerance import MERIT_UNITS, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import LENGTH
@@ -323,10 +325,17 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
         amounts = np.concatenate([samples.x[s] * bench.sizes, moves])[None]
         state = states_of((*bench.numbers, *bench.compensators), amounts)[0]
         perturb = {path: _perturb(motion) for path, motion in state.items()}
-        data = {"instrument": setup.test.instrument, "perturb": {path: what for path, what in perturb.items() if what}}
+        data = {"instrument": _reference(setup), "perturb": {path: what for path, what in perturb.items() if what}}
         number = f"worst_{rank + 1:02d}"
         out[number] = _job_text(data, int(s), setup)
     return out
+
+
+def _reference(setup: ToleranceSetup) -> str:
+    """The instrument as a job in another folder names it: by name, or by its whole path."""
+    named = setup.test.instrument
+    place = (Path(setup.test.source.file).parent / named).resolve()
+    return str(place) if is_path(named) and place.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
