@@ -264,6 +264,7 @@ def test_the_worst_camera_is_said_as_a_job_with_its_abbe_numbers(
     assert job.perturb[body].abbe is not None
 
 
+@pytest.mark.second
 def test_a_run_tells_its_light(backend: Backend, tmp_path: Path) -> None:
     told = TOLERANCE(run_tolerance(budget(tmp_path), backend))
     assert told["wavelengths_nm"] == pytest.approx([486.1327, 587.5618, 656.2725])
