@@ -1,17 +1,22 @@
-"""Tolerances: ten thousand cameras with nine fields and three compensators, every one traced exactly and adjusted."""
+"""Tolerances: ten thousand cameras with nine fields and three compensators, every one traced exactly and adjusted; and
+cameras of a telescope with a refocus beside optiland's tolerancing of it, in turns.
+"""
 
 from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from scenes.specs.tolerance import resolve_tolerance
 from scenes.yaml.yaml_file import dump_yaml
 from tests.benchmarks.number import Limit, Number, Speed
-from tests.benchmarks.workbench import Workbench
+from tests.benchmarks.stopwatch import Work, in_turns
+from tests.benchmarks.workbench import Workbench, absent, installed
 from twin.run.memory import largest_memory
 from twin.tolerance.merit_models import sensitivities
 from twin.tolerance.samples import Workforce, draw_samples
@@ -20,6 +25,11 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 CAMERAS, QUICK_CAMERAS = 10_000, 400
 SECONDS = 60.0
 MEMORY_MB = 1500.0
+PEERS = ("batoid", "optiland")
+"""What the comparison needs: optiland, and batoid for the rays that it is given."""
+REFOCUSED, THEIRS, ROUNDS = 1200, 40, 3
+LEAST_RATIO, LEAST_OWN_RATIO = 15.0, 250.0
+"""How many times the twin's processor time of a camera optiland's has to be: a third of what is measured."""
 MOTIONS = ("shift x", "shift y", "shift z", "rotate x", "rotate y", "radius")
 LIMITS = {"shift": "10 um", "rotate": "5 arcsec", "radius": "20 ppm"}
 BUDGET = {
@@ -42,6 +52,44 @@ BUDGET = {
 }
 
 
+def beside_optiland(bench: Workbench, quick: bool) -> tuple[Number, ...]:
+    """How many times the twin's processor time of a camera optiland's is: where one operand traces the rays of all
+    fields at once, and where each field is an operand of optiland's own wavefront.
+    """
+    from tests.oracles.tolerance_optiland import BUDGET as TWENTY
+    from tests.oracles.tolerance_optiland import Peer, twin_budget
+
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # numba's remarks on optiland's code
+        camera = ToleranceBench(twin_budget(Path(name)), bench.backend)
+        peer = Peer(camera.optics.model, camera.fields)
+        peer.register()
+        drawn = np.random.default_rng(1).uniform(-1.0, 1.0, (REFOCUSED, len(camera.numbers))) * camera.sizes
+        untilted = [key for key in TWENTY if "tilt" not in key]  # optiland's pupil is paraxial
+        counts = {"twin": REFOCUSED, "optiland": THEIRS, "optiland_own_wavefronts": 2}
+
+        def twin(_: Any) -> Any:
+            return camera.try_out(drawn)
+
+        works = {
+            "twin": Work(twin),
+            "optiland": Work(lambda _: peer.drawn(peer.tolerancing(), list(TWENTY), THEIRS)),
+            "optiland_own_wavefronts": Work(lambda _: peer.drawn(peer.tolerancing(own=True), untilted, 2)),
+        }
+        twin(None)
+        spent = in_turns(works, 1 if quick else ROUNDS)
+    each = {key: 1e3 * one.cpu_s / counts[key] for key, one in spent.items()}
+    limits = dict(zip(("optiland", "optiland_own_wavefronts"), (LEAST_RATIO, LEAST_OWN_RATIO), strict=True))
+    words = {"optiland": "one operand of all fields", "optiland_own_wavefronts": "its own wavefronts"}
+    out = [Number("refocused_ms", each["twin"], "processor time of a camera of three mirrors, refocused", "ms")]
+    for key, least in limits.items():
+        limit = None if quick else Limit(least, least=True)
+        out.append(
+            Number(f"times_{key}", each[key] / each["twin"], f"  times as much in optiland, {words[key]}", "", limit)
+        )
+    return tuple(out)
+
+
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Seconds from the start of two workers to the last camera; processor time of a camera; of all derivatives."""
     count = QUICK_CAMERAS if quick else CAMERAS
@@ -60,6 +108,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
     assert not any(drawn.problems)
     assert np.all(np.isfinite(drawn.values))
     limit = None if quick else Limit(SECONDS)
+    missing = [peer for peer in PEERS if not installed(peer)]
     each = 1e3 * drawn.seconds / count
     return Speed(
         (
@@ -69,5 +118,7 @@ def measure(bench: Workbench, quick: bool) -> Speed:
             Number("camera_ms", each, "  processor time of a camera", "ms"),
             Number("derivatives_ms", 1e3 * derived, f"  first and second derivatives by {len(camera.numbers)}", "ms"),
             Number("memory_mb", 1e-6 * largest_memory(), "  memory of this process", "MB", Limit(MEMORY_MB)),
-        )
+            *(() if missing else beside_optiland(bench, quick)),
+        ),
+        tuple(absent(peer) for peer in missing),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
+from scenes.specs.load import is_path
 from scenes.specs.tolerance import MERIT_UNITS, AllocationSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
 from scenes.yaml.units import LENGTH
@@ -380,7 +382,7 @@ def worst_jobs(setup: ToleranceSetup, bench: ToleranceBench, samples: Samples) -
     for rank, (s, state) in enumerate(zip(worst, _states(bench, samples, worst), strict=True)):
         perturb = {path: _perturb(motion) for path, motion in state.items()}
         data: dict[str, Any] = {
-            "instrument": setup.test.instrument,
+            "instrument": _reference(setup),
             "perturb": {path: what for path, what in perturb.items() if what},
         }
         data |= {key: _short(value) for key, value in setup.test.plain().items() if key == "disturbances"}
@@ -393,6 +395,13 @@ def _short(disturbances: dict[str, Any]) -> Any:
     """Disturbances as a file says them: by the name alone where nothing of the file is changed."""
     said = {key: value for key, value in disturbances.items() if value}
     return said["file"] if said.keys() == {"file"} else said
+
+
+def _reference(setup: ToleranceSetup) -> str:
+    """The instrument as a job in another folder names it: by name, or by its whole path."""
+    named = setup.test.instrument
+    place = (Path(setup.test.source.file).parent / named).resolve()
+    return str(place) if is_path(named) and place.is_file() else named
 
 
 def _perturb(motion: Any) -> dict[str, Any]:
