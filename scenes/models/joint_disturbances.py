@@ -16,6 +16,8 @@ from scenes.yaml.yaml_file import YamlFile
 
 ABOUT = ("shift", "rotate", "scale")
 """Kinds of components that have a pivot."""
+DIGITS = 12
+"""After the point of a correlation: less says nothing, and eigenvalues stay within ``INDEFINITE``."""
 FEW = 12
 """Components up to which a file holds the matrix of their correlations itself."""
 
@@ -53,11 +55,11 @@ def joint_disturbances(
     if np.min(np.diagonal(covariance), initial=0.0) < 0.0:
         raise ValueError("a variance is negative")
     sigma = np.sqrt(np.diagonal(covariance))
-    own = np.flatnonzero(sigma > 0.0)
-    correlation = covariance[np.ix_(own, own)] / sigma[own, None] / sigma[own]
+    own = np.flatnonzero(sigma > 0.0).tolist()
+    correlation = covariance[np.ix_(own, own)] / np.outer(sigma[own], sigma[own])
     if np.max(np.abs(correlation - correlation.T), initial=0.0) > -INDEFINITE:
         raise ValueError("a covariance is symmetric")
-    correlation = np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0)
+    correlation = np.round(np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0), DIGITS)
     np.fill_diagonal(correlation, 1.0)
     if len(own) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
         raise ValueError("a covariance has no negative eigenvalue")

@@ -43,7 +43,7 @@ class CameraUnderTestSpec(Spec):
     """The camera under test, alone in front of the collimator.
 
     Attributes:
-        camera: prescription, by name or path.
+        camera: prescription, or an instrument as built to one, by name or path.
         as_built: how it departs from the prescription: ``M1``, ``M2`` ... or ``focal_plane`` -> perturbation, as in a
             job; figures of mirrors for the most part.
     """

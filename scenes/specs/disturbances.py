@@ -159,8 +159,10 @@ class CorrelationSpec(Spec):
 
 JOINT = "joint"
 """Key of components that go together, and what their cause is called."""
-MOST_JOINT_BYTES = 64 << 20
-"""Of a table of correlations: some two thousand components."""
+MOST_JOINT = 200
+"""Components that go together: a config.yaml holds the matrix of their correlations."""
+MOST_JOINT_BYTES = 4 << 20
+"""Of a table of their correlations."""
 _AXES = ("x", "y", "z")
 
 
@@ -213,6 +215,8 @@ def _sigma_of(name: str, value: Any) -> float:
 def _components(value: Any) -> Any:
     if not isinstance(value, Mapping) or not value:
         raise Problem("no components", shown(value), '{"base/forward/M2 shift z": 3 um, ...}')
+    if len(value) > MOST_JOINT:
+        raise Problem("too many components", f"{len(value)} of them", f"at most {MOST_JOINT}, those that matter most")
     out: dict[str, float] = {}
     said: dict[tuple[str, str, str], str] = {}
     for name, sigma in value.items():

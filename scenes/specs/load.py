@@ -15,14 +15,15 @@ from scenes.specs.camera_tests import CameraUnderTestSpec
 from scenes.specs.detector import DetectorSpec
 from scenes.specs.disturbances import NONE, DisturbancesSpec
 from scenes.specs.error_budget import ErrorBudgetSpec
-from scenes.specs.instrument import InstrumentSpec
+from scenes.specs.instrument import BASE, InstrumentSpec
 from scenes.specs.job import JobSpec, with_tables
-from scenes.yaml.errors import InputError, KeyPath, Problem, names_text, nearest, shown, unknown
+from scenes.yaml.errors import InputError, Issue, KeyPath, Problem, names_text, nearest, shown, unknown
 from scenes.yaml.input_file import is_file, unusable
 from scenes.yaml.spec import Source, Spec, validate
 from scenes.yaml.yaml_file import YamlFile, read_yaml
 
 SpecType = TypeVar("SpecType", bound=Spec)
+TestType = TypeVar("TestType", bound=CameraUnderTestSpec)
 
 SCENES = Path(__file__).resolve().parent.parent
 LIBRARY = SCENES / "library"
@@ -206,7 +207,11 @@ def path_of_detector(instrument: InstrumentSpec) -> Path:
 
 def load_camera(name_or_path: str | Path) -> CameraSpec:
     """Read a camera; arguments and errors as `load_instrument`."""
-    return load_named(CameraSpec, CAMERAS, name_or_path).with_curves()
+    path, text = _read_named(CAMERAS, name_or_path)
+    if isinstance(text.data, dict) and DESIGN in text.data:
+        problem = "an instrument as built is no prescription of a camera"
+        raise InputError(Issue(problem, str(path), text.lines.get((DESIGN,)), (DESIGN,), None, "its design's camera"))
+    return validate(CameraSpec, text).with_curves()
 
 
 def load_detector(name_or_path: str | Path) -> DetectorSpec:
@@ -225,6 +230,36 @@ def load_autocollimator_test(name_or_path: str | Path = "principle_experiment") 
 def find_camera(test: CameraUnderTestSpec | CameraDesignSpec) -> Path:
     """The file of the camera under test, or that a design starts from. Raises InputError if there is none."""
     return find_named(CAMERAS, test.camera, test, ("camera",))
+
+
+def load_camera_under_test(test: TestType) -> tuple[TestType, CameraSpec]:
+    """The camera under test and the test; of a camera as built, with what was built in the test's `as_built`.
+
+    Args:
+        test: names the camera: a prescription, or an instrument as built that consists of one camera.
+
+    Raises:
+        InputError: as `load_instrument`; the instrument has several cameras, or both files say how a body was built.
+    """
+    path = find_camera(test)
+    data = read_yaml(path).data
+    if not (isinstance(data, dict) and DESIGN in data):
+        return test, load_camera(path)
+    instrument = load_instrument(path)
+    if len(instrument.cameras) > 1:
+        problem = f"one camera is tested, and {instrument.name} has {names_text(instrument.cameras)}"
+        raise test.error(problem, ("camera",), found=test.camera, allowed="an instrument as built to a camera's design")
+    (name, mounted), *_ = instrument.cameras.items()
+    built = dict(test.as_built)
+    for node, what in (instrument.as_built or {}).items():
+        # where the whole camera stands makes no difference before a collimator
+        if node in (f"{BASE}/{name}", name):
+            continue
+        own = node.removeprefix(f"{BASE}/").removeprefix(f"{name}/")
+        if own in built:
+            raise test.error(f"{path} says how this body was built", ("as_built", own), allowed="one of the two")
+        built[own] = what
+    return test.model_copy(update={"as_built": FrozenMap(built)}), load_cameras(instrument)[mounted.camera]
 
 
 def load_band_detectors(camera: CameraSpec) -> dict[str, DetectorSpec]:

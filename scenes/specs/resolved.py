@@ -279,7 +279,7 @@ def resolve_focus(path: str | Path) -> FocusSetup:
         _require_detectors(again, again.camera, again.detectors)
         return again
     test = load.load_named(FocusTestSpec, load.LAB, path)
-    camera = load.load_camera(load.find_camera(test))
+    test, camera = load.load_camera_under_test(test)
     _require_plane(test, camera)
     return FocusSetup.model_construct(test=test, camera=camera, detectors=FrozenMap(load.load_band_detectors(camera)))
 
@@ -295,7 +295,7 @@ def resolve_distortion(path: str | Path) -> DistortionSetup:
         _require_detectors(again, again.camera, again.detectors)
         return again
     test = load.load_named(DistortionTestSpec, load.LAB, path)
-    camera = load.load_camera(load.find_camera(test))
+    test, camera = load.load_camera_under_test(test)
     _require_bands(test, camera, test.band)
     turntable = load.load_named(
         TurntableTestSpec, load.LAB, load.find_named(load.LAB, test.turntable, test, ("turntable",))
