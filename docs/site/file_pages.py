@@ -15,6 +15,7 @@ READ_BY = {
     "job": "`python -m twin.render FILE`; in a script `twin.load(FILE)`; a study's base `render`",
     "measurement": "`python -m twin.recover FILE`",
     "instrument": 'jobs and tests, which name it: `instrument: gf7_pair`; in a script `twin.load("gf7_pair")`',
+    "as_built_instrument": "jobs and tests, which name it as their instrument: `instrument: as_built_pair.yaml`",
     "camera": "`python -m twin.camera FILE`; instruments, tests and designs, which name it: `camera: gf7`",
     "camera_design": "`python -m twin.design FILE`",
     "monitor_design": "`python -m twin.design monitor FILE`",
@@ -42,7 +43,7 @@ READ_BY = {
     "study": "`python -m twin.study FILE`",
 }
 """Sort of file -> what reads it."""
-ORDER = ("job", "instrument", "disturbances", "camera", "detector", "study", "camera_design")
+ORDER = ("job", "instrument", "as_built_instrument", "disturbances", "camera", "detector", "study", "camera_design")
 """Sorts that stand first in the list, what a new user meets first."""
 
 

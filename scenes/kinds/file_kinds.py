@@ -48,7 +48,13 @@ FILE_KINDS = (
         "an instrument's `cameras: {NAME: {camera: FILE}}`",
     ),
     FileKind("detector", DetectorSpec, "a detector's data sheet", place="`detector: FILE` of an area CCD or a band"),
-    FileKind("disturbances", DisturbancesSpec, "a list of disturbances", place="a job's `disturbances: FILE`"),
+    FileKind(
+        "disturbances",
+        DisturbancesSpec,
+        "a list of disturbances",
+        place="a job's `disturbances: FILE`",
+        one_of=("causes", "joint"),
+    ),
     FileKind("error_budget", ErrorBudgetSpec, "an error budget", place=_VALIDATED),
     FileKind("principle_experiment", AutocollimatorTestSpec, "a test of two autocollimators", place=_VALIDATED),
     *(

@@ -53,6 +53,7 @@ class FileKind:
         what: it is, with article, for messages.
         command: that reads it, as the user calls it; empty for what only other files name.
         place: where other files name it; empty for what only a command reads.
+        one_of: keys of which it has at least one.
     """
 
     name: str
@@ -60,6 +61,7 @@ class FileKind:
     what: str
     command: str = ""
     place: str = ""
+    one_of: tuple[str, ...] = ()
 
     @property
     def model(self) -> type[Spec]:
@@ -71,7 +73,8 @@ class FileKind:
         """How many of the keys are none of this kind's; None if one that it needs is missing."""
         fields = self.model.model_fields
         needed = {name for name, item in fields.items() if item.is_required()}
-        return len(keys - set(fields)) if needed <= keys else None
+        missing = not needed <= keys or (self.one_of and not keys & set(self.one_of))
+        return None if missing else len(keys - set(fields))
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ FOLDERS = {
     "examples/design_monitor": "monitor_design",
     "examples/design": "camera_design",
     "examples/tolerance": "tolerance",
+    "examples/as_built": "as_built_instrument",
     "examples/": "job",
     "lab/focus": "focus_test",
     "lab/distortion": "distortion_test",

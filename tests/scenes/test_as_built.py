@@ -1,0 +1,206 @@
+"""Files of instruments as built: what they say, what is refused with file, line and key, and how a state is written."""
+
+import re
+
+import numpy as np
+import pytest
+
+from optics.geometry.tree import Motion
+from scenes.kinds.file_kinds import kind_of
+from scenes.models.camera_model import build_camera_under_test
+from scenes.models.instrument_builder import build_instrument
+from scenes.specs.as_built import as_built_file
+from scenes.specs.load import INSTRUMENTS, LIBRARY, load_cameras, load_instrument
+from scenes.specs.resolved import resolve, resolve_camera, resolve_focus
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import parse_yaml
+
+HEAD = "name: own\ndesign: gf7_pair\nas_built:\n"
+
+
+def read(folder, text: str, name: str = "own.yaml"):
+    (folder / name).write_text(text)
+    return load_instrument(folder / name)
+
+
+def built(spec, backend):
+    return build_instrument(spec, load_cameras(spec), backend).as_built
+
+
+def test_a_file_that_says_how_another_instrument_was_built(backend, tmp_path) -> None:
+    text = HEAD + "  forward/M2: {shift: 0 0 3 um, pivot: centre}\n  base/central_prism: {rotate: 1 0 2 arcsec}\n"
+    spec = read(tmp_path, text + "description: mine\n")
+    design = load_instrument("gf7_pair")
+    assert (spec.name, spec.description, spec.disturbances) == ("own", "mine", "orbit")
+    assert spec.as_drawn.model_copy(update={"name": design.name, "description": design.description}) == design
+    state = built(spec, backend)
+    assert list(state) == ["base/forward/M2", "base/central_prism"]
+    assert state["base/forward/M2"] == Motion(shift=(0.0, 0.0, 3e-6), pivot="centre")
+
+
+def test_the_key_in_an_instruments_own_file_says_the_same(backend, tmp_path) -> None:
+    words = "[forward/M2 shift z 3 um, forward/M2 rotate x 2 arcsec about centre]"
+    own = (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text() + f"as_built: {words}\n"
+    other = (
+        "name: own\ndesign: gf7_pair\nas_built:\n  forward/M2: {shift: 0 0 3 um, rotate: 2 0 0 arcsec, pivot: centre}\n"
+    )
+    one, two = read(tmp_path, own), read(tmp_path, other)
+    assert one.as_built == two.as_built
+    assert built(one, backend) == built(two, backend)
+
+
+def test_paths_are_those_of_the_file_that_names_them(tmp_path) -> None:
+    """Of the camera from the design's folder, of the disturbances from the folder of the file as built."""
+    drawn, made = tmp_path / "drawn", tmp_path / "made"
+    drawn.mkdir()
+    made.mkdir()
+    text = (LIBRARY / "cameras" / "gf7.yaml").read_text()
+    (drawn / "my_camera.yaml").write_text(text)
+    (drawn / "pair.yaml").write_text(
+        (LIBRARY / INSTRUMENTS / "gf7_pair.yaml").read_text().replace("camera: gf7,", "camera: ./my_camera.yaml,")
+    )
+    (made / "known.yaml").write_text((LIBRARY / "disturbances" / "launch.yaml").read_text())
+    said = "name: own\ndesign: ../drawn/pair.yaml\nas_built: {}\ndisturbances: ./known.yaml\n"
+    (made / "own.yaml").write_text(said)
+    (tmp_path / "job.yaml").write_text("instrument: made/own.yaml\n")
+    found = resolve(tmp_path / "job.yaml")
+    assert found.disturbances.name == "launch"
+    assert list(found.cameras) == ["./my_camera.yaml"]
+
+
+def test_a_camera_is_a_design_as_well(backend, tmp_path) -> None:
+    for design in ("gf7", "{camera: gf7}"):
+        spec = read(tmp_path, f"name: own\ndesign: {design}\nas_built: [M2 shift z 3 um]\ndisturbances: assembled\n")
+        assert list(built(spec, backend)) == ["base/gf7/M2"]
+    setup = resolve_camera(tmp_path / "own.yaml")
+    assert (setup.mounted, setup.instrument.name) == ("gf7", "own")
+
+
+def test_a_camera_as_built_in_the_laboratory(backend, tmp_path) -> None:
+    """What its file says and what the test says of other bodies; one body is said once."""
+    lab = (LIBRARY.parent / "lab" / "focus.yaml").read_text().replace("camera: gf7\n", "camera: ./own.yaml\n")
+    (tmp_path / "focus.yaml").write_text(lab)
+    read(tmp_path, "name: own\ndesign: gf7\nas_built: [focal_plane shift z 30 um, gf7 rotate x 1 arcmin]\n")
+    setup = resolve_focus(tmp_path / "focus.yaml")
+    assert list(setup.test.as_built) == ["M1", "M2", "M3", "focal_plane"]
+    state = build_camera_under_test(setup.test, setup.camera, backend).as_built
+    assert state["camera/focal_plane"].shift == (0.0, 0.0, 30e-6)
+    read(tmp_path, "name: own\ndesign: gf7\nas_built: [base/gf7/M2 shift z 30 um]\n")
+    with pytest.raises(InputError, match=r"focus.yaml:\d+: as_built.M2: .*own.yaml says how this body was built"):
+        resolve_focus(tmp_path / "focus.yaml")
+    read(tmp_path, HEAD + "  forward/M2: {shift: 0 0 3 um}\n")
+    with pytest.raises(
+        InputError, match=r"focus.yaml:\d+: camera: one camera is tested, and own has forward, backward"
+    ):
+        resolve_focus(tmp_path / "focus.yaml")
+
+
+FAULTS = {
+    "no such node": ("  forward/M9: {shift: 0 0 3 um}", r"own.yaml:4: as_built.forward/M9: no such node", "forward/M2"),
+    "several nodes": (
+        "  M2: {shift: 0 0 3 um}",
+        r"own.yaml:4: as_built.M2: several nodes are called so",
+        "backward/M2",
+    ),
+    "twice": (
+        "  forward/M2: {shift: 0 0 3 um}\n  base/forward/M2: {shift: 0 0 3 um}",
+        r"own.yaml:5: as_built.base/forward/M2: this node is perturbed twice",
+        "once",
+    ),
+    "not of this node": (
+        "  forward/M2: {shift: 0 0 3 um}\n  forward/focal_plane:\n    figure: {Z5: 3 nm}",
+        r"own.yaml:6: as_built.base/forward/focal_plane.figure|own.yaml:6: as_built.forward/focal_plane.figure",
+        "rotate",
+    ),
+    "the base": ("  base: {shift: 0 0 3 um}", r"own.yaml:4: as_built.base.shift: this node does not allow shift", ""),
+    "pivot": (
+        "  forward/M2: {rotate: 1 0 0 arcsec, pivot: midle}",
+        r"as_built.forward/M2.pivot: .*no such pivot",
+        "centre",
+    ),
+    "temperature": ("  forward/M2: {temperature: 2 K}", r"own.yaml:4: as_built.forward/M2.temperature: ", "perturb"),
+    "no change of temperature": ("  forward/M2: {temperature: 0 K}", r"as_built.forward/M2.temperature: ", "perturb"),
+    "scale": ("  forward: {scale: 2 ppm}", r"own.yaml:4: as_built.forward.scale: ", "radius"),
+    "too far": ("  forward/M2: {shift: 0 0 300 mm}", r"own.yaml:4: as_built.forward/M2.shift", "100 mm"),
+    "too steep": ("  forward/M2: {rotate: 7 0 0 deg}", r"own.yaml:4: as_built.forward/M2.rotate", "5 deg"),
+    "no unit": ("  forward/M2: {shift: [0 um, 0 um, 3]}", r"own.yaml:4: as_built.forward/M2.shift", "um"),
+    "no such key": ("  forward/M2: {shft: 0 0 3 um}", r"own.yaml:4: as_built.forward/M2.shft: unknown key", "shift"),
+    "nothing there": ("  forward/M2: 3", r"own.yaml:4: as_built.forward/M2: not a mapping", "shift"),
+    "in each other": (
+        "  forward/monitor/left/prism_0: {shift: 0 0 90 mm}\n  forward/monitor/left/prism_180: {shift: 90 90 90 mm}",
+        r"own.yaml:4: as_built.forward/monitor/left/prism_0: as drawn there is room, and as built ",
+        "nearer to the drawing",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_what_cannot_be_built(backend, tmp_path, case) -> None:
+    text, message, remedy = FAULTS[case]
+    with pytest.raises(InputError) as caught:
+        built(read(tmp_path, HEAD + text + "\n"), backend)
+    told = str(caught.value)
+    assert re.search(message, told), told
+    assert remedy in told
+    assert told.count("\n") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("name: own\nas_built: {}\ndesign: gf7_pare\n", r"own.yaml:3: design: no such name .*did you mean 'gf7_pair'"),
+        ("name: own\nas_built: {}\ndesign: no/such.yaml\n", r"own.yaml:3: design: no such file"),
+        ("name: own\ndesign: ./own.yaml\n", r"own.yaml:2: design: this design is itself an instrument as built"),
+        ("name: own\ndesign: gf7_pair\ndisturbances: orbits\n", r"own.yaml:3: disturbances: no such name .*'orbit'"),
+        ("name: own\ndesign: gf7_pair\nmonitor: {}\n", r"own.yaml:3: monitor: unknown key"),
+        ("name: own\ndesign: 3\n", r"own.yaml:2: design: not text"),
+        ("design: gf7_pair\n", r"own.yaml: name: 'name' is missing|'name' is missing"),
+    ],
+)
+def test_what_no_file_may_say(tmp_path, text, message) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, text)
+
+
+def test_a_file_is_told_by_its_keys() -> None:
+    assert kind_of(parse_yaml(HEAD + "  M2: {shift: 0 0 3 um}\n").data).name == "as_built_instrument"
+    assert kind_of({"name": "a", "design": "b"}).name == "as_built_instrument"
+
+
+def random_state(rng: np.random.Generator) -> dict[str, Motion]:
+    """Motions of one to six bodies, within the limits of files, of sizes from 1e-12 on."""
+
+    def size(largest: float) -> float:
+        return float(rng.choice([-1.0, 1.0]) * largest * 10.0 ** rng.uniform(-9.0, 0.0))
+
+    paths = [
+        f"base/{camera}/{body}" for camera in ("forward", "backward") for body in ("M1", "M2", "M3", "focal_plane")
+    ]
+    out = {}
+    for path in rng.choice(paths, rng.integers(1, 7), replace=False).tolist():
+        mirror = "/M" in path
+        turn, move = (tuple(size(largest) for _ in range(3)) for largest in (0.05, 0.05))
+        out[path] = Motion(
+            turn,
+            move,
+            str(rng.choice(["origin", "centre" if mirror else "rear_node"])),
+            figure={int(j): size(1e-5) for j in rng.integers(4, 37, 3)} if mirror else {},
+            radius=size(0.05) if mirror and rng.random() < 0.5 else 0.0,
+            conic=size(0.5) if mirror and rng.random() < 0.5 else 0.0,
+        )
+    return out
+
+
+def test_a_written_state_is_read_back_to_the_last_bit(tmp_path) -> None:
+    rng = np.random.default_rng(35)
+    for _ in range(15):
+        state = random_state(rng)
+        spec = read(tmp_path, as_built_file("own", "gf7_pair", state, "launch", "made", "two lines\nof remarks"))
+        assert {path: what.motion() for path, what in spec.as_built.items()} == state
+        assert spec.disturbances == "launch"
+
+
+@pytest.mark.parametrize("motion", [Motion(scale=1e-6), Motion(stretch=1e-6), Motion(index_gradient=(1e-6, 0.0, 0.0))])
+def test_what_no_file_can_say_is_not_written(motion) -> None:
+    with pytest.raises(ValueError, match="base/forward: only rigid motions"):
+        as_built_file("own", "gf7_pair", {"base/forward": motion})
