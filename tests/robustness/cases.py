@@ -141,11 +141,36 @@ def _renders() -> Iterator[Case]:
         own = {"job.yaml": job_text, "own.yaml": text}
         yield Case(f"render-disturbances-{stem}", "disturbances", render, (), own, "own.yaml", **quick, whole=50)
     yield Case("render-disturbances-job", "job with disturbances", render, (), own, "job.yaml", **quick)
+    own = {"job.yaml": AS_BUILT, "own.yaml": text_of("examples/as_built_pair.yaml")}
+    yield Case("render-as-built", "instrument as built", render, (), own, "own.yaml", **quick, whole=40)
+    own = {
+        "job.yaml": text_of("examples/aligned.yaml") + b"disturbances: ./own.yaml\n",
+        "own.yaml": JOINT,
+        "own.csv": TABLE,
+    }
+    yield Case("render-joint", "disturbances", render, (), own, "own.yaml", **quick, whole=50)
+    yield Case("render-joint-table", "table of correlations", render, (), own, "own.csv", **quick, whole=50)
     yield _config("render", render, "", resolve, "examples/targets.yaml", **quick, weight=0.5)
     yield _of_one("uncertainty", job, uncertainty, "", "perturb.yaml", whole=40)
     yield _of_one("live", job, live, "", "perturb.yaml", options=("--port", "0"), out="", weight=0.5)
 
 
+AS_BUILT = b"instrument: ./own.yaml\nperturb:\n  forward/M2: {shift: 0 0 1 um}\nrender: {frames: 1, seed: 1}\n"
+JOINT = b"""name: own
+joint:
+  components:
+    base/forward/M2 shift z: 3.1 um
+    forward/M2 rotate x about origin: 0.4 arcsec
+    base/forward/M1 conic: 2.0e-5
+  correlation_file: own.csv
+  time: constant
+  reason: an estimate
+"""
+TABLE = b"""base/forward/M2 shift z,forward/M2 rotate x about origin,base/forward/M1 conic
+1.0,0.8,0.0
+0.8,1.0,-0.3
+0.0,-0.3,1.0
+"""
 SPOTS = (
     b"instrument: ./pair.yaml\nperturb:\n  base/forward/M2: {shift: [0 um, 0 um, 3 um]}\nrender: {frames: 1, seed: 1}\n"
 )
