@@ -59,7 +59,8 @@ def joint_disturbances(
     correlation = covariance[np.ix_(own, own)] / np.outer(sigma[own], sigma[own])
     if np.max(np.abs(correlation - correlation.T), initial=0.0) > -INDEFINITE:
         raise ValueError("a covariance is symmetric")
-    correlation = np.round(np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0), DIGITS)
+    correlation = np.clip(0.5 * (correlation + correlation.T), -1.0, 1.0)
+    correlation = np.asarray(np.round(correlation, DIGITS), dtype=np.float64)
     np.fill_diagonal(correlation, 1.0)
     if len(own) and np.linalg.eigvalsh(correlation)[0] < INDEFINITE:
         raise ValueError("a covariance has no negative eigenvalue")
