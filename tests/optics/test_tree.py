@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.pose import Pose, about_axis, rotation_matrix
-from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State
+from optics.geometry.tree import COMPLEX_STEP, Body, Motion, RigidTree, State, compose
 
 PIVOT = (0.0, 0.2, -0.1)
 
@@ -142,3 +142,35 @@ def test_a_body_at_rest_is_where_it_is_when_it_is_moved_by_nothing(tree: RigidTr
     # what a state does to one body is not kept for the next
     assert np.array_equal(tree.place([turned]).translation, tree.place([turned]).translation)
     assert np.array_equal(tree.place().translation[0], tree.place([still]).translation[0])
+
+
+def test_a_tree_stands_by_itself_as_another_does_in_a_state() -> None:
+    """Also under states on top of it; what cannot be a place of a body is refused."""
+    bodies = (
+        Body("a", Pose(about_axis(1, 0.3), np.array([0.1, 0.2, 0.3]))),
+        Body("a/b", Pose(about_axis(0, -0.2), np.array([0.0, 0.5, 0.1])), pivots={"far": (0.2, -0.1, 0.4)}),
+        Body("a/b/c", Pose(about_axis(2, 0.1), np.array([0.3, 0.0, 0.0]))),
+    )
+    tree = RigidTree(bodies)
+    first = {
+        "a": Motion((0.01, -0.02, 0.03), (0.001, 0.002, -0.003)),
+        "a/b": Motion((0.02, 0.01, 0.0), (0.0, 0.004, 0.0), "far"),
+    }
+    then = {
+        "a/b": Motion((0.0, 0.03, -0.01), (0.002, 0.0, 0.001), "far", scale=0.01),
+        "a/b/c": Motion(shift=(0.1, 0.0, 0.0)),
+    }
+    standing, paths = tree.standing(first), {body.path: body for body in bodies}
+    for there, here in ((first, {}), (compose(first, then, paths), then)):
+        expected, found = tree.place([there]), standing.place([here])
+        np.testing.assert_allclose(found.rotation, expected.rotation, rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(found.translation, expected.translation, rtol=0.0, atol=1e-15)
+        np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-15)
+    for state, error in (
+        ({"a/d": Motion()}, KeyError),
+        ({"a": Motion(pivot="far")}, KeyError),
+        ({"a": Motion(scale=1e-6)}, ValueError),
+        ({"a": Motion(stretch=1e-6)}, ValueError),
+    ):
+        with pytest.raises(error):
+            tree.standing(state)
