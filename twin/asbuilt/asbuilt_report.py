@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from optics.numerics.frozen_map import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses, shown
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
 from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, shown_unit
 from twin.run.report import Report, Section, answer
 from twin.run.svg import (
     BLUE,
+    GREEN,
     GREY,
     INK,
     ORANGE,
@@ -28,6 +30,8 @@ from twin.tolerance.tolerance_run import merit_unit
 
 _MOST_COMBINATIONS = 12
 _FEW = 3
+BANDS = FrozenMap({"prior": GREY, "as built": BLUE, "after the next move": GREEN})
+"""What bands of a figure are called, and their colours."""
 
 
 def asbuilt_report(run: AsBuiltRun) -> Report:
@@ -41,7 +45,7 @@ def asbuilt_report(run: AsBuiltRun) -> Report:
             "The camera",
             (
                 "Wavefront error along the line, as drawn and as built. Bands hold the middle 68 and 95 % of what is "
-                "possible: before the measurements, under the prior alone, and with them.",
+                "possible: before the measurements, under the prior alone, with them, and after the next move.",
             ),
             (SvgFigure("along", "Wavefront error over the field", "", along), _range_table(run)),
             name="camera",
@@ -197,13 +201,15 @@ def _summary(run: AsBuiltRun) -> Table:
 def _range_table(run: AsBuiltRun) -> Table:
     designed, bands = run.along
     rows: list[list[Cell]] = [
-        [field[0], float(designed[f]), *(float(bands[b, q, f]) for b in (0, 1) for q in (1, 2, 3))]
+        [field[0], float(designed[f]), *(float(band[q, f]) for band in bands for q in (1, 2, 3))]
         for f, field in enumerate(ALONG)
     ]
-    heads = ("field", "designed", *(text for _ in range(2) for text in ("16 %", "50 %", "84 %")))
-    over = (("", 2), ("prior", 3), ("as built", 3))
+    heads = ("field", "designed", *(text for _ in bands for text in ("16 %", "50 %", "84 %")))
+    over = (("", 2), *((name, 3) for name, _ in zip(BANDS, bands, strict=False)))
     caption = "Rms wavefront error, waves. Field: share of half the line."
-    return Table("field", "Wavefront error along the line", caption, heads, rows, (1, *[4] * 7), over=over)
+    return Table(
+        "field", "Wavefront error along the line", caption, heads, rows, (1, *[4] * (len(heads) - 1)), over=over
+    )
 
 
 def _known_table(run: AsBuiltRun) -> Table:
@@ -304,7 +310,7 @@ def _along_figure(run: AsBuiltRun) -> Figure:
     x = np.array([field[0] for field in ALONG])
     figure = new_figure(2.9)
     ax = figure.subplots()
-    for band, colour, label in ((bands[0], GREY, "prior"), (bands[1], BLUE, "as built")):
+    for band, (label, colour) in zip(bands, BANDS.items(), strict=False):
         ax.fill_between(x, band[0], band[4], color=colour, alpha=0.15, lw=0)
         ax.fill_between(x, band[1], band[3], color=colour, alpha=0.25, lw=0)
         ax.plot(x, band[2], color=colour, lw=1.6, label=label)

@@ -69,8 +69,8 @@ class AsBuiltRun:
         found: the state.
         known: combinations of motions, the best known first.
         standings: of the merits.
-        along: rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior and
-            with the measurements, (2, 5, F).
+        along: rms wavefront error along the line, waves: designed (F,), and quantiles ``LEVELS`` under the prior, with
+            the measurements and, where something can be moved, after the next move, (2 or 3, 5, F).
         advice: the next move; None where nothing can be moved.
         true: parameters of a drawn instrument; None of a real one.
         warnings: what the user should know.
@@ -126,7 +126,7 @@ def run_asbuilt(
     last = bench.last
     step = advice(bench, found, draws, _random(seed, _MOVE)) if bench.parameters.names else None
     advance("state", 2, 4)
-    moved = None
+    moved, made = None, None
     if step is not None:
         errors = _random(seed, _MADE).standard_normal((len(draws), 2, len(step.move.amounts)))
         made = bench.actuators.made(step.move.amounts, errors)
@@ -136,7 +136,7 @@ def run_asbuilt(
     nominal = bench.merit_parts(np.zeros((1, len(prior.mean))), None)[0]
     standings = tuple(_standing(one, nominal, parts, truth) for one in bench.merits.merits)
     advance("state", 3, 4)
-    along = _along(bench, blind, draws)
+    along = _along(bench, ((blind, None), (draws, None), *(() if made is None else ((draws, made),))))
     advance("state", 4, 4)
     return AsBuiltRun(
         setup, bench, data, found, combinations(found), standings, along, step, true, tuple(_warnings(found, parts[1]))
@@ -194,21 +194,25 @@ def _standing(
     )
 
 
-def _along(bench: AsBuiltBench, blind: np.ndarray, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rms wavefront error along the line, of the design, and quantiles under the prior and the posterior."""
+def _along(
+    bench: AsBuiltBench, several: Sequence[tuple[np.ndarray, np.ndarray | None]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rms wavefront error along the line, of the design, and quantiles of several sets of states with further moves."""
     field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)}, ("merits",))
 
-    def rms(values: np.ndarray) -> np.ndarray:
+    def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
         try:
-            return np.asarray(np.sqrt(np.maximum(field.parts_of(bench.parameters.states(values, bench.last)), 0.0)))
+            states = bench.parameters.states(values, bench.last, further)
+            return np.asarray(np.sqrt(np.maximum(field.parts_of(states), 0.0)))
         except PhysicalError:
             if len(values) == 1:
                 return np.full((1, len(ALONG)), np.nan)
         half = len(values) // 2
-        return np.concatenate([rms(values[:half]), rms(values[half:])])
+        both = slice(0, half), slice(half, None)
+        return np.concatenate([rms(values[own], None if further is None else further[own]) for own in both])
 
     designed = np.sqrt(np.maximum(field.parts_of([{}])[0], 0.0))
-    return designed, np.stack([np.nanquantile(rms(values), LEVELS, axis=0) for values in (blind, draws)])
+    return designed, np.stack([np.nanquantile(rms(*one), LEVELS, axis=0) for one in several])
 
 
 def _warnings(found: StateEstimate, now: np.ndarray) -> list[str]:
