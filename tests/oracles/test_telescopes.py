@@ -150,8 +150,8 @@ def test_psf_of_hsc_as_by_batoids_rays(backend, field) -> None:
 
 
 PSF_TOLD = {(0.0, 0.0): 1e-3, (1.0, 0.0): 1.3e-3, (1.0, 1.0): 5e-3}
-"""Of the peak. The polynomials of a pupil whose shadows are taken off again leave 6e-5 waves of the wavefront at the end
-of the line and 5e-4 in the corner, most of it along the edges."""
+"""Of the peak. The polynomials of a pupil whose shadows are taken off again leave 6e-5 waves of the wavefront at the
+end of the line and 5e-4 in the corner, most of it along the edges."""
 
 
 @cache
