@@ -1097,7 +1097,7 @@ def test_a_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, started: Callab
 
 def test_everything_that_the_list_of_tests_names_is_there() -> None:
     for name, procedure in registered(PROCEDURES)[2].items():
-        assert re.fullmatch("(lab|orbit|design) [a-z]+", name)
+        assert re.fullmatch("(lab|orbit|design|asbuilt) [a-z]+", name)
         assert issubclass(procedure.model, ExperimentSetup)
         for function in (procedure.resolve, procedure.run, procedure.numbers, procedure.report):
             assert callable(function.get()), name

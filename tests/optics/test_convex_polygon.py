@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from optics.geometry.polygon import (
     area,
+    area_in_disk,
     clip,
     compact,
     covered,
@@ -32,6 +33,21 @@ def test_hulls_have_the_area_of_qhull() -> None:
     points = RNG.normal(size=(40, 9, 2))
     points[:, 8] = points[:, 0]  # a corner that is there twice
     np.testing.assert_allclose(area(hull(points)), [ConvexHull(p).volume for p in points], rtol=1e-12)
+
+
+def test_areas_within_the_unit_disk() -> None:
+    """Of polygons that hold it, lie within it, cut a segment or half of it off; and of others by their parts."""
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    beyond = 0.4  # of x: the segment on the far side
+    segment = np.arccos(beyond) - beyond * np.sqrt(1.0 - beyond**2)
+    found = area_in_disk(np.stack([5.0 * square, 0.3 * square, 5.0 * square + [5.4, 0.0], 2.0 * square + [0.0, 2.0]]))
+    np.testing.assert_allclose(found, [np.pi, 0.36, segment, 0.5 * np.pi], atol=1e-14)
+    assert area_in_disk(0.5 * square[None, ::-1]) == pytest.approx(-1.0)
+    assert area_in_disk(0.2 * square[None] + 3.0) == pytest.approx(0.0, abs=1e-14)
+    inside, outside = intersect(SOME, *sides(OTHERS)), difference(SOME, OTHERS)
+    parts = area_in_disk(inside) + sum(area_in_disk(part) for part in outside)
+    np.testing.assert_allclose(parts, area_in_disk(SOME), atol=1e-13)
+    assert np.count_nonzero((area_in_disk(SOME) > 0.1) & (area_in_disk(SOME) < area(SOME) - 0.1)) > 20
 
 
 def test_what_is_cut_off_and_what_stays_make_the_whole() -> None:

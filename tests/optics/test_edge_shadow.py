@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optics.geometry.aperture import Circle, Edge, Ellipse, Polygon, Ray, Rectangle
-from optics.geometry.polygon import area, covered
+from optics.geometry.polygon import area, area_in_disk, covered, hull, intersect, sides
 from optics.numerics import quadrature
 from optics.numerics.physical_error import UnphysicalError
 from optics.waves import edge_shadow
@@ -181,3 +181,19 @@ def test_polynomials_follow_the_light_and_stay_near_it_in_the_dark() -> None:
     assert np.std((told - wave)[lit]) < 1e-4
     # and runs no farther in the dark
     assert np.ptp(told) < 2.0 * np.ptp(wave[lit])
+
+
+def test_what_clear_edges_leave_no_light_in_is_all_but_what_they_leave() -> None:
+    """Pieces beyond a polygon, wide or thin, within the stop or across its rim, take the rest of the stop once."""
+    rng = np.random.default_rng(3)
+    shapes = hull(rng.normal(0.0, 0.7, (40, 9, 2)) * np.array([1.0, 0.2]) + rng.normal(0.0, 0.3, (40, 1, 2)))
+    for shape in (*shapes, 0.1 * shapes[0], 9.0 * (shapes[1] - shapes[1].mean(axis=0))):
+        window = sides(edge_shadow._window(1))
+        (lit,) = intersect(shape[None], *window)
+        pieces = edge_shadow._around(lit)
+        assert np.all(area(pieces) > 0.0)
+        assert np.max(np.abs(pieces), initial=0.0) < 1.3
+        assert np.sum(area_in_disk(pieces)) + area_in_disk(lit[None])[0] == pytest.approx(np.pi, abs=1e-8)
+        middles = np.mean(pieces, axis=1)
+        counted = [np.sum(covered(piece[None, None], middles)) for piece in pieces]
+        assert counted == [1] * len(pieces)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from optics.geometry.tree import Motion
 from optics.numerics.physical_error import UnphysicalError
 from optics.waves.transfer import polychromatic_transfer
 from scenes.specs.resolved import resolve_camera
@@ -139,6 +140,23 @@ def test_a_camera_of_mirrors_over_its_band(backend, gf7) -> None:
     # of one wavelength the Strehl ratio is what the wavefront says
     (alone,) = spectral_psfs(optics, [field], np.array([650e-9]), np.ones(1))
     assert alone.strehl == pytest.approx(optics.wavefront(field).strehl, abs=2e-3)
+
+
+def test_axial_colour_is_that_of_the_state(achromat, backend) -> None:
+    """Of a moved focal plane, and of a lens whose last face has moved: as of a file that says so."""
+    lines, middle, step = np.array([486.1327e-9, 656.2725e-9]), [(0.0, 0.0)], 20e-6
+    spec = achromat.model.spec
+    still = axial_colour(achromat, middle, lines)
+    away = replace(achromat, state={"camera/focal_plane": Motion(shift=(0.0, 0.0, step))})
+    moved = axial_colour(away, middle, lines) - still
+    np.testing.assert_allclose(np.abs(moved), step, rtol=1e-6)
+    last = list(spec.mirrors)[-1]
+    mirrors = {**spec.mirrors, last: spec.mirrors[last].model_copy(update={"z": spec.mirrors[last].z + step})}
+    written = CameraOptics.alone(spec.model_copy(update={"mirrors": mirrors}), backend)
+    bent = replace(achromat, state={f"camera/{last}": Motion(shift=(0.0, 0.0, step))})
+    found, wanted = axial_colour(bent, middle, lines) - still, axial_colour(written, middle, lines) - still
+    assert np.min(np.abs(wanted)) > 0.1 * step
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-9)
 
 
 def test_no_colours_without_named_glass(achromat, backend) -> None:

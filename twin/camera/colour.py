@@ -250,7 +250,7 @@ def _sampled(pupil: PupilFunction, wavelength: float, half: float) -> PupilField
     right, left, _ = pupil.edge.corners(nothing)
     bent = pupil.values(np.exp(2j * np.pi * np.arange(32) / 32))[0]
     phase = 2.0 * np.pi / wavelength * (np.sqrt(2.0) * aperture * half + 0.5 * float(np.ptp(bent)))
-    count = nodes_for(phase, LEAST_ACROSS)
+    count = nodes_for(phase, LEAST_ACROSS) + pupil.finer
     points, weight = pupil.edge.overlap(nothing, right, left, gauss(count), gauss(count))
     if pupil.shadow is not None:
         taken, area = pupil.shadow.overlap(nothing[None], max(SHADOW_NODES, count))
