@@ -233,6 +233,7 @@ def test_an_instrument_is_found(whole) -> None:
     assert np.max(np.abs(other.mean - found.mean) / found.sigma) < 0.02
 
 
+@pytest.mark.second
 def test_a_gross_error_of_one_field_is_named(whole) -> None:
     """Coma of 150 nm too much at one field: it is left out, and the rest tells the same state."""
     rng = np.random.default_rng(9)
@@ -275,6 +276,7 @@ def test_moves_are_part_of_the_state(backend, tmp_path) -> None:
     assert not np.any(wanted_move(still, np.zeros(len(still.parameters.labels)), None).amounts)
 
 
+@pytest.mark.second
 def test_responses_of_actuators_are_found(backend, tmp_path) -> None:
     """Real responses were 1.13, 0.92 and 0.87 of the traced ones (Rubin's M2, despace and decentres): three pokes tell
     them, within three standard deviations that are below 2 %.
@@ -312,7 +314,9 @@ def written_maps(folder: Path, coefficients: np.ndarray, orientation: Orientatio
     return names
 
 
-@pytest.mark.parametrize("name", ["as it is", "turned 90", "mirrored diagonal"])
+@pytest.mark.parametrize(
+    "name", ["mirrored diagonal", *(pytest.param(one, marks=pytest.mark.second) for one in ("as it is", "turned 90"))]
+)
 def test_maps_and_tables_hold_the_same(backend, tmp_path, name) -> None:
     """Coefficients of double-pass maps on a grid of 121 points are those that made them, to 1 %; of a table exactly."""
     rng = np.random.default_rng(1)

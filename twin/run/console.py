@@ -27,7 +27,7 @@ PROGRAMS = {
     "study": ("twin.study", "vary any key of a job; statistics, sensitivities, gradients"),
     "design": ("twin.design", "optimise a camera, or find the layout of a monitor"),
     "tolerance": ("twin.tolerance", "tolerances with compensators: sensitivities, yield, allocation"),
-    "asbuilt": ("twin.asbuilt", "one instrument as built, by all that was measured; the next move"),
+    "asbuilt": ("twin.asbuilt", "one instrument as built: its state by all that was measured"),
     "camera": ("twin.camera", "wavefront, spots, MTF, distortion of a camera; refocus it"),
     "lens": ("scenes.lens", "read and write prescriptions of Zemax, CODE V and batoid"),
     "mtf": ("analysis.mtf", "MTF from a slanted edge or bars in any image"),
