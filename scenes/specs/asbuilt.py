@@ -219,11 +219,14 @@ class SpotReadingsSpec(ReadingsSpec):
     Attributes:
         after: the last of `moves` that had been made when it was taken; none by default.
         sigma: standard deviation of each coordinate, pixels.
-        file: CSV file with the places: columns camera, channel, row_px, column_px.
+        file: the `recovered.json` of a run of `twin.recover`, or a CSV file with the places: columns camera, channel,
+            row_px, column_px.
+        state: whether the spots of `recovered.json` count that were recorded before or after.
     """
 
     sigma: Annotated[Number, Field(gt=0.0, le=100.0)]
     file: Reference | None = None
+    state: Literal["before", "after"] = "before"
 
     @property
     def given(self) -> bool:

@@ -213,6 +213,37 @@ def test_spots_and_temperatures_of_a_pair(backend, tmp_path) -> None:
     np.testing.assert_allclose(warm[:, own], [[1, 0], [0, 1], [0, 1], [1, 0]], atol=1e-9)
 
 
+def test_spots_of_recovered_frames_and_of_tables_are_read(backend, tmp_path) -> None:
+    """The same places from recovered.json and from a CSV file, against where the design has the spots."""
+    channels = [("forward", "left"), ("forward", "right"), ("backward", "left"), ("backward", "right")]
+    spots: dict = {"forward": {}, "backward": {}}
+    for k, (camera, channel) in enumerate(channels):
+        spots[camera][channel] = {"before": {"row": 1.0, "column": 2.0}, "after": {"row": 40.0 + k, "column": 50.0 - k}}
+    (tmp_path / "recovered.json").write_text(json.dumps({"spots": spots}))
+    rows = "".join(f"{camera},{channel},{40.0 + k},{50.0 - k}\n" for k, (camera, channel) in enumerate(channels))
+    (tmp_path / "spots.csv").write_text(f"camera,channel,row_px,column_px\n{rows}")
+    prior = {
+        "name": "parts",
+        "causes": {"one": {"bodies": "base/forward/M2", "shift": "1 um", "reason": "a test"}},
+    }
+    measured = {
+        "spots": {
+            "frames": {"file": "recovered.json", "state": "after", "sigma": 0.02},
+            "table": {"file": "spots.csv", "sigma": 0.02},
+        }
+    }
+    bench = bench_of(backend, tmp_path, measured, prior, instrument="gf7_pair", camera="forward", simulate=None)
+    frames, table = bench.data()
+    np.testing.assert_allclose(frames, table, atol=1e-12)
+    places = bench.experiment.path.coarse
+    middle = 0.5 * (np.array(bench.experiment.path.shape) - 1.0)
+    mean = np.einsum("n,bnk->bk", places.nodes.share, places.rays([{}]).position[..., 1::-1]) / places.pitch
+    np.testing.assert_allclose(frames.reshape(-1, 2)[1], np.array([41.0, 49.0]) - middle - mean[1], atol=1e-9)
+    (tmp_path / "spots.csv").write_text("camera,channel\nforward,left\n")
+    with pytest.raises(InputError, match="not a spot"):
+        bench.data()
+
+
 def test_an_instrument_is_found(whole) -> None:
     """Of a drawn instrument each combination and motion lies within what its sigma says, and order does not matter.
 

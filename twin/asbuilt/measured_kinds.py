@@ -376,9 +376,31 @@ class SpotReadings(MeasuredKind):
         return np.asarray(self.spec.sigma**2 * np.eye(len(self.labels)))
 
     def read(self) -> np.ndarray:
-        """Places of the CSV file, less those of the design."""
-        path = self.file("file", self.spec.file, "a CSV file")
+        """Places of the file, less those of the design."""
+        path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
         middle = 0.5 * (np.array(self.site.experiment.path.shape) - 1.0)
+        found = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
+        out = []
+        for channel in self.path.channels:
+            if (channel.camera, channel.name) not in found:
+                raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
+            out.append(np.array(found[channel.camera, channel.name]) - middle)
+        return np.concatenate(out) - self.nominal
+
+    def _recovered(self, path: Path) -> dict[tuple[str, str], tuple[float, float]]:
+        data = read_json(self, path)
+        try:
+            return {
+                (camera, channel): (float(one[self.spec.state]["row"]), float(one[self.spec.state]["column"]))
+                for camera, channels in data["spots"].items()
+                for channel, one in channels.items()
+            }
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+            raise self.wrong(
+                f"no spots in it ({error!r})", "file", "the recovered.json of twin.recover or twin.render", str(path)
+            ) from error
+
+    def _table(self, path: Path) -> dict[tuple[str, str], tuple[float, float]]:
         found: dict[tuple[str, str], tuple[float, float]] = {}
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = csv.DictReader(line for line in stream if not line.startswith("#"))
@@ -392,12 +414,7 @@ class SpotReadings(MeasuredKind):
                         "columns camera, channel, row_px, column_px",
                         str(path),
                     ) from error
-        out = []
-        for channel in self.path.channels:
-            if (channel.camera, channel.name) not in found:
-                raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
-            out.append(np.array(found[channel.camera, channel.name]) - middle)
-        return np.concatenate(out) - self.nominal
+        return found
 
 
 class SightReadings(MeasuredKind):
