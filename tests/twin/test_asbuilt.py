@@ -534,8 +534,9 @@ def test_a_run_from_file_to_numbers(backend, tmp_path) -> None:
         ({"actuators": {"z": {"motion": "M7 shift z", "range": "1 mm"}}}, "M7"),
         ({"moves": {"one": {"by": {"z": "1 um"}}}}, "no such actuator"),
         ({"simulate": None}, "no data"),
+        ({"merits": {"one": {"kind": "monitor_angle", "at_most": "1 arcsec"}}}, "twin.uncertainty"),
     ],
-    ids=["nothing", "field", "unit", "zero", "move", "body", "monitor", "camera", "actuator", "moved", "data"],
+    ids=["nothing", "field", "unit", "zero", "move", "body", "monitor", "camera", "actuator", "moved", "data", "merit"],
 )
 def test_bad_input_has_one_message(backend, tmp_path, changes, words) -> None:
     """File, line, key and what is allowed."""

@@ -17,7 +17,7 @@ from optics.numerics.frozen_map import FrozenMap
 from optics.numerics.physical_error import PhysicalError
 from scenes.models.disturbances import StatedMotions, motions_of_spec
 from scenes.specs.asbuilt import AsBuiltSetup, MeasurementsSpec
-from scenes.specs.tolerance import MeritSpec, ToleranceBudgetSpec, ToleranceSetup
+from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, ToleranceSetup
 from scenes.yaml.errors import names_text, unknown
 from twin.asbuilt.measured_kinds import KINDS, MeasuredKind, Site, View
 from twin.asbuilt.parameters import Parameters
@@ -68,6 +68,11 @@ class AsBuiltBench(Site):
         self._beams: dict[tuple[tuple[float, float], ...], VariedBeams] = {}
         self.kinds = self._kinds(self.test.measurements, "measurements")
         self.afters = tuple(one.after for _, _, one in self.test.measurements.every())
+        for name, merit in self.test.merits.items():
+            if merit.kind in OF_MONITOR:
+                problem = "what a monitor knows rests on its own disturbances, not on how the instrument was assembled"
+                allowed = "`twin.uncertainty` of the instrument that results"
+                raise self.test.error(problem, ("merits", name, "kind"), found=merit.kind, allowed=allowed)
         self.merits = self.bench(dict(self.test.merits), ("merits",))
 
     def _camera_name(self) -> str:

@@ -318,6 +318,7 @@ class ToleranceBench:
     def numbers_of(self, states: Sequence[State]) -> np.ndarray:
         """Numbers (S, R) of cameras whose squares sum to their merits' mean squares over fields or points, each in
         units of its requirement; an MTF counts as the wavefront at its fields, a quarter of the wavelength rms as one.
+        What bodies take of beams, and what a monitor knows, have no such numbers.
 
         They change linearly with small motions. Raises PhysicalError: the light is lost.
         """
@@ -327,6 +328,8 @@ class ToleranceBench:
         parts = self._parts(states, *self._still(states), light)
         out = []
         for merit in self.merits:
+            if merit.spec.kind in ("obstruction", *OF_MONITOR):
+                continue
             if merit.spec.kind in ("wavefront", "mtf"):
                 assert terms is not None
                 own = terms[:, merit.fields].reshape(count, -1) / np.sqrt(len(merit.fields))
@@ -335,7 +338,7 @@ class ToleranceBench:
                 own = parts[:, merit.parts] / np.sqrt(merit.parts.stop - merit.parts.start)
                 size = merit.spec.requirement
             out.append(own / size)
-        return np.concatenate(out, axis=1)
+        return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
 
     def pair_curvature(self, slopes: np.ndarray) -> np.ndarray:
         """Second derivatives of the parts by pairs of numbers, (P, K, K), as first derivatives of the wavefronts make
