@@ -19,7 +19,7 @@ from rich.console import Console
 from scenes.yaml.errors import Problem, nearest
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import durable
-from twin.run.cli import BAD_INPUT, AsJson, InputErrorText, Quiet, explained, print_verdict, result_table
+from twin.run.cli import BAD_INPUT, AsJson, InputErrorText, Quiet, explained, print_verdict, print_whole, result_table
 
 if TYPE_CHECKING:
     from twin.operate.entries import Given
@@ -282,7 +282,7 @@ def _show(data: dict[str, Any], console: Console) -> None:
         table.add_column(head, justify="right" if head == "entries" else "left")
     for one in data["streams"]:
         table.add_row(one["kind"], one["subject"], str(one["entries"]), one["first_utc"], one["last_utc"])
-    console.print(table, markup=False)
+    print_whole(console, table)
     for one in data["refused"]:
         line = "" if one["line"] is None else f":{one['line']}"
         since = " (taken since)" if one["taken_since"] else ""

@@ -13,6 +13,8 @@ from sqlalchemy import Connection, Engine, create_engine, event, func, insert, s
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
 
+from optics.numerics.backend import load_backend
+from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.json_file import parse_json
 from twin.operate import schema
@@ -109,6 +111,7 @@ class History:
         sha256: by which the instrument is recognised.
         temperature: of the instrument as its file states it, kelvin.
         simulated: whether its times are not compared with the computer's clock.
+        bodies: ``warm``, paths of those that have a temperature; ``cameras``, their names.
     """
 
     def __init__(self, place: str) -> None:
@@ -128,6 +131,7 @@ class History:
             row = connection.execute(select(INSTRUMENT)).mappings().one()
         self.name, self.sha256 = str(row["name"]), str(row["sha256"])
         self.temperature, self.simulated = float(row["temperature_k"]), bool(row["simulated"])
+        self.bodies: dict[str, list[str]] = parse_json(row["bodies"], "the record")
 
     def close(self) -> None:
         """Let go of the database."""
@@ -353,6 +357,13 @@ def content_of(row: Mapping[str, Any]) -> Any:
     return parse_json(row["content"], "the record")
 
 
+def bodies_of(job: ResolvedJob) -> dict[str, list[str]]:
+    """Paths of the bodies of a job's instrument that have a temperature, and names of its cameras."""
+    nodes = build_instrument(job.instrument, job.cameras, load_backend()).nodes
+    warm = [path for path, info in nodes.items() if "temperature" in info.allows]
+    return {"warm": warm, "cameras": list(job.instrument.cameras)}
+
+
 def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[int, ...]:
     """Make a record, or bring one of an earlier version up to this one.
 
@@ -383,10 +394,8 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
             if not found:
                 schema.create(connection)
                 row = {"name": job.instrument.name, "sha256": digest, "simulated": simulated}
-                row |= {
-                    "temperature_k": repr(job.instrument.temperature),
-                    "plain": canonical(job.plain()["instrument"]),
-                }
+                row |= {"temperature_k": repr(job.instrument.temperature), "bodies": canonical(bodies_of(job))}
+                row |= {"plain": canonical(job.plain()["instrument"])}
                 connection.execute(insert(INSTRUMENT).values(**row))
             own = connection.execute(select(INSTRUMENT)).mappings().one()
             if own["sha256"] != digest:

@@ -52,6 +52,7 @@ INSTRUMENT = _table(
     _digest("sha256", nullable=False, unique=True),
     Column("temperature_k", Text, nullable=False),
     Column("simulated", Boolean, nullable=False),
+    Column("bodies", Text, nullable=False),
     Column("plain", Text, nullable=False),
 )
 """The one instrument of which the record is."""

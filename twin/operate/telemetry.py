@@ -51,6 +51,12 @@ def read_telemetry(path: Path, history: History) -> TelemetrySpec:
     if digest != history.sha256:
         problem = f"tables of another instrument than the record's ({digest[:12]}, not {history.sha256[:12]})"
         raise spec.error(problem, ("instrument",), found=named, allowed=history.name)
+    for k, table in enumerate(spec.readings):
+        known = {"temperature": history.bodies["warm"], "focus": history.bodies["cameras"]}.get(table.kind)
+        for subject in table.columns if known is not None else ():
+            if subject not in (known or ()):
+                what = "body with a temperature" if table.kind == "temperature" else "camera"
+                raise spec.error(unknown(f"no such {what}", subject, known or ()), ("readings", k, "columns", subject))
     return spec
 
 
