@@ -68,7 +68,7 @@ def url_of(place: str) -> URL:
         return URL.create("sqlite", database=str(Path(place).absolute() / FILE))
     try:
         return make_url(place)
-    except ArgumentError:
+    except (ArgumentError, ValueError):
         raise NotARecord("not an address of a database; write DIALECT://USER@HOST/DATABASE, or a folder") from None
 
 

@@ -20,6 +20,7 @@ from sqlalchemy import (
     func,
     inspect,
     select,
+    text,
 )
 from sqlalchemy.schema import CreateIndex, CreateTable
 
@@ -107,26 +108,33 @@ class NotARecord(Exception):
 def _guard(connection: Connection, table: str) -> None:
     """Let the database refuse to alter or remove rows of a table; on others than these two only the program does."""
     for what in ("UPDATE", "DELETE"):
-        name, text = f"{table}_no_{what.lower()}", f"a record is never altered: {what} of {table}"
+        name, says = f"{table}_no_{what.lower()}", f"a record is never altered: {what} of {table}"
         if connection.dialect.name == "sqlite":
-            body = f"BEGIN SELECT RAISE(ABORT, '{text}'); END"
-            connection.exec_driver_sql(f"CREATE TRIGGER {name} BEFORE {what} ON {table} {body}")
+            body = f"BEGIN SELECT RAISE(ABORT, '{says}'); END"
+            connection.execute(text(f"CREATE TRIGGER {name} BEFORE {what} ON {table} {body}"))
         elif connection.dialect.name == "postgresql":
-            connection.exec_driver_sql(
-                f"CREATE TRIGGER {name} BEFORE {what} ON {table} FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+            connection.execute(
+                text(
+                    f"CREATE TRIGGER {name} BEFORE {what} ON {table} "
+                    "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+                )
             )
     if connection.dialect.name == "postgresql":
-        connection.exec_driver_sql(
-            f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} "
-            "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+        connection.execute(
+            text(
+                f"CREATE TRIGGER {table}_no_truncate BEFORE TRUNCATE ON {table} "
+                "FOR EACH STATEMENT EXECUTE FUNCTION record_refuses()"
+            )
         )
 
 
 def _guard_function(connection: Connection) -> None:
     if connection.dialect.name == "postgresql":
-        connection.exec_driver_sql(
-            "CREATE OR REPLACE FUNCTION record_refuses() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
-            "RAISE EXCEPTION 'a record is never altered: % of %', TG_OP, TG_TABLE_NAME; END $$"
+        connection.execute(
+            text(
+                "CREATE OR REPLACE FUNCTION record_refuses() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN "
+                "RAISE EXCEPTION 'a record is never altered: % of %', TG_OP, TG_TABLE_NAME; END $$"
+            )
         )
 
 
@@ -140,7 +148,7 @@ def guarded(connection: Connection) -> bool:
     query = names.get(connection.dialect.name)
     if query is None:
         return False
-    return int(connection.exec_driver_sql(query).scalar_one()) >= 2 * len(_METADATA.tables)
+    return int(connection.execute(text(query)).scalar_one()) >= 2 * len(_METADATA.tables)
 
 
 def create(connection: Connection) -> None:
@@ -160,7 +168,7 @@ def version(connection: Connection) -> int:
 
 def _to_two(connection: Connection) -> None:
     """Add where a reading was found from, and what was refused; old rows get no origin, since none is altered."""
-    connection.exec_driver_sql("ALTER TABLE entry ADD COLUMN origin VARCHAR(64)")
+    connection.execute(text("ALTER TABLE entry ADD COLUMN origin VARCHAR(64)"))
     for index in ENTRY.indexes:
         if index.name == "entry_origin":
             connection.execute(CreateIndex(index))
