@@ -65,13 +65,17 @@ def exported(place: Path | str) -> bytes:
         return b"".join(TABLE_FORMATS["csv"](one) for one in tables(history))
 
 
-MOMENTS = pytest.mark.parametrize(
-    "moments", [pytest.param(3, marks=pytest.mark.second), pytest.param(10, marks=pytest.mark.slow)]
-)
+@pytest.mark.second
+def test_kill_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    killed(3, tmp_path, whole)
 
 
-@MOMENTS
-def test_kill_at_any_moment(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+@pytest.mark.slow
+def test_kill_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    killed(10, tmp_path, whole)
+
+
+def killed(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
     """After SIGKILL each file is there in whole or not at all; taking them again gives what an undisturbed one does."""
     file, seconds, expected = whole
     made(tmp_path / "new").close()
@@ -92,8 +96,17 @@ def test_kill_at_any_moment(moments: int, tmp_path: Path, whole: tuple[Path, flo
     assert len(set(found)) > (1 if moments == 3 else 3), found  # they were different moments
 
 
-@MOMENTS
-def test_a_power_cut_at_any_moment(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+@pytest.mark.second
+def test_a_power_cut_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    cut_off(3, tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_a_power_cut_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    cut_off(10, tmp_path, whole)
+
+
+def cut_off(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
     """Files as they stand while a writer is at work are what a disk has after a power cut: a copy of them opens."""
     file, seconds, expected = whole
     made(tmp_path / "record").close()

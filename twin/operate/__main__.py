@@ -85,7 +85,7 @@ def _plain(console: Console, text: str) -> None:
     console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-@app.command()
+@app.command("init")
 def init(
     record: Place,
     instrument: Annotated[str, typer.Argument(help="Name of an instrument in the library, or path of its file.")],
@@ -117,7 +117,7 @@ def init(
         _tell(errors, as_json, quiet, {**data, "versions": list(passed)}, lambda console: _plain(console, text))
 
 
-@app.command()
+@app.command("ingest")
 def ingest(
     record: Place,
     files: Annotated[
@@ -255,7 +255,7 @@ def _taken(one: Taken) -> dict[str, Any]:
     return {"file": one.file, "new": one.new, "known": one.known, "refused": refused, "before": one.before}
 
 
-@app.command()
+@app.command("status")
 def status(record: Place, as_json: AsJson = False, quiet: Quiet = False) -> None:
     """Tell what a record holds: readings by sort and body with their first and last time, and what was refused and why.
 
@@ -289,7 +289,7 @@ def _show(data: dict[str, Any], console: Console) -> None:
         _plain(console, f"refused{since}: {one['file']}{line}: {one['reason']}")
 
 
-@app.command()
+@app.command("export")
 def export(
     record: Place,
     tables: Annotated[str, typer.Option(help="Format of the tables: csv, parquet or fits.")] = "csv",
