@@ -3,9 +3,11 @@
 import csv
 import hashlib
 import json
+import os
 import re
 import shutil
 import sqlite3
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,6 +163,56 @@ def test_later_tables_are_found_and_old_rows_are_known(record: Path, tmp_path: P
     (tmp_path / "t_2.csv").write_text(table(5, 2))
     found = json.loads(run("ingest", record, tmp_path, "--json").stdout)
     assert [(one["new"], one["known"]) for one in found["files"]] == [(2, 3), (2, 0)]
+
+
+def test_watching_takes_what_comes_and_what_grows(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each look one thing more has happened; a file that is still being written is left for the next look."""
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3)})
+
+    def aged(name: str, text: str, seconds: float) -> None:
+        (tmp_path / name).write_text(text)
+        os.utime(tmp_path / name, (time.time() - seconds,) * 2)
+
+    aged("t_1.csv", table(0, 3), 60)
+    steps = [
+        lambda: aged("t_2.csv", table(3, 2)[:-9], 0),  # half a line
+        lambda: aged("t_2.csv", table(3, 2), 50),
+        lambda: None,
+        lambda: aged("t_2.csv", table(3, 4), 40),
+    ]
+
+    def sleep(seconds: float) -> None:
+        if not steps:
+            raise KeyboardInterrupt
+        steps.pop(0)()
+
+    monkeypatch.setattr("twin.operate.__main__.time.sleep", sleep)
+    result = run("ingest", record, file, "--watch", "--json")
+    assert result.exit_code == 0, result.stderr
+    *looks, total = map(json.loads, result.stdout.splitlines())
+    assert [(Path(one["file"]).name, one["new"], one["known"]) for one in looks] == [
+        ("t_1.csv", 3, 0),
+        ("t_2.csv", 2, 0),
+        ("t_2.csv", 2, 2),
+    ]
+    assert (total["new"], total["refused"]) == (7, 0)
+
+
+def test_an_interruption_says_what_is_kept(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3), "t_2.csv": table(3, 2)})
+    take = History.take
+
+    def interrupted(self: History, given: Given, late: bool = False):
+        if given.file.endswith("t_2.csv"):
+            raise KeyboardInterrupt
+        return take(self, given, late)
+
+    monkeypatch.setattr(History, "take", interrupted)
+    result = run("ingest", record, file)
+    assert (result.exit_code, "the files that were told are in the record" in result.stderr) == (130, True)
+    assert status(record)["entries"] == 3
 
 
 # --- what is refused -------------------------------------------------------------------------------------

@@ -8,8 +8,10 @@ if __name__ == "__main__":
     end_quietly()
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +21,17 @@ from rich.console import Console
 from scenes.yaml.errors import Problem, nearest
 from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
 from twin.run import durable
-from twin.run.cli import BAD_INPUT, AsJson, InputErrorText, Quiet, explained, print_verdict, print_whole, result_table
+from twin.run.cli import (
+    BAD_INPUT,
+    INTERRUPTED,
+    AsJson,
+    InputErrorText,
+    Quiet,
+    explained,
+    print_verdict,
+    print_whole,
+    result_table,
+)
 
 if TYPE_CHECKING:
     from twin.operate.entries import Given
@@ -160,25 +172,29 @@ def ingest(
         start = _moment(moment)
         stated = _is_stated(instrument, history)
         seen: dict[str, tuple[int, int]] = {}
-        done: list[Taken] = []
-        while True:
-            for given in _given(files, start, stated, history, seen if watch else None):
-                taken = history.take(given, late)
-                done.append(taken)
-                if not quiet and not as_json:
-                    _plain(errors if watch else Terminal(), _line(taken))
-            if not watch:
-                break
-            time.sleep(POLL)
-        refused = sum(len(one.refused) for one in done)
-        totals = {"new": sum(one.new for one in done), "known": sum(one.known for one in done), "refused": refused}
-        data = {**totals, "files": [_taken(one) for one in done]}
-        text = f"{totals['new']} taken, {totals['known']} known already, {refused} refused"
-        _tell(errors, as_json, quiet, data, lambda console: print_verdict(console, text))
-        if refused:
+        totals, told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
+        try:
+            while True:
+                for given in _given(files, start, stated, history, seen if watch else None):
+                    taken = history.take(given, late)
+                    totals.update(new=taken.new, known=taken.known, refused=len(taken.refused))
+                    first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
+                    if watch or not as_json:
+                        _tell(errors, as_json, quiet, _taken(taken), partial(_plain, text=_line(taken)))
+                    else:
+                        told.append(_taken(taken))
+                if not watch:
+                    break
+                time.sleep(POLL)
+        except KeyboardInterrupt:
+            if not watch:  # a watching command has no other end
+                print_error(errors, "interrupted: the files that were told are in the record, the others are not")
+                raise typer.Exit(INTERRUPTED) from None
+        text = f"{totals['new']} taken, {totals['known']} known already, {totals['refused']} refused"
+        _tell(errors, as_json, quiet, {**totals, "files": told}, partial(print_verdict, verdict=text))
+        if totals["refused"]:
             if quiet or as_json:
-                first = next(one for one in done if one.refused)
-                print_error(errors, f"{refused} refused, the first in {first.file}: {first.refused[0][1]}")
+                print_error(errors, f"{totals['refused']} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
 
 
