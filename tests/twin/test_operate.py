@@ -17,6 +17,7 @@ from sqlalchemy import create_engine, inspect
 from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
 from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.commands import invoke
 from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, table, temperatures
 from twin.operate import schema
@@ -127,6 +128,32 @@ def test_a_run_folder_is_a_reading_with_its_frames(record: Path, tmp_path: Path)
     assert other.exit_code == 2
     assert "same frames as the reading of 2026-03-05T03:05:00Z" in other.stdout
     assert run("ingest", record, folder).exit_code == 2
+
+
+def test_a_run_of_measured_frames_states_its_instrument_below_model(record: Path, tmp_path: Path) -> None:
+    """With an exposure of its own, which makes no other instrument."""
+    model = json.loads(json.dumps(pair().plain()))
+    model["instrument"]["monitor"]["area_ccd"]["exposure"] = "7 ms"
+    folder = run_folder(tmp_path / "run", config=dump_yaml({"test": {"exposure": "7 ms"}, "model": model}))
+    result = run("ingest", record, folder, "--time", "2026-03-05T03:05:00Z", "--json")
+    assert (result.exit_code, json.loads(result.stdout)["new"]) == (0, 1), result.stdout
+
+
+def test_a_calibration_is_of_the_instrument_that_is_said(record: Path, tmp_path: Path) -> None:
+    """A run of twin.orbit does not say it itself."""
+    folder = run_folder(tmp_path / "run", config="test: {}\n")
+    (folder / "recovered.json").rename(folder / "calibration.json")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["sha256"]["calibration.json"] = manifest["sha256"].pop("recovered.json")
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    words = ("ingest", record, folder, "--time", "2026-03-05T03:05:00Z")
+    assert "--instrument NAME, which says it" in run(*words).stdout
+    other = run(*words, "--instrument", "gf7_pair_two")
+    assert (other.exit_code, "not of gf7_pair_two" in other.stderr) == (2, True)
+    assert run(*words, "--instrument", "gf7_pair").exit_code == 0
+    with History(str(record)) as history:
+        (found,) = tables(history)[:1]
+        assert (found.name, found.column("kind").plain) == ("run", ["calibration"])
 
 
 def test_tables_name_run_folders(record: Path, tmp_path: Path) -> None:
