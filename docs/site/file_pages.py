@@ -40,6 +40,7 @@ READ_BY = {
     "orbit_match": "`python -m twin.orbit match FILE`",
     "tolerance": "`python -m twin.tolerance FILE`",
     "asbuilt": "`python -m twin.asbuilt FILE`, `python -m twin.asbuilt check FILE`",
+    "telemetry": "`python -m twin.operate ingest RECORD FILE`",
     "three_line_camera": "tests in orbit, which name it: `camera: th1`",
     "study": "`python -m twin.study FILE`",
 }

@@ -24,6 +24,7 @@ FOLDERS = {
     "examples/design": "camera_design",
     "examples/tolerance": "tolerance",
     "examples/asbuilt": "asbuilt",
+    "examples/telemetry": "telemetry",
     "examples/as_built": "as_built_instrument",
     "examples/cassegrain": "camera",
     "examples/": "job",

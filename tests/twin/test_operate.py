@@ -1,0 +1,514 @@
+"""The record of an instrument in operation: what is taken, what is known already, what is refused and why."""
+
+import csv
+import hashlib
+import json
+import os
+import re
+import shutil
+import sqlite3
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, inspect
+
+from scenes.specs.load import EXAMPLES
+from scenes.specs.resolved import resolve_with
+from scenes.yaml.errors import InputError
+from scenes.yaml.yaml_file import dump_yaml
+from tests.twin.commands import invoke
+from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, table, temperatures
+from twin.operate import schema
+from twin.operate.__main__ import app
+from twin.operate.entries import Entry, Given, digest_of_job, instrument_digest, micros, utc_text
+from twin.operate.history import FILE, History, content_of, initialised, url_of
+from twin.operate.record_tables import tables
+from twin.operate.run_readings import run_entries
+from twin.operate.schema import NotARecord
+from twin.operate.telemetry import read_telemetry
+
+
+def run(*words: object):
+    return invoke(app, *words)
+
+
+def status(record: Path) -> dict:
+    return json.loads(run("status", record, "--json").stdout)
+
+
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("record") / "record"
+    made(place).close()
+    return place
+
+
+@pytest.fixture
+def record(tmp_path: Path, empty: Path) -> Path:
+    return Path(shutil.copytree(empty, tmp_path / "record"))
+
+
+def written(folder: Path, text: str, tables: dict[str, str]) -> Path:
+    for name, content in tables.items():
+        (folder / name).write_text(content, "utf-8")
+    (folder / "telemetry.yaml").write_text(text, "utf-8")
+    return folder / "telemetry.yaml"
+
+
+# --- what is taken ---------------------------------------------------------------------------------------
+
+
+def test_the_example_is_taken_once_and_told_the_second_time(tmp_path: Path) -> None:
+    record, file = tmp_path / "record", EXAMPLES / "telemetry.yaml"
+    assert run("init", record, "gf7_pair").exit_code == 0
+    first, second = (json.loads(run("ingest", record, file, "--json").stdout) for _ in range(2))
+    assert (first["new"], first["known"], first["refused"]) == (13, 0, 0)
+    assert (second["new"], second["known"], second["refused"]) == (0, 13, 0)
+    assert all(one["before"] for one in second["files"])
+    told = status(record)
+    assert told["entries"] == 13
+    assert told["guarded"]
+    assert {one["kind"]: one["entries"] for one in told["streams"] if one["subject"] != "base"} == {
+        "attitude": 2,
+        "event": 1,
+        "focus": 1,
+        "temperature": 3,
+    }
+
+
+def test_a_record_is_exported_with_units(tmp_path: Path) -> None:
+    """Values in the file's units come out in those of the heads: 20.12 degC as kelvin, GPS time as UTC."""
+    record, out = tmp_path / "record", tmp_path / "tables"
+    run("init", record, "gf7_pair")
+    run("ingest", record, EXAMPLES / "telemetry.yaml")
+    assert run("export", record, "--out", out).exit_code == 0
+    rows = {path.stem: list(csv.DictReader(path.open())) for path in out.iterdir()}
+    assert set(rows) == {"temperature", "attitude", "focus", "event"}
+    (warm,) = (r for r in rows["temperature"] if (r["subject"], r["time_utc"][11:16]) == ("base/forward/M1", "00:00"))
+    assert float(warm["temperature_K [K]"]) == pytest.approx(293.27, abs=1e-12)
+    assert float(warm["temperature_K_sigma [K]"]) == 0.05
+    assert float(rows["focus"][0]["defocus_um [um]"]) == pytest.approx(12.5, abs=1e-12)
+    # GPS time is ahead of UTC by 18 s in 2026
+    assert rows["attitude"][0]["time_utc"] == "2026-03-05T00:00:00Z"
+    assert float(rows["attitude"][0]["angle_arcsec_sigma [arcsec]"]) == pytest.approx(2.0, abs=1e-12)
+    assert [r["subject"] for r in rows["event"]] == ["safe_mode", "heater_set_point"]
+    again = run("export", record, "--out", out)
+    assert again.exit_code == 2
+    assert "is there already" in again.stderr
+    assert "did you mean 'parquet'" in run("export", record, "--tables", "parket", "--out", tmp_path / "x").stderr
+
+
+def test_parquet_has_units_and_meanings(record: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    with History(str(record)) as history:
+        history.take(given("t", temperatures(0, 5)))
+    assert run("export", record, "--tables", "parquet", "--out", tmp_path / "p").exit_code == 0
+    found = parquet.read_table(tmp_path / "p/temperature.parquet")
+    assert found.num_rows == 5
+    assert found.schema.field("temperature_K").metadata[b"unit"] == b"K"
+
+
+def test_a_run_folder_is_a_reading_with_its_frames(record: Path, tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run", angle=1.25)
+    first = run("ingest", record, folder, "--time", "2026-03-05T03:05:00Z", "--json")
+    assert (first.exit_code, json.loads(first.stdout)["new"]) == (0, 1)
+    with History(str(record)) as history:
+        (entry,) = history.entries("monitor")
+        by_name = {one.name: one for one in tables(history)}
+        with history.reading() as connection:
+            frames = connection.exec_driver_sql("SELECT file, length(sha256) FROM frame").all()
+    assert content_of(entry)["numbers"]["cameras"]["forward"]["posterior"]["d_alpha_arcsec"] == 1.25
+    assert by_name["monitor"].column("d_alpha_arcsec").plain == [1.25]
+    assert by_name["intersection_angle"].column("change_arcsec_sigma").plain == [0.1]
+    assert [tuple(row) for row in frames] == [("images/forward_left_after.tiff", 64)]
+    # the same frames cannot be of another moment
+    other = run("ingest", record, folder, "--time", "2026-03-06T03:05:00Z")
+    assert other.exit_code == 2
+    assert "same frames as the reading of 2026-03-05T03:05:00Z" in other.stdout
+    assert run("ingest", record, folder).exit_code == 2
+
+
+def test_a_run_of_measured_frames_states_its_instrument_below_model(record: Path, tmp_path: Path) -> None:
+    """With an exposure of its own, which makes no other instrument."""
+    model = json.loads(json.dumps(pair().plain()))
+    model["instrument"]["monitor"]["area_ccd"]["exposure"] = "7 ms"
+    folder = run_folder(tmp_path / "run", config=dump_yaml({"test": {"exposure": "7 ms"}, "model": model}))
+    result = run("ingest", record, folder, "--time", "2026-03-05T03:05:00Z", "--json")
+    assert (result.exit_code, json.loads(result.stdout)["new"]) == (0, 1), result.stdout
+
+
+def test_a_calibration_is_of_the_instrument_that_is_said(record: Path, tmp_path: Path) -> None:
+    """A run of twin.orbit does not say it itself."""
+    folder = run_folder(tmp_path / "run", config="test: {}\n")
+    (folder / "recovered.json").rename(folder / "calibration.json")
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["sha256"]["calibration.json"] = manifest["sha256"].pop("recovered.json")
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    words = ("ingest", record, folder, "--time", "2026-03-05T03:05:00Z")
+    assert "--instrument NAME, which says it" in run(*words).stdout
+    other = run(*words, "--instrument", "gf7_pair_two")
+    assert (other.exit_code, "not of gf7_pair_two" in other.stderr) == (2, True)
+    assert run(*words, "--instrument", "gf7_pair").exit_code == 0
+    with History(str(record)) as history:
+        (found,) = tables(history)[:1]
+        assert (found.name, found.column("kind").plain) == ("run", ["calibration"])
+
+
+def test_tables_name_run_folders(record: Path, tmp_path: Path) -> None:
+    for k in range(2):
+        run_folder(tmp_path / f"run{k}", angle=float(k), frame=bytes([k]))
+    text = "instrument: gf7_pair\nreadings: [{kind: monitor, files: passes.csv, name: run}]\n"
+    rows = "time,run\n2026-03-05T03:05:00Z,run0\n2026-03-05T04:35:00Z,run1\n2026-03-05T06:05:00Z,run2\n"
+    result = run("ingest", record, written(tmp_path, text, {"passes.csv": rows}), "--json")
+    assert result.exit_code == 2
+    (file,) = json.loads(result.stdout)["files"]
+    assert file["new"] == 2
+    assert [(one["line"], "no reading in" in one["reason"]) for one in file["refused"]] == [(4, True)]
+
+
+def test_a_series_is_a_reading_for_each_time(record: Path, tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run")
+    data = json.loads((folder / "recovered.json").read_text())
+    data |= {"times_s": [0.0, 60.0], "series": [{"cameras": data["cameras"]}, {"cameras": data["cameras"]}]}
+    (folder / "recovered.json").write_text(json.dumps(data))
+    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest["sha256"]["recovered.json"] = hashlib.sha256((folder / "recovered.json").read_bytes()).hexdigest()
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    with History(str(record)) as history:
+        taken = history.take(run_entries(folder, "", START, history, stated=False))
+        assert (taken.new, taken.refused) == (2, ())
+        assert [row["time_us"] for row in history.entries()] == [START, START + MINUTE]
+
+
+def test_later_tables_are_found_and_old_rows_are_known(record: Path, tmp_path: Path) -> None:
+    """A table that grows, as telemetry does: each row is taken once."""
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3)})
+    assert json.loads(run("ingest", record, file, "--json").stdout)["new"] == 3
+    (tmp_path / "t_1.csv").write_text(table(0, 5))
+    (tmp_path / "t_2.csv").write_text(table(5, 2))
+    found = json.loads(run("ingest", record, tmp_path, "--json").stdout)
+    assert [(one["new"], one["known"]) for one in found["files"]] == [(2, 3), (2, 0)]
+
+
+def test_watching_takes_what_comes_and_what_grows(
+    record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each look one thing more has happened; a file that is still being written is left for the next look."""
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3)})
+
+    def aged(name: str, text: str, seconds: float) -> None:
+        (tmp_path / name).write_text(text)
+        os.utime(tmp_path / name, (time.time() - seconds,) * 2)
+
+    aged("t_1.csv", table(0, 3), 60)
+    steps = [
+        lambda: aged("t_2.csv", table(3, 2)[:-9], 0),  # half a line
+        lambda: aged("t_2.csv", table(3, 2), 50),
+        lambda: None,
+        lambda: aged("t_2.csv", table(3, 4), 40),
+    ]
+
+    def sleep(seconds: float) -> None:
+        if not steps:
+            raise KeyboardInterrupt
+        steps.pop(0)()
+
+    monkeypatch.setattr("twin.operate.__main__.time.sleep", sleep)
+    result = run("ingest", record, file, "--watch", "--json")
+    assert result.exit_code == 0, result.stderr
+    *looks, total = map(json.loads, result.stdout.splitlines())
+    assert [(Path(one["file"]).name, one["new"], one["known"]) for one in looks] == [
+        ("t_1.csv", 3, 0),
+        ("t_2.csv", 2, 0),
+        ("t_2.csv", 2, 2),
+    ]
+    assert (total["new"], total["refused"]) == (7, 0)
+
+
+def test_an_interruption_says_what_is_kept(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3), "t_2.csv": table(3, 2)})
+    take = History.take
+
+    def interrupted(self: History, given: Given, late: bool = False):
+        if given.file.endswith("t_2.csv"):
+            raise KeyboardInterrupt
+        return take(self, given, late)
+
+    monkeypatch.setattr(History, "take", interrupted)
+    result = run("ingest", record, file)
+    assert (result.exit_code, "the files that were told are in the record" in result.stderr) == (130, True)
+    assert status(record)["entries"] == 3
+
+
+# --- what is refused -------------------------------------------------------------------------------------
+
+WRONG = {
+    "unit": ("K", "2026-01-01T00:00:00Z,20.1", "273 K from the instrument's 293.15 K", "unit: degC"),
+    "kelvin": ("degC", "2026-01-01T00:00:00Z,293.2", "from the instrument's 293.15 K", "unit: K"),
+    "number": ("degC", "2026-01-01T00:00:00Z,warm", "not a number with a unit", ""),
+    "time": ("degC", "01.02.2026 00:00,20.1", "not a date and time", "2011-03-05T03:05:00.25"),
+    "cells": ("degC", "2026-01-01T00:00:00Z,20.1,3", "3 cells under 2 heads", ""),
+    "no leap second": ("degC", "2026-01-01T23:59:60Z,20.1", "no leap second on this day", ""),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_a_row_that_cannot_be_is_refused_and_the_others_are_taken(case: str, record: Path, tmp_path: Path) -> None:
+    unit, row, *words = WRONG[case]
+    good = "2026-01-01T00:10:00Z," + ("20.2" if unit == "degC" else "293.2")
+    text = TELEMETRY.replace("degC", unit)
+    result = run("ingest", record, written(tmp_path, text, {"t_1.csv": f"UTC,T\n{row}\n{good}\n"}), "--json")
+    assert result.exit_code == 2
+    (file,) = json.loads(result.stdout)["files"]
+    assert file["new"] == 1
+    (one,) = file["refused"]
+    assert one["line"] == 2
+    for word in words:
+        assert word in one["reason"]
+    assert [(r["line"], r["reason"]) for r in status(record)["refused"]] == [(2, one["reason"])]
+
+
+def test_a_clock_that_runs_backwards(record: Path) -> None:
+    first, second, third = temperatures(0, 3)
+    with History(str(record)) as history:
+        taken = history.take(given("t", [second, first, third]))
+        assert taken.new == 2
+        assert "the clock runs backwards: 2026-01-01T00:00:00Z after 2026-01-01T00:01:00Z" in taken.refused[0][1]
+        # another body's clock is another one
+        assert history.take(given("u", [replace(first, subject="base/forward/M1")])).new == 1
+
+
+def test_a_late_reading_waits_for_who_knows(record: Path) -> None:
+    early, late = temperatures(0, 1), temperatures(5, 1)
+    with History(str(record)) as history:
+        history.take(given("b", late))
+        refused = history.take(given("a", early))
+        assert refused.new == 0
+        assert "--late takes it" in refused.refused[0][1]
+        assert status(record)["open"] == 1
+        assert history.take(given("a", early)).refused == refused.refused
+        assert len(status(record)["refused"]) == 1  # told once, however often it is tried
+        assert history.take(given("a", early), late=True).new == 1
+    told = status(record)
+    assert (told["entries"], told["open"], [one["taken_since"] for one in told["refused"]]) == (2, 0, [True])
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_other_numbers_of_a_moment_do_not_replace_those_that_are_there(record: Path, late: bool) -> None:
+    (one,) = temperatures(0, 1)
+    other = replace(one, content={**one.content, "values": [299.0]})
+    with History(str(record)) as history:
+        history.take(given("a", [one]))
+        assert "has other numbers of base" in history.take(given("b", [other]), late).refused[0][1]
+        assert [content_of(row)["values"] for row in history.entries()] == [[293.0]]
+        in_one = [replace(e, time=e.time + MINUTE) for e in (one, other)]
+        assert "another reading of base" in history.take(given("c", in_one), late).refused[0][1]
+
+
+def test_a_time_still_to_come_is_of_a_wrong_clock(tmp_path: Path) -> None:
+    far = [replace(temperatures(0, 1)[0], time=micros("2098-01-01T00:00:00Z"))]
+    with made(tmp_path / "real", simulated=False) as history:
+        assert "is still to come" in history.take(given("a", far)).refused[0][1]
+    with made(tmp_path / "simulated") as history:
+        assert history.take(given("a", far)).new == 1
+
+
+def test_an_unknown_event_is_refused_with_the_nearest(record: Path, tmp_path: Path) -> None:
+    text = "instrument: gf7_pair\nreadings: [{kind: event, files: events.csv, name: what}]\n"
+    rows = "time,what\n2026-01-01T00:00:00Z,safe_mod\n2026-01-02T00:00:00Z,refocus\n"
+    result = run("ingest", record, written(tmp_path, text, {"events.csv": rows}))
+    assert result.exit_code == 2
+    assert "line 2: unknown event; did you mean 'safe_mode'?" in result.stdout
+    assert [one["subject"] for one in status(record)["streams"]] == ["refocus"]
+
+
+def test_readings_of_another_instrument(record: Path, tmp_path: Path) -> None:
+    other = run_folder(tmp_path / "other", config=resolve_with("gf7_pair_two").to_yaml())
+    result = run("ingest", record, other, "--time", "2026-01-01T00:00:00Z")
+    assert result.exit_code == 2
+    assert "is of another instrument, gf7_pair_two" in result.stdout
+    file = written(tmp_path, TELEMETRY.replace("gf7_pair", "gf7_pair_two"), {"t_1.csv": table(0, 1)})
+    result = run("ingest", record, file)
+    assert result.exit_code == 2
+    assert re.search(r"telemetry\.yaml:1: instrument: tables of another instrument", result.stderr)
+    silent = run_folder(tmp_path / "silent", config="test: {}\n")
+    assert "does not say of which instrument" in run("ingest", record, silent, "--time", "2026-01-01T00:00:00Z").stdout
+    assert status(record)["entries"] == 0
+    assert "not of gf7_pair_two" in run("init", record, "gf7_pair_two").stderr
+
+
+def test_a_run_that_was_changed_is_refused(record: Path, tmp_path: Path) -> None:
+    folder = run_folder(tmp_path / "run")
+    (folder / "recovered.json").write_text((folder / "recovered.json").read_text().replace("1.0", "1.5"))
+    result = run("ingest", record, folder, "--time", "2026-01-01T00:00:00Z")
+    assert (result.exit_code, "changed since its run: recovered.json" in result.stdout) == (2, True)
+
+
+def test_an_instrument_is_its_content(tmp_path: Path) -> None:
+    """What is only said of it does not count; a prescription's number does."""
+    plain = json.loads(json.dumps(pair().plain()))
+    own = instrument_digest(plain["instrument"], plain["cameras"])
+    assert own == digest_of_job(pair())
+    assert instrument_digest({**plain["instrument"], "description": "another"}, plain["cameras"]) == own
+    (name, camera), *_ = plain["cameras"].items()
+    mirrors = {**camera["mirrors"], "M1": {**camera["mirrors"]["M1"], "radius": "-1.0 m"}}
+    assert instrument_digest(plain["instrument"], {name: {**camera, "mirrors": mirrors}}) != own
+
+
+BAD = {
+    "unknown body": ("base:", "bese:", "no such body with a temperature; did you mean 'base'?", 3),
+    "unit": ("unit: degC", "unit: arcsec", "is a unit of an angle", 3),
+    "sigma": ("sigma: 0.05 K", "sigma: 0 K", "not greater than zero", 3),
+    "kind": ("kind: temperature", "kind: monitor", "no column that says which monitor", 3),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_wrong_description_names_its_line(case: str, record: Path, tmp_path: Path) -> None:
+    old, new, words, line = BAD[case]
+    file = written(tmp_path, TELEMETRY.replace(old, new), {})
+    with History(str(record)) as history, pytest.raises(InputError) as caught:
+        read_telemetry(file, history)
+    assert words in str(caught.value)
+    assert caught.value.line == line
+
+
+def test_a_table_without_a_column_is_refused_as_a_whole(record: Path, tmp_path: Path) -> None:
+    file = written(tmp_path, TELEMETRY, {"t_1.csv": "UTC,T2\n2026-01-01T00:00:00Z,20\n"})
+    assert "no column 'T'; did you mean 'T2'?" in run("ingest", record, file).stdout
+
+
+def test_a_place_without_a_record() -> None:
+    for words in (("status", "/nowhere/at/all"), ("status", "no-such-dialect://x/y"), ("status", "a://b://c:d")):
+        result = run(*words)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("error: no")
+
+
+# --- times -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text", ["1999-12-31T23:59:28Z", "2016-12-31T23:59:59.999999Z", "2016-12-31T23:59:60.5Z", "2017-01-01T00:00:00Z"]
+)
+def test_times_read_back_to_the_microsecond(text: str) -> None:
+    assert utc_text(micros(text)) == text
+
+
+def test_times_count_leap_seconds() -> None:
+    assert micros("2017-01-01T00:00:00Z") - micros("2016-12-31T23:59:59Z") == 2_000_000
+    assert micros("2000-01-01T00:00:00", "TAI") == 0
+    assert micros("2000-01-01T00:00:00", "TT") == -32_184_000
+
+
+# --- nothing is altered ----------------------------------------------------------------------------------
+
+
+def test_the_database_refuses_to_alter_a_record(record: Path) -> None:
+    with History(str(record)) as history:
+        history.take(given("a", [*temperatures(1, 1), *temperatures(0, 1)]))
+    base = sqlite3.connect(record / FILE)
+    names = [name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+    full = [name for name in names if base.execute(f"SELECT count(*) FROM {name}").fetchone()[0]]
+    assert {"entry", "refused", "source", "instrument", "record_schema"} <= set(full)
+    for name in full:
+        for what in (f"DELETE FROM {name}", f"UPDATE {name} SET id = id + 1"):
+            with pytest.raises(sqlite3.IntegrityError, match="a record is never altered"):
+                base.execute(what)
+    base.close()
+
+
+# --- versions --------------------------------------------------------------------------------------------
+
+ONE = """
+CREATE TABLE record_schema (id INTEGER NOT NULL PRIMARY KEY, version INTEGER NOT NULL,
+  made_utc VARCHAR(32) NOT NULL, program TEXT NOT NULL, UNIQUE (version));
+CREATE TABLE instrument (id INTEGER NOT NULL PRIMARY KEY, name TEXT NOT NULL, sha256 VARCHAR(64) NOT NULL,
+  temperature_k TEXT NOT NULL, simulated BOOLEAN NOT NULL, bodies TEXT NOT NULL, plain TEXT NOT NULL, UNIQUE (sha256));
+CREATE TABLE source (id INTEGER NOT NULL PRIMARY KEY, file TEXT NOT NULL, sha256 VARCHAR(64) NOT NULL,
+  taking VARCHAR(64) NOT NULL, taken_utc VARCHAR(32) NOT NULL, rows_read INTEGER NOT NULL, UNIQUE (taking));
+CREATE TABLE frame (id INTEGER NOT NULL PRIMARY KEY, source_id INTEGER NOT NULL REFERENCES source (id),
+  file TEXT NOT NULL, sha256 VARCHAR(64) NOT NULL);
+CREATE INDEX ix_frame_source_id ON frame (source_id);
+CREATE TABLE entry (id INTEGER NOT NULL PRIMARY KEY, sha256 VARCHAR(64) NOT NULL, kind VARCHAR(32) NOT NULL,
+  subject VARCHAR(200) NOT NULL, time_us BIGINT NOT NULL, time_utc VARCHAR(32) NOT NULL, content TEXT NOT NULL,
+  source_id INTEGER NOT NULL REFERENCES source (id), line INTEGER, UNIQUE (sha256));
+CREATE INDEX entry_stream ON entry (kind, subject, time_us);
+"""
+"""A record of version 1, as it was: what was refused was not kept, nor where a reading was found from."""
+
+
+def frozen_one(place: Path) -> None:
+    place.mkdir()
+    base = sqlite3.connect(place / FILE)
+    base.executescript(ONE)
+    for name in ("record_schema", "instrument", "source", "frame", "entry"):
+        for what in ("UPDATE", "DELETE"):
+            body = f"SELECT RAISE(ABORT, 'a record is never altered: {what} of {name}')"
+            base.execute(f"CREATE TRIGGER {name}_no_{what.lower()} BEFORE {what} ON {name} BEGIN {body}; END")
+    (old,) = temperatures(0, 1)
+    base.execute("INSERT INTO record_schema VALUES (1, 1, '2026-01-01T00:00:00Z', 'space-camera-twin 1.0.0')")
+    bodies = json.dumps({"warm": ["base"], "cameras": ["forward", "backward"]})
+    base.execute(
+        "INSERT INTO instrument VALUES (1, 'gf7_pair', ?, '293.15', 1, ?, '{}')", (digest_of_job(pair()), bodies)
+    )
+    base.execute("INSERT INTO source VALUES (1, 'a.csv', ?, ?, '2026-01-01T00:00:00Z', 1)", ("0" * 64, "1" * 64))
+    row = (old.digest, old.kind, old.subject, old.time, utc_text(old.time), json.dumps(old.content), 1, 2)
+    base.execute("INSERT INTO entry VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+    base.commit()
+    base.close()
+
+
+def shape(place: Path) -> dict:
+    found = inspect(create_engine(url_of(str(place))))
+    base = sqlite3.connect(place / FILE)
+    triggers = sorted(name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'"))
+    base.close()
+    return {
+        "triggers": triggers,
+        **{
+            name: (
+                [(c["name"], str(c["type"]), c["nullable"]) for c in found.get_columns(name)],
+                sorted((i["name"], tuple(i["column_names"])) for i in found.get_indexes(name)),
+                sorted(tuple(c["column_names"]) for c in found.get_unique_constraints(name)),
+            )
+            for name in found.get_table_names()
+        },
+    }
+
+
+def test_a_record_of_version_one_is_brought_up(tmp_path: Path, record: Path) -> None:
+    old = tmp_path / "old"
+    frozen_one(old)
+    with pytest.raises(NotARecord, match=r"is of version 1, this program writes 2; python -m twin\.operate init"):
+        History(str(old))
+    result = run("init", old, "gf7_pair", "--json")
+    assert (result.exit_code, json.loads(result.stdout)["versions"]) == (0, [2])
+    assert shape(old) == shape(record)
+    with History(str(old)) as history:
+        taken = history.take(given("b", temperatures(0, 2)))
+        assert (taken.new, taken.known) == (1, 1)  # what version 1 had taken is recognised
+        assert [content_of(row)["values"] for row in history.entries()] == [[293.0], [293.001]]
+    assert json.loads(run("init", old, "gf7_pair", "--json").stdout)["versions"] == []
+
+
+def test_a_record_of_a_later_version_is_left_alone(record: Path) -> None:
+    base = sqlite3.connect(record / FILE)
+    later = schema.VERSION + 1
+    base.execute(f"INSERT INTO record_schema VALUES (9, {later}, '2030-01-01T00:00:00Z', 'x')")
+    base.commit()
+    base.close()
+    with pytest.raises(NotARecord, match=f"is of version {later}, this program knows"):
+        History(str(record))
+    with pytest.raises(NotARecord, match="use a later program"):
+        initialised(str(record), pair())
+
+
+def test_frames_of_a_file_are_kept_with_it(record: Path) -> None:
+    entry = Entry("monitor", "monitor", START, {"numbers": {}}, None, "a" * 64)
+    with History(str(record)) as history:
+        history.take(Given("f", "b" * 64, "", [entry], {"x.tiff": "c" * 64}))
+        with history.reading() as connection:
+            assert connection.exec_driver_sql("SELECT file, sha256 FROM frame").all() == [("x.tiff", "c" * 64)]

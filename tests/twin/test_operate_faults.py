@@ -1,0 +1,251 @@
+"""Whatever happens while a record is written: no reading is lost or doubled, and the record opens."""
+
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.twin.commands import invoke
+from tests.twin.record_bench import (
+    TELEMETRY,
+    given,
+    ingesting,
+    made,
+    postgres_programs,
+    postgres_server,
+    table,
+    temperatures,
+)
+from tests.twin.test_durability import mounted
+from twin.operate.__main__ import app
+from twin.operate.history import FILE, History, RecordFailed
+from twin.operate.record_tables import tables
+from twin.run.data_files import TABLE_FORMATS
+
+FILES, ROWS = 12, 400
+
+
+def telemetry(folder: Path) -> Path:
+    """Twelve tables, each taken in one step."""
+    folder.mkdir()
+    for k in range(FILES):
+        (folder / f"t_{k:02d}.csv").write_text(table(ROWS * k, ROWS))
+    (folder / "telemetry.yaml").write_text(TELEMETRY)
+    return folder / "telemetry.yaml"
+
+
+def times(place: Path | str) -> list[int]:
+    with History(str(place)) as history:
+        return [row["time_us"] for row in history.entries()]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, float, bytes]:
+    """Description of the tables, seconds that an undisturbed ingest takes, and what it exports."""
+    folder = tmp_path_factory.mktemp("whole")
+    file = telemetry(folder / "tm")
+    made(folder / "record").close()
+    start = time.monotonic()
+    process = ingesting(folder / "record", file, "--json")
+    out, error = process.communicate(timeout=120)
+    assert process.returncode == 0, error
+    assert json.loads(out)["new"] == FILES * ROWS
+    return file, time.monotonic() - start, exported(folder / "record")
+
+
+def exported(place: Path | str) -> bytes:
+    with History(str(place)) as history:
+        return b"".join(TABLE_FORMATS["csv"](one) for one in tables(history))
+
+
+@pytest.mark.second
+def test_kill_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    killed(3, tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_kill_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    killed(10, tmp_path, whole)
+
+
+def killed(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    """After SIGKILL each file is there in whole or not at all; taking them again gives what an undisturbed one does."""
+    file, seconds, expected = whole
+    made(tmp_path / "new").close()
+    found = []
+    for k in range(moments):
+        place = Path(shutil.copytree(tmp_path / "new", tmp_path / f"record{k}"))
+        process = ingesting(place, file)
+        # the first third of the time the program starts and reads
+        time.sleep(seconds * (0.4 + 0.55 * k / (moments - 1)))
+        process.kill()
+        process.communicate()
+        there = times(place)
+        assert len(there) == len(set(there))
+        assert len(there) % ROWS == 0
+        found.append(len(there))
+        assert invoke(app, "ingest", place, file, "--quiet").exit_code == 0
+        assert exported(place) == expected
+    assert len(set(found)) > (1 if moments == 3 else 3), found  # they were different moments
+
+
+@pytest.mark.second
+def test_a_power_cut_at_three_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    cut_off(3, tmp_path, whole)
+
+
+@pytest.mark.slow
+def test_a_power_cut_at_ten_moments(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    cut_off(10, tmp_path, whole)
+
+
+def cut_off(moments: int, tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    """Files as they stand while a writer is at work are what a disk has after a power cut: a copy of them opens."""
+    file, seconds, expected = whole
+    made(tmp_path / "record").close()
+    process = ingesting(tmp_path / "record", file)
+    time.sleep(0.35 * seconds)
+    copies = []
+    for k in range(moments):
+        time.sleep(0.5 * seconds / moments)
+        os.kill(process.pid, signal.SIGSTOP)
+        copies.append(Path(shutil.copytree(tmp_path / "record", tmp_path / f"copy{k}")))
+        os.kill(process.pid, signal.SIGCONT)
+    process.communicate(timeout=120)
+    for copy in copies:
+        there = times(copy)
+        assert len(there) == len(set(there))
+        assert len(there) % ROWS == 0
+        assert invoke(app, "ingest", copy, file, "--quiet").exit_code == 0
+        assert exported(copy) == expected
+
+
+def two_writers(place: str, file: Path) -> None:
+    writers = [ingesting(place, file, "--json") for _ in range(2)]
+    done = [(one.communicate(timeout=240), one.returncode) for one in writers]
+    assert [code for _, code in done] == [0, 0], done
+    new = [json.loads(out)["new"] for (out, _), _ in done]
+    known = [json.loads(out)["known"] for (out, _), _ in done]
+    assert sum(new) == FILES * ROWS
+    assert [a + b for a, b in zip(new, known, strict=True)] == [FILES * ROWS] * 2
+
+
+@pytest.mark.second
+def test_two_writers_at_once(tmp_path: Path, whole: tuple[Path, float, bytes]) -> None:
+    made(tmp_path / "record").close()
+    two_writers(str(tmp_path / "record"), whole[0])
+    assert exported(tmp_path / "record") == whole[2]
+
+
+@pytest.mark.second
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to mount a small file system")
+def test_a_full_disk(tmp_path: Path) -> None:
+    """What does not fit is refused as a whole, what was taken stays, and there is room again when the disk has some."""
+    told = []
+    with mounted("-t", "tmpfs", "-o", "size=700k", "tmpfs", at=tmp_path / "disk") as disk:
+        taken = 0
+        with made(disk / "record") as history:
+            for k in range(20):
+                try:
+                    taken += history.take(given(f"t{k}", temperatures(100 * k, 100))).new
+                except RecordFailed as error:
+                    told.append(str(error))
+        assert set(told) == {"database or disk is full"}
+        assert taken > 0
+        there = times(disk / "record")
+        assert len(there) == len(set(there)) == taken
+        shutil.copytree(disk / "record", tmp_path / "larger")
+    base = sqlite3.connect(tmp_path / "larger" / FILE)
+    assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    base.close()
+    with History(str(tmp_path / "larger")) as history:
+        for k in range(20):
+            history.take(given(f"t{k}", temperatures(100 * k, 100)), late=True)
+    assert len(times(tmp_path / "larger")) == 2000
+
+
+def test_the_command_tells_of_a_database_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made(tmp_path / "record").close()
+    base = sqlite3.connect(tmp_path / "record" / FILE)
+    base.execute("BEGIN EXCLUSIVE")
+    monkeypatch.setattr("twin.operate.history.WAIT", 0.1)
+    result = invoke(app, "status", tmp_path / "record")
+    base.close()
+    assert (result.exit_code, "database is locked" in result.stderr) == (1, True)
+
+
+PROGRAMS = postgres_programs()
+HAS_SERVER = pytest.mark.skipif(
+    PROGRAMS is None, reason="no PostgreSQL server: Debian's package postgresql is not installed"
+)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[str]:
+    """Address of an empty database of a server of its own."""
+    pytest.importorskip("psycopg", reason="the extra `postgres` is not installed")
+    assert PROGRAMS is not None
+    with tempfile.TemporaryDirectory(prefix="pg-") as place:  # a socket's path is short
+        Path(place).chmod(0o755)
+        with postgres_server(PROGRAMS, Path(place) / "server") as url:
+            yield url
+
+
+def database(server: str, name: str) -> str:
+    """Address of another database of the server."""
+    import psycopg
+
+    with psycopg.connect(dbname="template1", user="twin", host=server.partition("host=")[2], autocommit=True) as base:
+        base.execute(f"CREATE DATABASE {name} TEMPLATE template0")
+    return server.replace("/record?", f"/{name}?")
+
+
+@HAS_SERVER
+@pytest.mark.second
+def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> None:
+    """The same readings give the same bytes as in SQLite; nothing can be altered; what is known is recognised."""
+    import psycopg
+
+    assert "no record" in invoke(app, "status", server).stderr
+    for place in (server, str(tmp_path / "record")):
+        with made(place) as history:
+            assert history.take(given("a", temperatures(5, 600))).new == 600
+            assert history.take(given("b", temperatures(0, 10))).refused[0][1].endswith("--late takes it")
+            assert history.take(given("b", temperatures(0, 10)), late=True).new == 5
+            assert history.take(given("c", temperatures(0, 605))).known == 605
+    with History(server) as one, History(str(tmp_path / "record")) as two:
+        kept = [[t for t in tables(history) if t.name != "refused"] for history in (one, two)]
+        assert [TABLE_FORMATS["csv"](t) for t in kept[0]] == [TABLE_FORMATS["csv"](t) for t in kept[1]]
+        told = one.status()
+        assert (told["entries"], told["guarded"], told["open"], len(told["refused"])) == (605, True, 0, 5)
+        assert told["streams"] == two.status()["streams"]
+    with psycopg.connect(dbname="record", user="twin", host=server.partition("host=")[2]) as base:
+        for what in ("DELETE FROM entry", "UPDATE source SET file = 'x'", "TRUNCATE refused"):
+            with pytest.raises(psycopg.errors.RaiseException, match="a record is never altered"), base.transaction():
+                base.execute(what)
+
+
+@HAS_SERVER
+@pytest.mark.slow
+def test_writers_and_kills_on_a_postgresql_server(server: str, whole: tuple[Path, float, bytes]) -> None:
+    url = database(server, "writers")
+    made(url).close()
+    two_writers(url, whole[0])
+    assert exported(url) == whole[2]
+    for k in range(4):
+        killed = database(server, f"killed{k}")
+        made(killed).close()
+        process = ingesting(killed, whole[0])
+        time.sleep(whole[1] * (0.4 + 0.2 * k))
+        process.kill()
+        process.communicate()
+        assert len(times(killed)) % ROWS == 0
+        assert invoke(app, "ingest", killed, whole[0], "--quiet").exit_code == 0
+        assert exported(killed) == whole[2]
