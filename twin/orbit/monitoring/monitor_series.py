@@ -217,7 +217,7 @@ class MonitorSeries:
             return np.asarray(every[:, self._own])
         out = []
         for k, number in enumerate(numbers):
-            one, span = slice(k, k + 1), stated.since(spec.course.times[number] - spec.reference)
+            one, span = slice(k, k + 1), stated.between(spec.reference, spec.course.times[number])
             shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
             out.append(Posterior().gain(shifts)[0, self._own])
         return np.array(out)
@@ -236,7 +236,7 @@ class MonitorSeries:
         if stated is not None:
             left = []
             for gain, number in zip(gains, numbers, strict=True):
-                span = stated.since(self.spec.course.times[number] - self.spec.reference)
+                span = stated.between(self.spec.reference, self.spec.course.times[number])
                 root = (gain @ span.spots - span.parameters[self._own]) @ span.root
                 left.append(root @ root.T)
             total = noise + np.array(left)
