@@ -171,7 +171,13 @@ class _Search:
     """
 
     def __init__(
-        self, stated: Disturbances, when: Array, shifts: Array, noise: ShiftNoise, order: Numbers, reference: float | None
+        self,
+        stated: Disturbances,
+        when: Array,
+        shifts: Array,
+        noise: ShiftNoise,
+        order: Numbers,
+        reference: float | None,
     ) -> None:
         self.stated, self.when, self.shifts, self.noise, self.order = stated, when, shifts, noise, order
         self.reference, self.may = reference, candidates(stated)
