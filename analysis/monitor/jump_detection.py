@@ -15,6 +15,9 @@ jump is reported where this sum is below the chance that is stated: a bound that
 false alarms are rarer than stated. A jump that was found becomes an event, and the next one is looked for in what that
 leaves; the last look, the one that finds nothing, is the one that can be wrong in a series whose jumps have all been
 found, so that further looks do not add up (as in Holm's procedure).
+
+Jumps that are too small to be found remain in the readings. Where it is stated how often a motion jumps, the smoother
+takes them for a walk of their mean square.
 """
 
 from __future__ import annotations
@@ -27,11 +30,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import gammaincc, gammaln
+from scipy.special import gammaincc, gammaln, ndtr
 
+from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 
-__all__ = ["MOST", "Candidate", "Jump", "Steps", "candidates", "likeliest", "sized", "steps", "with_jumps"]
+__all__ = [
+    "MOST",
+    "Candidate",
+    "Jump",
+    "Steps",
+    "candidates",
+    "likeliest",
+    "sized",
+    "steps",
+    "with_jumps",
+    "with_unfound",
+]
 
 Array = NDArray[np.float64]
 MOST = 100
@@ -41,6 +56,8 @@ _UNSEEN = 1e-9
 since there float64 leaves nothing of it."""
 _UNLIKELY = 1e-4
 """Likelihood over that of the likeliest time, below which the step did not come at a time."""
+_AHEAD = 100.0
+"""Lengths of the series after its end for which a forecast knows that jumps go on."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """By how much the variance of a jump is tried to be larger than stated."""
 
@@ -189,7 +206,8 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
         squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
         logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
     which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)
-    best, own = may[which], list(may[which].motions)
+    best = may[int(which)]
+    own = list(best.motions)
     rivals: dict[str, float] = {}
     for c, one in enumerate(may):
         if one.body != best.body:
@@ -252,6 +270,41 @@ def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
     for one in found:
         stated = stated.with_copies(one.motions, one.times, one.law)
     return stated
+
+
+def with_unfound(
+    model: Disturbances, found: Sequence[Steps], stated: Disturbances, looks: int, last: float
+) -> Disturbances:
+    """Disturbances with what jumps leave that are too small to be found, where it is stated how often a motion jumps: a
+    walk whose variance grows by the mean square of such steps, the more where measurements are few.
+
+    Args:
+        model: disturbances with the jumps that were found.
+        found: steps at all times, with those jumps known.
+        stated: disturbances as stated, which the first motions of ``model`` are.
+        looks: of the search.
+        last: time of the last measurement, seconds; from there on no jump is found.
+    """
+    after, until, information = (
+        np.concatenate([getattr(one, name) for one in found]) for name in ("after", "until", "information")
+    )
+    if not looks or not len(until):
+        return model
+    size = np.linspace(0.0, 8.0, 401)
+    mean = 2.0 * (size[1] - size[0]) * size**2 * np.exp(-0.5 * size**2) / np.sqrt(2.0 * np.pi)
+    limit = float(np.sqrt(limit_of(stated.jump_false_alarm / looks, 1)))
+    for k, law in enumerate(stated.laws):
+        if law.every_s is None:
+            continue
+        column = stated.spots[:, k]
+        seen = np.sqrt(np.maximum(column @ information @ column, 0.0))
+        left = ndtr(limit - size * seen[:, None]) @ mean
+        grown = np.cumsum(left * (until - after)) / law.every_s
+        ahead = _AHEAD * (last - float(after[0]))
+        knots = [(float(after[0]), 0.0), *zip(until.tolist(), grown.tolist(), strict=True)]
+        knots.append((last + ahead, float(grown[-1]) + ahead / law.every_s))
+        model = model.with_copies((k,), 1.0, TimeLaw(event=tuple(knots)))
+    return model
 
 
 def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None) -> Jump:

@@ -6,10 +6,10 @@ so that shifts s and parameters p at two times have the covariances
     cov(s, s') = sum rho A C A',   cov(p, s') = sum rho B C A',   cov(p, p') = sum rho B C B',
 
 sums over the laws. Changes are counted from the calibration, where nothing had moved, or from a reference time of the
-same process; rho(t, t') is then rho(t, t') - rho(t, t0) - rho(t', t0) + rho(t0, t0). With the noise N of all shifts together
-the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other: u = L^-1 s are
-the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the first n shifts
-is then the sum of the first n products
+same process; rho(t, t') is then rho(t, t') - rho(t, t0) - rho(t', t0) + rho(t0, t0). With the noise N of all shifts
+together the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other:
+u = L^-1 s are the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the
+first n shifts is then the sum of the first n products
 
     p(t) = sum_n (L^-1 cov(s, p(t)))_n u_n,
 
@@ -36,7 +36,17 @@ from scipy.linalg import solve_triangular
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
-from analysis.monitor.jump_detection import MOST, Jump, candidates, likeliest, sized, steps, with_jumps
+from analysis.monitor.jump_detection import (
+    MOST,
+    Jump,
+    Steps,
+    candidates,
+    likeliest,
+    sized,
+    steps,
+    with_jumps,
+    with_unfound,
+)
 
 __all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
 
@@ -87,8 +97,8 @@ class SmoothedSeries:
         innovations: (M,) chi-square of each measurement, in the order given, against what those before it say, each of
             D degrees of freedom.
         consistency: chi-square of the whole series.
-        jumps: that were found, in the order of time; None where nothing is stated to jump. Filtered changes know of them
-            from their time on, as if they had been known then.
+        jumps: that were found, in the order of time; None where nothing is stated to jump. Filtered changes know of
+            them from their time on, as if they had been known then.
     """
 
     filtered: SeriesChanges
@@ -133,8 +143,7 @@ def smooth(
     when = when[order]
     jumps = None
     if any(law.jump for law in stated.laws):
-        jumps = _Search(stated, when, shifts, noise, order, reference).jumps()
-        stated = with_jumps(stated, jumps)
+        jumps, stated = _Search(stated, when, shifts, noise, order, reference).jumps()
     model = _Process(stated, reference)
     width, count = len(stated.parameters), len(wanted)
     found = {
@@ -182,8 +191,8 @@ class _Search:
         self.stated, self.when, self.shifts, self.noise, self.order = stated, when, shifts, noise, order
         self.reference, self.may = reference, candidates(stated)
 
-    def jumps(self) -> tuple[Jump, ...]:
-        """All that are found, in the order of time, with their sizes."""
+    def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
+        """All that are found, in the order of time, with their sizes; and what moves, now that they are known."""
         found = self._further([])
         if len(found) > 1:
             # the first were found when the others were still unknown
@@ -193,7 +202,12 @@ class _Search:
                 found = others if again is None else [*found[:k], again, *found[k + 1 :]]
             found = self._further(found)
         found.sort(key=lambda one: one.until)
-        return tuple(self._sized(one, found) for one in found)
+        model = with_jumps(self.stated, found)
+        if any(law.every_s is not None for law in self.stated.laws):
+            every = self._steps(model)
+            looks = len(self.may) * sum(len(one.until) for one in every)
+            model = with_unfound(model, every, self.stated, looks, float(self.when[-1]))
+        return tuple(self._sized(one, model) for one in found), model
 
     def _further(self, found: list[Jump]) -> list[Jump]:
         while len(found) < MOST and (one := self._look(found)) is not None:
@@ -202,21 +216,21 @@ class _Search:
 
     def _look(self, known: list[Jump]) -> Jump | None:
         """The likeliest jump beside those known, if chance does not explain it."""
-        every = []
-        for part, piece in self._factors(known):
-            every.append(steps(part.root, part.white, part.when, piece, self.reference))
-        one = likeliest(every, self.may, self.stated)
+        one = likeliest(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
         return one if one is not None and one.chance <= self.stated.jump_false_alarm else None
 
-    def _sized(self, one: Jump, found: list[Jump]) -> Jump:
-        for part, piece in self._factors(found):
+    def _steps(self, model: Disturbances) -> list[Steps]:
+        return [steps(one.root, one.white, one.when, piece, self.reference) for one, piece in self._factors(model)]
+
+    def _sized(self, one: Jump, model: Disturbances) -> Jump:
+        for part, piece in self._factors(model):
             if one.until in part.when[piece]:
                 return sized(one, self.stated, part.root, part.white, part.when, self.reference)
         raise AssertionError(f"a jump at {one.until} s is at no measurement")
 
-    def _factors(self, known: list[Jump]) -> Iterator[tuple[_Factor, slice]]:
-        """The measurements of each window with some jumps known, and the piece of them that is the window's own."""
-        process = _Process(with_jumps(self.stated, known), self.reference)
+    def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
+        """The measurements of each window by what moves, and the piece of them that is the window's own."""
+        process = _Process(model, self.reference)
         for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
             own = self.order[window]
             part = _Factor(process, self.when[window], self.shifts[own], self.noise.covariance(own))
@@ -290,7 +304,7 @@ class _Factor:
     def __init__(self, process: _Process, when: Array, shifts: Array, noise: Array) -> None:
         self.process, self.when, self.each = process, when, shifts.shape[1]
         try:
-            self.root = np.linalg.cholesky(process.shifts(when) + noise)
+            self.root: Array = np.linalg.cholesky(process.shifts(when) + noise)
         except np.linalg.LinAlgError as error:
             raise UndeterminedError("smoother: shifts that say the same twice need noise") from error
         self.white = solve_triangular(self.root, shifts.ravel(), lower=True)

@@ -73,7 +73,7 @@ class TimeLawSpec(Spec):
     The others are an amplitude of unknown size; the standard deviation is that of its size:
 
         trend S: (t - since) / S.  relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before.
-        event E: 1 from E on, 0 before.  jump: an event at a time that nobody knows.
+        event E: 1 from E on, 0 before.  jump: an event at a time that nobody knows; jump T: one in T on average.
 
     A trend can be multiplied by a period, a swing that grows; an event by drift and period: what sets in at a moment.
 
@@ -84,6 +84,7 @@ class TimeLawSpec(Spec):
         trend: time in which it grows by its standard deviation, seconds.
         relaxation: time constant with which it goes to a new value, seconds.
         event: when it steps, seconds.
+        jump: mean time between two jumps, seconds; what is too small to be found then counts in sigma.
         since: when a trend or relaxation starts, seconds; 0 by default.
     """
 
@@ -93,6 +94,7 @@ class TimeLawSpec(Spec):
     trend: Span | None = None
     relaxation: Span | None = None
     event: Moment | None = None
+    jump: Span | None = None
     since: Moment | None = None
 
     @model_validator(mode="after")
@@ -100,8 +102,8 @@ class TimeLawSpec(Spec):
         given = {name for name in _TIMES if getattr(self, name) is not None}
         if (self.kind is not None) == bool(given):
             raise Problem("no law of time", self.text, _LAWS)
-        if {"trend", "relaxation", "event"} & given and given not in _PRODUCTS:
-            allowed = "trend alone or with period, relaxation alone, event alone or with drift and period"
+        if given - {"drift", "period"} and given not in _PRODUCTS:
+            allowed = "trend alone or with period, relaxation or jump alone, event alone or with drift and period"
             raise Problem("no law of time: these do not multiply", self.text, allowed)
         if self.since is not None and not {"trend", "relaxation"} & given:
             raise Problem("nothing starts then", self.text, "since beside trend or relaxation", within=("since",))
@@ -117,16 +119,16 @@ class TimeLawSpec(Spec):
         return ", ".join(filter(None, parts)) or "nothing"
 
 
-_TIMES = ("drift", "period", "trend", "relaxation", "event")
+_TIMES = ("drift", "period", "trend", "relaxation", "event", "jump")
 """Keys of a law that make it one."""
 _PRODUCTS = (
-    *({"trend"}, {"trend", "period"}, {"relaxation"}),
+    *({"trend"}, {"trend", "period"}, {"relaxation"}, {"jump"}),
     *({"event"}, {"event", "drift"}, {"event", "period"}, {"event", "drift", "period"}),
 )
 """Which of them go together, beside drift and period."""
 _LAWS = (
     "white, constant, jump, {drift: 6 h}, {period: 95 min}, {trend: 365 d}, {relaxation: 30 d, since: 0 h}, "
-    "{event: 12 h}"
+    "{event: 12 h}, {jump: 400 d}"
 )
 BodyPattern = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 BodyPatterns = Annotated[

@@ -1,4 +1,4 @@
-"""Jumps in a series, against a generator of its own: readings as the aspect camera of Chandra has of its fiducial lights
+"""Jumps in a series, against a generator of its own: readings as the aspect camera of Chandra has of its lights
 (temperature times a coefficient, a trend, jumps, slow recoveries, scatter, missing days), of which the filter knows the
 laws in time and no more; and missions in which nothing jumps, for the chance of a false alarm.
 """
@@ -82,7 +82,7 @@ LAWS = {
     "seasons": (TimeLaw(period_s=YEAR), (1.0, 1.0)),
     "trend": (TimeLaw(trend_s=YEAR), (0.5, 0.5)),
     "mounting": (TimeLaw(), (5.0, 5.0)),
-    "jumps": (TimeLaw(jump=True), (4.0, 4.0)),
+    "jumps": (TimeLaw(jump=True, every_s=400.0 * DAY), (4.0, 4.0)),
 }
 """Cause -> its law and its standard deviation in each axis, arcsec."""
 
@@ -148,7 +148,9 @@ class Score:
                     sigma["yz".index(label[-1])] = math.hypot(sigma["yz".index(label[-1])], s)
             seen = sigma > 0.0
             self.sized += bool(own) and bool(np.all(np.abs(got - size)[seen] < 3.0 * sigma[seen]))
-        self.false += sum(not any(e <= j.after and j.until <= u for e, u in reach) for j in jumps)
+        for j in jumps:  # false where none came when the filter says, nor within two readings of it
+            stated = np.any((one.moments >= j.chances[0][0]) & (one.moments <= j.chances[-1][0]))
+            self.false += not stated and not any(e <= j.after and j.until <= u for e, u in reach)
         ratio = np.abs(values - one.truth) / np.sqrt(np.diagonal(total, 0, 1, 2))
         apart = np.abs(one.wanted[:, None] - one.moments)
         close = np.min(apart, axis=1) < 10.0 * DAY if len(one.moments) else np.zeros(len(one.wanted), bool)

@@ -481,5 +481,6 @@ def _law(law: TimeLawSpec) -> TimeLaw:
         law.relaxation,
         law.since or 0.0,
         () if law.event is None else ((law.event, 1.0),),
-        law.kind == "jump",
+        law.kind == "jump" or law.jump is not None,
+        law.jump,
     )

@@ -316,7 +316,7 @@ def _warnings(
 
 
 _AS_GOOD = 3.0
-"""Difference of the log ratios of two bodies, a factor 20 of likelihood, below which the spots do not tell them apart."""
+"""Difference of log ratios, a factor 20 of likelihood, below which the spots do not tell two bodies apart."""
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
 """Times between two of a course, and in all, at which it is smoothed, too."""
 
