@@ -42,10 +42,11 @@ class TimeLaw:
         relaxation_s: it goes to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before; None for none.
         since_s: where trend and relaxation start, seconds.
         event: a step, (time, chance that it has come by then) in the order of time, linear between; one entry
-            (time, 1) for a known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier of two times: at a time that is not sure to be
-            after the step the motion is known the less. Empty for no step.
-        jump: a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then an
-            event. All others but ``every_s`` are then as by default.
+            (time, 1) for a known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier
+            of two times: at a time that is not sure to be after the step the motion is known the less. Empty for no
+            step.
+        jump: a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then
+            an event. All others but ``every_s`` are then as by default.
         every_s: mean time between two such steps, seconds; None where nothing is stated, and what is too small to be
             found then counts as not there.
     """

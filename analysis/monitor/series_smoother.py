@@ -304,7 +304,7 @@ class _Factor:
     def __init__(self, process: _Process, when: Array, shifts: Array, noise: Array) -> None:
         self.process, self.when, self.each = process, when, shifts.shape[1]
         try:
-            self.root: Array = np.linalg.cholesky(process.shifts(when) + noise)
+            self.root = np.asarray(np.linalg.cholesky(process.shifts(when) + noise), np.float64)
         except np.linalg.LinAlgError as error:
             raise UndeterminedError("smoother: shifts that say the same twice need noise") from error
         self.white = solve_triangular(self.root, shifts.ravel(), lower=True)

@@ -112,7 +112,7 @@ def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
         return ()
     if not together.jumps:
         return (f"No jump was found (a false one with a chance of at most {together.jump_false_alarm:g}).",)
-    return tuple(f"{text[0].upper()}{text[1:]}." for text in together.jump_texts())
+    return tuple(f"The series says that {text}." for text in together.jump_texts())
 
 
 def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:

@@ -348,7 +348,7 @@ class SmoothedCourse:
 
     def jump_texts(self) -> tuple[str, ...]:
         """What jumped, when and how far; sentences without their end."""
-        return tuple(_jump_text(one) for one in self.jumps or ())
+        return tuple(jump_text(one) for one in self.jumps or ())
 
     def between_dict(self) -> dict[str, Any]:
         """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
@@ -374,8 +374,12 @@ class SmoothedCourse:
         }
 
 
-def _jump_text(one: Jump) -> str:
-    """A sentence without its end."""
+def jump_text(one: Jump) -> str:
+    """What jumped, when and how far; a sentence without its end.
+
+    Args:
+        one: a jump that was found.
+    """
     body = one.body
     sizes = ", ".join(
         f"{label.removeprefix(f'{body} ')} {size:+.3g} ± {sigma:.2g} {unit}"
