@@ -357,12 +357,13 @@ def test_how_often_it_jumps_counts_in_a_forecast() -> None:
 
 @pytest.mark.slow
 def test_a_hundred_missions_of_ten_years() -> None:
-    """Nine jumps each, from 0.7 to 12.5 arcsec."""
+    """Nine jumps each, from 0.7 to 12.5 arcsec. Near jumps that were too small to be found sigma does not hold, and no
+    number of it is asked for."""
     score = live(np.random.default_rng(1), 100, 10.0, 9)
     assert score.large > 300
     assert score.found >= 0.98 * score.large
     assert score.sized >= 0.98 * score.large
     assert score.false <= binom.isf(1e-3, 100, 0.01)
     for count, one, two in (score.near, score.away):
-        assert one / count > 0.66
-        assert two / count > 0.93
+        assert one / count > 0.68
+        assert two / count > 0.95
