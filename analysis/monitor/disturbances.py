@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from analysis.chi_square import chance_beyond, density, limit_of
 from analysis.short_repr import shows
@@ -29,21 +29,44 @@ _INFLATIONS = np.logspace(0.0, 8.0, 161)
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """Correlation of a disturbance between two times.
+    """Covariance of a disturbance at two times, where 1 is the square of its stated standard deviation.
+
+    The law is g(t) g(t') rho(t - t') C(t, t'): an amplitude that is known but for its size, a correlation over the gap,
+    and the chance that a step has come by both times. Each factor is positive semidefinite, and so is their product.
 
     Attributes:
-        white: independent at different times; the others are then None.
+        white: independent at different times; all others are then None.
         drift_s: time in which it forgets where it was, seconds, None for never.
         period_s: it comes back with, seconds, None for none.
+        trend_s: it grows linearly, g = (t - since) / trend_s; seconds, None for no growth.
+        relaxation_s: it goes to a new value, g = 1 - exp(-(t - since) / relaxation_s) and 0 before; None for none.
+        since_s: where trend and relaxation start, seconds.
+        event: a step, (time, chance that it has come by then) in the order of time, linear between; one entry
+            (time, 1) for a known moment; above 1 it is the mean number of steps of many. C is the chance at the earlier
+            of two times: at a time that is not sure to be after the step the motion is known the less. Empty for no
+            step.
+        jump: a step whose time nobody knows: it counts as not there until it is found (`jump_detection`), and is then
+            an event. All others but ``every_s`` are then as by default.
+        every_s: mean time between two such steps, seconds; None where nothing is stated, and what is too small to be
+            found then counts as not there.
     """
 
     white: bool = False
     drift_s: float | None = None
     period_s: float | None = None
+    trend_s: float | None = None
+    relaxation_s: float | None = None
+    since_s: float = 0.0
+    event: tuple[tuple[float, float], ...] = ()
+    jump: bool = False
+    every_s: float | None = None
 
-    def correlation(self, gap: Array) -> Array:
-        """Correlation over gaps of time, seconds, of any shape."""
-        away = np.abs(np.asarray(gap, np.float64))
+    def covariance(self, one: ArrayLike, two: ArrayLike) -> Array:
+        """Between times, seconds, of shapes that broadcast; of the shape that both have together."""
+        first, second = np.asarray(one, np.float64), np.asarray(two, np.float64)
+        away = np.abs(first - second)
+        if self.jump:
+            return np.zeros_like(away)
         if self.white:
             return np.asarray(away == 0.0, np.float64)
         out = np.ones_like(away)
@@ -51,6 +74,39 @@ class TimeLaw:
             out = out * np.exp(-away / self.drift_s)
         if self.period_s is not None:
             out = out * np.cos(2.0 * math.pi * away / self.period_s)
+        if self.trend_s is not None or self.relaxation_s is not None:
+            out = out * (self._amplitude(first) * self._amplitude(second))
+        if self.event:
+            out = out * self.come(np.minimum(first, second))
+        return np.asarray(out)
+
+    def come(self, time: ArrayLike) -> Array:
+        """Chance that the step of an event has come by times, seconds, of any shape."""
+        at, chance = np.array(self.event).T
+        when = np.asarray(time, np.float64)
+        if len(at) == 1:
+            return np.asarray((when >= at[0]) * chance[0])
+        return np.asarray(np.interp(when, at, chance))
+
+    def over(self, then: float, now: float) -> tuple[float, float, float]:
+        """Variance at one time, covariance with a later one and variance there; a jump may have come between them.
+
+        Args:
+            then: the earlier time, seconds.
+            now: the later one.
+        """
+        if self.jump:
+            return 0.0, 0.0, 1.0
+        times = ((then, then), (then, now), (now, now))
+        before, across, after = (float(self.covariance(*pair)) for pair in times)
+        return before, across, after
+
+    def _amplitude(self, time: Array) -> Array:
+        out, since = np.ones_like(time), time - self.since_s
+        if self.trend_s is not None:
+            out = out * since / self.trend_s
+        if self.relaxation_s is not None:
+            out = out * -np.expm1(-np.maximum(since, 0.0) / self.relaxation_s)
         return out
 
 
@@ -69,6 +125,7 @@ class Disturbances:
         parameters: (4 K, M) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other, likewise.
         correlation: (M, M), positive semidefinite.
         laws: (M,) in time.
+        jump_false_alarm: chance that a series without a jump has one reported, over all times and motions together.
     """
 
     name: str
@@ -81,6 +138,7 @@ class Disturbances:
     parameters: Array
     correlation: Array
     laws: tuple[TimeLaw, ...]
+    jump_false_alarm: float = FALSE_ALARM
 
     def __post_init__(self) -> None:
         """Check shapes. Raises ValueError."""
@@ -127,14 +185,47 @@ class Disturbances:
         f = np.asarray(factors, np.float64)
         return replace(self, sigmas=self.sigmas * f, spots=self.spots * f, parameters=self.parameters * f)
 
-    def since(self, gap: float) -> Disturbances:
-        """Disturbances over a span of time, in place of those from what the instrument is meant to be.
+    def between(self, then: float, now: float) -> Disturbances:
+        """Disturbances from one time to another, in place of those from what the instrument is meant to be.
 
         Args:
-            gap: between the two times, seconds.
+            then: the earlier time, seconds.
+            now: the later one.
         """
-        kept = np.array([float(law.correlation(np.array(gap))) for law in self.laws])
-        return self.scaled(np.sqrt(2.0 * (1.0 - kept)))
+        over = np.array([law.over(then, now) for law in self.laws]).reshape(-1, 3)
+        return self.scaled(np.sqrt(np.maximum(over[:, 0] + over[:, 2] - 2.0 * over[:, 1], 0.0)))
+
+    def with_copies(self, which: Sequence[int], times: float, law: TimeLaw) -> Disturbances:
+        """Disturbances with copies of some motions beside them, which go together as those do and are independent of
+        them.
+
+        Args:
+            which: numbers of the motions.
+            times: standard deviations of the copies over those of the motions.
+            law: of the copies in time.
+        """
+        own = list(which)
+        count = len(self.labels)
+        correlation = np.zeros((count + len(own),) * 2)
+        correlation[:count, :count] = self.correlation
+        correlation[count:, count:] = self.correlation[np.ix_(own, own)]
+
+        def more(values: tuple[str, ...]) -> tuple[str, ...]:
+            return (*values, *(values[k] for k in own))
+
+        return Disturbances(
+            self.name,
+            more(self.labels),
+            more(self.bodies),
+            more(self.causes),
+            np.append(self.sigmas, times * self.sigmas[own]),
+            more(self.units),
+            np.concatenate([self.spots, times * self.spots[:, own]], axis=1),
+            np.concatenate([self.parameters, times * self.parameters[:, own]], axis=1),
+            correlation,
+            (*self.laws, *(law,) * len(own)),
+            self.jump_false_alarm,
+        )
 
     def best_gain(self, noise: Array) -> Array:
         """Parameters per pixel of the best linear unbiased prediction, B C A' (A C A' + R)^-1, (..., 4 K, D).

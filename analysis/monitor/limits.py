@@ -245,6 +245,7 @@ def extended(stated: Disturbances, spots: Array, own: Sequence[bool]) -> Disturb
         parameters=np.concatenate([stated.parameters, np.zeros((len(stated.parameters), more))], axis=1),
         correlation=correlation,
         laws=laws,
+        jump_false_alarm=stated.jump_false_alarm,
     )
 
 
@@ -277,14 +278,15 @@ def calibrated_sigma(rows: Array, stated: Disturbances, noise: Array, field: Arr
         field: (4 K, 4 K) covariance of what the test field gives.
         gap_s: since then, seconds.
     """
-    kept = np.array([float(law.correlation(np.array(gap_s))) for law in stated.laws])
-    now, then = stated.correlation, stated.correlation * kept
+    before, across, after = np.array([law.over(0.0, gap_s) for law in stated.laws]).reshape(-1, 3).T
+    now, then, old_now = stated.correlation * after, stated.correlation * across, stated.correlation * before
     a, b = stated.spots, stated.parameters
     measured = np.concatenate([a, a, b])
     parts = len(a), 2 * len(a)
     old = np.arange(len(measured)) >= parts[0]
     same = old[:, None] == old[None, :]
-    spread = np.where(same, measured @ now @ measured.T, measured @ then @ measured.T)
+    own = np.where(old, measured @ old_now @ measured.T, measured @ now @ measured.T)
+    spread = np.where(same, own, measured @ then @ measured.T)
     spread[: parts[0], : parts[0]] += noise
     spread[parts[0] : parts[1], parts[0] : parts[1]] += noise
     spread[parts[1] :, parts[1] :] += field

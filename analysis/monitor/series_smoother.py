@@ -1,15 +1,15 @@
 """Changes of the cameras over a series of measurements, at the times of the measurements and between them.
 
-What is stated to move is a normal process: the motions of one law go on with the correlation rho(t - t') of that law,
+What is stated to move is a normal process: the motions of one law go on with the covariance rho(t, t') of that law,
 so that shifts s and parameters p at two times have the covariances
 
     cov(s, s') = sum rho A C A',   cov(p, s') = sum rho B C A',   cov(p, p') = sum rho B C B',
 
 sums over the laws. Changes are counted from the calibration, where nothing had moved, or from a reference time of the
-same process; rho(t - t') is then rho(t - t') - rho(t - t0) - rho(t' - t0) + 1. With the noise N of all shifts together
-the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other: u = L^-1 s are
-the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the first n shifts
-is then the sum of the first n products
+same process; rho(t, t') is then rho(t, t') - rho(t, t0) - rho(t', t0) + rho(t0, t0). With the noise N of all shifts
+together the Cholesky factor of S = cov(s, s') + N, in the order of time, whitens the shifts one after the other:
+u = L^-1 s are the innovations of a Kalman filter, each from what the shifts before it do not say. The estimate from the
+first n shifts is then the sum of the first n products
 
     p(t) = sum_n (L^-1 cov(s, p(t)))_n u_n,
 
@@ -17,12 +17,16 @@ filtered where the sum ends with the last shift up to t, smoothed where it takes
 Kalman filter and of the Rauch-Tung-Striebel smoother, without their state space, and for noise that is not white in
 time, too (Kailath, Sayed, Hassibi, Linear Estimation, 2000, ch. 4; Rasmussen, Williams, Gaussian Processes for Machine
 Learning, 2006, ch. 2). The sum of squares of u is the chi-square of the series.
+
+Where motions are stated to jump, jumps are looked for first (`jump_detection`), and those found are events of the
+process: steps of unknown size, between two measurements of unknown time, so that sigma is wide there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -32,6 +36,17 @@ from scipy.linalg import solve_triangular
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances, TimeLaw
+from analysis.monitor.jump_detection import (
+    MOST,
+    Jump,
+    Steps,
+    candidates,
+    likeliest,
+    sized,
+    steps,
+    with_jumps,
+    with_unfound,
+)
 
 __all__ = ["LARGEST", "SeriesChanges", "ShiftNoise", "SmoothedSeries", "smooth", "window_of"]
 
@@ -82,12 +97,15 @@ class SmoothedSeries:
         innovations: (M,) chi-square of each measurement, in the order given, against what those before it say, each of
             D degrees of freedom.
         consistency: chi-square of the whole series.
+        jumps: that were found, in the order of time; None where nothing is stated to jump. Filtered changes know of
+            them from their time on, as if they had been known then.
     """
 
     filtered: SeriesChanges
     smoothed: SeriesChanges
     innovations: Array
     consistency: Consistency
+    jumps: tuple[Jump, ...] | None = None
 
 
 def window_of(values: int) -> int:
@@ -120,10 +138,13 @@ def smooth(
     Raises:
         ValueError: motions of different laws are correlated, or the shifts have no noise and say the same twice.
     """
-    model = _Process(stated, reference)
     when, wanted = np.asarray(measured, np.float64), np.asarray(times, np.float64)
     order = np.argsort(when, kind="stable")
     when = when[order]
+    jumps = None
+    if any(law.jump for law in stated.laws):
+        jumps, stated = _Search(stated, when, shifts, noise, order, reference).jumps()
+    model = _Process(stated, reference)
     width, count = len(stated.parameters), len(wanted)
     found = {
         which: SeriesChanges(np.empty((count, width)), np.empty((count, width, width)), np.empty((count, width, width)))
@@ -143,7 +164,77 @@ def smooth(
             part.estimate(wanted, mine[k : k + _AT_ONCE], found["filtered"], found["smoothed"])
     degrees = shifts.size
     whole = Consistency(float(squares.sum()), degrees, float(limit_of(FALSE_ALARM, degrees)))
-    return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole)
+    return SmoothedSeries(found["filtered"], found["smoothed"], squares, whole, jumps)
+
+
+class _Search:
+    """Looks for jumps in a series.
+
+    Args:
+        stated: what moves, and how it goes on in time.
+        when: (M,) times of the measurements, seconds, ascending.
+        shifts: (M, D) px, in their own order.
+        noise: of these.
+        order: (M,) numbers of the shifts in the order of time.
+        reference: as of `smooth`.
+    """
+
+    def __init__(
+        self,
+        stated: Disturbances,
+        when: Array,
+        shifts: Array,
+        noise: ShiftNoise,
+        order: Numbers,
+        reference: float | None,
+    ) -> None:
+        self.stated, self.when, self.shifts, self.noise, self.order = stated, when, shifts, noise, order
+        self.reference, self.may = reference, candidates(stated)
+
+    def jumps(self) -> tuple[tuple[Jump, ...], Disturbances]:
+        """All that are found, in the order of time, with their sizes; and what moves, now that they are known."""
+        found = self._further([])
+        if len(found) > 1:
+            # the first were found when the others were still unknown
+            for k in reversed(range(len(found))):
+                others = found[:k] + found[k + 1 :]
+                again = self._look(others)
+                found = others if again is None else [*found[:k], again, *found[k + 1 :]]
+            found = self._further(found)
+        found.sort(key=lambda one: one.until)
+        model = with_jumps(self.stated, found)
+        if any(law.every_s is not None for law in self.stated.laws):
+            every = self._steps(model)
+            looks = len(self.may) * sum(len(one.until) for one in every)
+            model = with_unfound(model, every, self.stated, looks, float(self.when[-1]))
+        return tuple(self._sized(one, model) for one in found), model
+
+    def _further(self, found: list[Jump]) -> list[Jump]:
+        while len(found) < MOST and (one := self._look(found)) is not None:
+            found = [*found, one]
+        return found
+
+    def _look(self, known: list[Jump]) -> Jump | None:
+        """The likeliest jump beside those known, if chance does not explain it."""
+        one = likeliest(self._steps(with_jumps(self.stated, known)), self.may, self.stated)
+        return one if one is not None and one.chance <= self.stated.jump_false_alarm else None
+
+    def _steps(self, model: Disturbances) -> list[Steps]:
+        return [steps(one.root, one.white, one.when, piece, self.reference) for one, piece in self._factors(model)]
+
+    def _sized(self, one: Jump, model: Disturbances) -> Jump:
+        for part, piece in self._factors(model):
+            if one.until in part.when[piece]:
+                return sized(one, self.stated, part.root, part.white, part.when, self.reference)
+        raise AssertionError(f"a jump at {one.until} s is at no measurement")
+
+    def _factors(self, model: Disturbances) -> Iterator[tuple[_Factor, slice]]:
+        """The measurements of each window by what moves, and the piece of them that is the window's own."""
+        process = _Process(model, self.reference)
+        for piece, window in _pieces(len(self.when), window_of(self.shifts.shape[1])):
+            own = self.order[window]
+            part = _Factor(process, self.when[window], self.shifts[own], self.noise.covariance(own))
+            yield part, slice(piece.start - window.start, piece.stop - window.start)
 
 
 def _pieces(count: int, window: int) -> Iterator[tuple[slice, slice]]:
@@ -173,30 +264,31 @@ class _Process:
             across = parameters @ correlation
             self.parts.append((law, spots @ correlation @ spots.T, across @ spots.T, across @ parameters.T))
 
-    def _correlation(self, law: TimeLaw, one: Array, two: Array) -> Array:
+    def _covariance(self, law: TimeLaw, one: Array, two: Array) -> Array:
         """(n, m) of a law between two sets of times."""
-        out = law.correlation(one[:, None] - two)
+        out = law.covariance(one[:, None], two)
         if self.reference is None:
             return out
-        since, until = (law.correlation(times - self.reference) for times in (one, two))
-        return np.asarray(out - since[:, None] - until + 1.0)
+        since, until = (law.covariance(times, self.reference) for times in (one, two))
+        return np.asarray(out - since[:, None] - until + law.covariance(self.reference, self.reference))
 
     def shifts(self, times: Array) -> Array:
         """(n D, n D) px^2."""
-        return _together([(self._correlation(law, times, times), spots) for law, spots, _, _ in self.parts])
+        return _together([(self._covariance(law, times, times), spots) for law, spots, _, _ in self.parts])
 
     def across(self, times: Array, wanted: Array) -> Array:
         """(n D, m 4 K) shifts against parameters."""
-        return _together([(self._correlation(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
+        return _together([(self._covariance(law, times, wanted), cross.T) for law, _, cross, _ in self.parts])
 
     def parameters(self, wanted: Array) -> Array:
         """(m, 4 K, 4 K) of the parameters at each time."""
         width = len(self.parts[0][3])
         out = np.zeros((len(wanted), width, width))
         for law, _, _, own in self.parts:
-            share = np.ones_like(wanted)
+            share = law.covariance(wanted, wanted)
             if self.reference is not None:
-                share = 2.0 * (1.0 - law.correlation(wanted - self.reference))
+                then = law.covariance(self.reference, self.reference)
+                share = share + then - 2.0 * law.covariance(wanted, self.reference)
             out += share[:, None, None] * own
         return out
 
@@ -212,13 +304,18 @@ class _Factor:
     def __init__(self, process: _Process, when: Array, shifts: Array, noise: Array) -> None:
         self.process, self.when, self.each = process, when, shifts.shape[1]
         try:
-            self.root = np.linalg.cholesky(process.shifts(when) + noise)
+            self.root = np.asarray(np.linalg.cholesky(process.shifts(when) + noise), np.float64)
         except np.linalg.LinAlgError as error:
             raise UndeterminedError("smoother: shifts that say the same twice need noise") from error
         self.white = solve_triangular(self.root, shifts.ravel(), lower=True)
-        left = solve_triangular(self.root, noise, lower=True)
-        self.noise = solve_triangular(self.root, left.T, lower=True)
+        self._noise = noise
         self.squares = np.sum(self.white.reshape(shifts.shape) ** 2, axis=1)
+
+    @cached_property
+    def noise(self) -> Array:
+        """(n D, n D) covariance of the whitened shifts by their noise."""
+        left = solve_triangular(self.root, self._noise, lower=True)
+        return np.asarray(solve_triangular(self.root, left.T, lower=True))
 
     def estimate(self, times: Array, at: Numbers, filtered: SeriesChanges, smoothed: SeriesChanges) -> None:
         """Fill in the changes at some of the times.

@@ -112,12 +112,14 @@ class StatedMotions:
         components: cause by cause, body by body.
         correlation: (M, M), positive semidefinite; zero between causes.
         laws: of each component in time.
+        jump_false_alarm: chance that a series without a jump has one reported; None for that of every other test.
     """
 
     name: str
     components: tuple[Component, ...]
     correlation: np.ndarray
     laws: tuple[TimeLawSpec, ...]
+    jump_false_alarm: float | None = None
 
     @property
     def sigma(self) -> np.ndarray:
@@ -138,6 +140,7 @@ class StatedMotions:
             tuple(self.components[k] for k in own),
             self.correlation[np.ix_(own, own)],
             tuple(self.laws[k] for k in own),
+            self.jump_false_alarm,
         )
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -206,7 +209,7 @@ def motions_of_spec(spec: DisturbancesSpec, instrument: Instrument, at: _Where |
         issues += faults
     if issues:
         raise InputError(*issues)
-    return StatedMotions(spec.name, tuple(components), block_diag(*blocks), tuple(laws))
+    return StatedMotions(spec.name, tuple(components), block_diag(*blocks), tuple(laws), spec.jump_false_alarm)
 
 
 def check_heat(resolved: ResolvedJob, stated: StatedMotions, thermal: ThermalModel) -> None:

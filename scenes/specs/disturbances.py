@@ -48,6 +48,7 @@ RadiusSigma = Annotated[float, _spread(units.SCALE, "1 percent")]
 ConicSigma = Annotated[Number, Field(ge=0.0, le=1.0)]
 FigureSigma = Annotated[float, _spread(units.LENGTH, "100 um")]
 Span = Annotated[float, Quantity(units.MOMENT, above_zero=True, largest="1000000 h")]
+Moment = Annotated[float, Quantity(units.MOMENT, smallest="-1000000 h", largest="1000000 h")]
 Correlation = Annotated[Number, Field(ge=-1.0, le=1.0)]
 
 
@@ -69,41 +70,73 @@ class TimeLawSpec(Spec):
         white: 1 at the same time, 0 at any other; constant: 1.
         drift D: exp(-|t - t'| / D).  period T: cos(2 pi (t - t') / T).  Both: their product.
 
+    The others are an amplitude of unknown size; the standard deviation is that of its size:
+
+        trend S: (t - since) / S.  relaxation R: 1 - exp(-(t - since) / R) from `since` on, 0 before.
+        event E: 1 from E on, 0 before.  jump: an event at a time that nobody knows; jump T: one in T on average.
+
+    A trend can be multiplied by a period, a swing that grows; an event by drift and period: what sets in at a moment.
+
     Attributes:
-        kind: `white` or `constant`, in place of the others.
+        kind: `white`, `constant` or `jump`, in place of the others.
         drift: time in which it forgets where it was, seconds.
         period: it comes back with, seconds.
+        trend: time in which it grows by its standard deviation, seconds.
+        relaxation: time constant with which it goes to a new value, seconds.
+        event: when it steps, seconds.
+        jump: mean time between two jumps, seconds; what is too small to be found then counts in sigma.
+        since: when a trend or relaxation starts, seconds; 0 by default.
     """
 
-    kind: Literal["white", "constant"] | None = None
+    kind: Literal["white", "constant", "jump"] | None = None
     drift: Span | None = None
     period: Span | None = None
+    trend: Span | None = None
+    relaxation: Span | None = None
+    event: Moment | None = None
+    jump: Span | None = None
+    since: Moment | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> "TimeLawSpec":
-        given = [self.drift is not None, self.period is not None]
-        if (self.kind is not None) == any(given):
-            raise Problem(
-                "no law of time", self.text, "white, constant, {drift: 6 h}, {period: 95 min}, or the last two"
-            )
+        given = {name for name in _TIMES if getattr(self, name) is not None}
+        if (self.kind is not None) == bool(given):
+            raise Problem("no law of time", self.text, _LAWS)
+        if given - {"drift", "period"} and given not in _PRODUCTS:
+            allowed = "trend alone or with period, relaxation or jump alone, event alone or with drift and period"
+            raise Problem("no law of time: these do not multiply", self.text, allowed)
+        if self.since is not None and not {"trend", "relaxation"} & given:
+            raise Problem("nothing starts then", self.text, "since beside trend or relaxation", within=("since",))
         return self
 
     @property
     def text(self) -> str:
         """In words."""
         parts: list[str] = [self.kind or ""]
-        parts += [f"drift {moment(self.drift)}"] if self.drift is not None else []
-        parts += [f"period {moment(self.period)}"] if self.period is not None else []
+        for name in (*_TIMES, "since"):
+            time = getattr(self, name)
+            parts += [f"{name} {moment(time)}"] if time is not None else []
         return ", ".join(filter(None, parts)) or "nothing"
 
 
+_TIMES = ("drift", "period", "trend", "relaxation", "event", "jump")
+"""Keys of a law that make it one."""
+_PRODUCTS = (
+    *({"trend"}, {"trend", "period"}, {"relaxation"}, {"jump"}),
+    *({"event"}, {"event", "drift"}, {"event", "period"}, {"event", "drift", "period"}),
+)
+"""Which of them go together, beside drift and period."""
+_LAWS = (
+    "white, constant, jump, {drift: 6 h}, {period: 95 min}, {trend: 365 d}, {relaxation: 30 d, since: 0 h}, "
+    "{event: 12 h}, {jump: 400 d}"
+)
 BodyPattern = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 BodyPatterns = Annotated[
     tuple[BodyPattern, ...], Field(min_length=1), short_for(None, str, schema=BodyPattern | tuple[BodyPattern, ...])
 ]
 Reason = Annotated[Text, Field(min_length=1)]
 FigureSigmas = Annotated[dict[Term, FigureSigma], AfterValidator(FrozenMap)]
-TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant"] | TimeLawSpec)]
+TimeLaw = Annotated[TimeLawSpec, short_for("kind", str, schema=Literal["white", "constant", "jump"] | TimeLawSpec)]
 MOVES = ("shift", "rotate", "scale", "figure", "radius", "conic", "temperature", "index_gradient")
 """Keys of a cause that hold standard deviations."""
 
@@ -425,11 +458,14 @@ class DisturbancesSpec(TitledSpec):
         causes: by name.
         joint: components of bodies, each by its name, that go together as an estimate of them does; besides the causes,
             or in their place.
+        jump_false_alarm: chance that a series in which nothing jumps has a jump reported, over all its times and all
+            components whose law in time is `jump`; 0.001 by default.
     """
 
     sigmas: Annotated[Number, Field(gt=0.0, le=10.0)] = 1.0
     causes: Named[CauseSpec] = Field(default_factory=FrozenMap)
     joint: JointSpec | None = None
+    jump_false_alarm: Annotated[Number, Field(gt=0.0, le=0.5)] | None = None
 
     @model_validator(mode="after")
     def _states_something(self) -> "DisturbancesSpec":

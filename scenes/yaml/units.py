@@ -103,6 +103,7 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "ppm": (Decimal("1e-6"), ""),
     "percent": (Decimal("1e-2"), ""),
     "um/m": (Decimal("1e-6"), ""),
+    "d": (Decimal(86_400), "s"),
     "h": (Decimal(3600), "s"),
     "min": (Decimal(60), "s"),
     "s": (Decimal(1), "s"),

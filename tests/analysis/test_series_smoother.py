@@ -81,7 +81,7 @@ def dense(stated: Disturbances, times: np.ndarray, reference: float | None) -> n
 
     def rho(i: int, t: float, u: float) -> float:
         def plain(a: float, b: float) -> float:
-            return float(laws[i].correlation(np.array(a - b)))
+            return float(laws[i].covariance(a, b))
 
         if reference is None:
             return plain(t, u)
@@ -282,7 +282,7 @@ def test_one_measurement_since_a_reference_is_the_posterior_of_that_span() -> No
     own, shared = random_noise(rng, 1)
     shifts, _ = drawn(rng, stated, np.array([7.0]), own, shared, np.array([7.0]), -30.0)
     found = smooth(stated, [7.0], shifts, noise_of(own, shared), [7.0], -30.0)
-    span = stated.since(37.0)
+    span = stated.between(-30.0, 7.0)
     gain = Posterior().gain(Shifts(np.zeros((1, 2, 2)), shifts.reshape(1, 2, 2), own + shared, {}, span))
     close(found.smoothed.values[0], gain[0] @ shifts[0], stated.parameter_covariance)
     total = gain[0] @ (own + shared)[0] @ gain[0].T + span.misfit(gain)[0]

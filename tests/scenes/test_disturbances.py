@@ -319,6 +319,8 @@ OF_FILE = {
     "law": (f"  a: {{{M2}, shift: 1 um, time: pink, reason: r}}", "a.time.kind", "white, constant"),
     "two laws": (f"  a: {{{M2}, shift: 1 um, time: {{kind: white, drift: 1 h}}, reason: r}}", "a.time", "no law of"),
     "no law": (f"  a: {{{M2}, shift: 1 um, time: {{}}, reason: r}}", "a.time", "{drift: 6 h}"),
+    "no product": (f"  a: {{{M2}, shift: 1 um, time: {{trend: 1 d, drift: 1 h}}, reason: r}}", "a.time", "trend alone"),
+    "no start": (f"  a: {{{M2}, shift: 1 um, time: {{drift: 1 d, since: 1 h}}, reason: r}}", "a.time.since", "beside"),
     "no time": (f"  a: {{{M2}, shift: 1 um, time: {{drift: 0 h}}, reason: r}}", "a.time.drift", "greater than zero"),
     "wrong time": (f"  a: {{{M2}, shift: 1 um, time: {{period: 3 K}}, reason: r}}", "a.time.period", "min"),
 }  # fmt: skip

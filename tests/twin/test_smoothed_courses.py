@@ -32,7 +32,7 @@ def drawn(stated: Disturbances, times: np.ndarray, rng: np.random.Generator) -> 
     out = np.empty((len(times), len(stated.labels)))
     for law in dict.fromkeys(stated.laws):
         own = np.array([one == law for one in stated.laws])
-        values, vectors = np.linalg.eigh(law.correlation(times[:, None] - times))
+        values, vectors = np.linalg.eigh(law.covariance(times[:, None], times))
         along = vectors * np.sqrt(np.clip(values, 0.0, None))
         together = np.linalg.cholesky(stated.correlation[np.ix_(own, own)] + 1e-12 * np.eye(own.sum()))
         out[:, own] = along @ rng.standard_normal((len(times), own.sum())) @ together.T

@@ -103,6 +103,19 @@ def course_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
         together: the course.
         times: of its measurements, seconds.
     """
+    return " ".join((_series_agrees(together, times), *_jumps_told(together)))
+
+
+def _jumps_told(together: SmoothedCourse) -> tuple[str, ...]:
+    """What jumped, or that nothing did, where something may; sentences."""
+    if together.jumps is None:
+        return ()
+    if not together.jumps:
+        return (f"No jump was found (a false one with a chance of at most {together.jump_false_alarm:g}).",)
+    return tuple(f"The series says that {text}." for text in together.jump_texts())
+
+
+def _series_agrees(together: SmoothedCourse, times: np.ndarray) -> str:
     found = together.consistency
     what = f"Chi-square of all {len(times)} measurements is {found.chi_square:.4g}"
     if found.chance > 1.0 - FALSE_ALARM:

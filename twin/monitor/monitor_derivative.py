@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.disturbances import FALSE_ALARM, Disturbances, TimeLaw
 from optics.geometry.tree import AT_REST, COMPLEX_STEP, FIGURE, ORIGIN, PlacedBodies, State, compose
 from optics.numerics.array_math import inverse, turned
 from optics.numerics.backend import Backend
@@ -381,6 +381,7 @@ def disturbances_of(
         parameters=parameters * sigma,
         correlation=stated.correlation,
         laws=tuple(_law(law) for law in stated.laws),
+        jump_false_alarm=stated.jump_false_alarm or FALSE_ALARM,
     )
 
 
@@ -472,4 +473,14 @@ def derivative_changes(
 
 
 def _law(law: TimeLawSpec) -> TimeLaw:
-    return TimeLaw(law.kind == "white", law.drift, law.period)
+    return TimeLaw(
+        law.kind == "white",
+        law.drift,
+        law.period,
+        law.trend,
+        law.relaxation,
+        law.since or 0.0,
+        () if law.event is None else ((law.event, 1.0),),
+        law.kind == "jump" or law.jump is not None,
+        law.jump,
+    )

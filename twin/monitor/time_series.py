@@ -12,6 +12,7 @@ from analysis.monitor.calibration import CameraCalibration
 from analysis.monitor.curvature import Curvature
 from analysis.monitor.disturbances import FALSE_ALARM, Consistency, Disturbances
 from analysis.monitor.ground_error import GroundGeometry
+from analysis.monitor.jump_detection import Jump
 from analysis.monitor.recovery import Recovery, estimates_of
 from analysis.monitor.series_smoother import smooth, window_of
 from analysis.monitor.spot_evidence import SpotEvidence
@@ -24,7 +25,7 @@ from scenes.models.thermal_model import TemperatureError
 from scenes.specs.course import CourseSpec, moment
 from scenes.specs.job import JobSpec
 from scenes.specs.resolved import ResolvedJob
-from scenes.yaml.errors import InputError
+from scenes.yaml.errors import InputError, names_text
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import LOST, Observing, observe, one_detector, why_lost
@@ -250,6 +251,8 @@ def run_series(
         reason = f"the spot {channels[spot].key} cannot be measured ({error.reasons[error.indices[0]]})"
         raise too_large(job, done + k, reason) from error
     moves = [motions_of(job, k) for k in range(len(states))]
+    smoothed = together.smoothed()
+    jumped = () if smoothed is None else smoothed.jump_texts()
     return TimeSeries(
         times=np.array(course.times),
         temperatures={path: tuple(job.fields(k)[path] for k in range(len(states))) for path in job.fields(0)},
@@ -257,13 +260,13 @@ def run_series(
         shown=course.shown,
         angle=angle,
         readings=ReadingTable.joined(tables),
-        smoothed=together.smoothed(),
+        smoothed=smoothed,
         shift=np.concatenate([r.shift for r in recoveries]),
         shift_covariance=np.concatenate([r.shift_covariance for r in recoveries]),
         photons=photons,
         shown_photons=shown_photons,
         frames=first,
-        warnings=_warnings(experiment, course, saturated, share),
+        warnings=(*_warnings(experiment, course, saturated, share), *(f"course: {text}" for text in jumped)),
         evidence=SpotEvidence.joined([r.evidence for r in recoveries if r.evidence is not None]),
         curvature={e: Curvature.joined([r.curvature[e] for r in recoveries]) for e in recoveries[0].curvature},
     )
@@ -312,6 +315,8 @@ def _warnings(
     return tuple(out)
 
 
+_AS_GOOD = 3.0
+"""Difference of log ratios, a factor 20 of likelihood, below which the spots do not tell two bodies apart."""
 MOST_BETWEEN, LARGEST_BETWEEN = 7, 400
 """Times between two of a course, and in all, at which it is smoothed, too."""
 
@@ -327,6 +332,8 @@ class SmoothedCourse:
         times: (F,) between those of the course, seconds; between: the changes there, likewise.
         innovations: (T,) chi-square of each measurement against what those before it say; each: its degrees of freedom.
         consistency: chi-square of the whole series.
+        jumps: that were found; None where nothing is stated to jump; jump_false_alarm: chance that a series without any
+            has one.
     """
 
     name: str
@@ -336,6 +343,12 @@ class SmoothedCourse:
     innovations: np.ndarray
     each: int
     consistency: Consistency
+    jumps: tuple[Jump, ...] | None = None
+    jump_false_alarm: float = FALSE_ALARM
+
+    def jump_texts(self) -> tuple[str, ...]:
+        """What jumped, when and how far; sentences without their end."""
+        return tuple(jump_text(one) for one in self.jumps or ())
 
     def between_dict(self) -> dict[str, Any]:
         """Filtered and smoothed changes between the times of the course, as course.json has those at its times."""
@@ -344,6 +357,10 @@ class SmoothedCourse:
     def to_dict(self) -> dict[str, Any]:
         """Do the measurements agree with what is stated?"""
         found = self.consistency
+        searched: dict[str, Any] = {}
+        if self.jumps is not None:
+            told = [one.to_dict() for one in self.jumps]
+            searched = {"jumps": {"false_alarm": self.jump_false_alarm, "found": told}}
         return {
             "name": self.name,
             "chi_square": found.chi_square,
@@ -353,7 +370,27 @@ class SmoothedCourse:
             "chance": found.chance,
             "agrees": found.agrees,
             "innovations": {"chi_square": self.innovations.tolist(), "degrees_of_freedom": self.each},
+            **searched,
         }
+
+
+def jump_text(one: Jump) -> str:
+    """What jumped, when and how far; a sentence without its end.
+
+    Args:
+        one: a jump that was found.
+    """
+    body = one.body
+    sizes = ", ".join(
+        f"{label.removeprefix(f'{body} ')} {size:+.3g} ± {sigma:.2g} {unit}"
+        for label, size, sigma, unit in zip(one.labels, one.sizes, one.sigmas, one.units, strict=True)
+    )
+    rivals = [other for other, ratio in one.rivals.items() if ratio > one.log_ratio - _AS_GOOD]
+    others = f"; {names_text(rivals[:3])} would explain it nearly as well" if rivals else ""
+    return (
+        f"{body} jumped between {moment(one.after)} and {moment(one.until)}: {sizes}, log ratio {one.log_ratio:.1f}; "
+        f"sigmas are wide there, and smoothed changes take it for an event{others}"
+    )
 
 
 class CourseSmoother:
@@ -421,4 +458,14 @@ class CourseSmoother:
         count = len(times)
         each = found.consistency.degrees // count
         at, rest = part(slice(count)), part(slice(count, None))
-        return SmoothedCourse(stated.name, at, between, rest, found.innovations, each, found.consistency)
+        return SmoothedCourse(
+            stated.name,
+            at,
+            between,
+            rest,
+            found.innovations,
+            each,
+            found.consistency,
+            found.jumps,
+            stated.jump_false_alarm,
+        )

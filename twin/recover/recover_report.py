@@ -155,6 +155,8 @@ def _warnings(run: RecoverRun) -> tuple[str, ...]:
         when = f" at {moment(run.times[worst[0]])}, the worst of {len(run.times)} times"
         rate += " for the series"
     found = (*run.warnings, *contradicted(run.last.disturbances, worst[1], when, rate))
+    if run.smoothed is not None:
+        found += run.smoothed.jump_texts()
     if run.smoothed is not None and not run.smoothed.consistency.agrees:
         # each time may agree with what moves, and all of them not with how it goes on in time
         found += (

@@ -11,6 +11,7 @@ import numpy as np
 
 from analysis.monitor.disturbances import Consistency
 from analysis.monitor.estimators import LeastSquares, Posterior, Shifts
+from analysis.monitor.jump_detection import Jump
 from analysis.monitor.monitoring import CameraParameters
 from analysis.monitor.recovery import MeasuredSpots, Recovery, judged_spots
 from analysis.monitor.series_smoother import smooth, window_of
@@ -73,10 +74,12 @@ class SmoothedReadings:
     Attributes:
         readings: at all times of the course.
         consistency: chi-square of the measurements.
+        jumps: that were found; None where nothing is stated to jump.
     """
 
     readings: Readings
     consistency: Consistency
+    jumps: tuple[Jump, ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +220,7 @@ class MonitorSeries:
             return np.asarray(every[:, self._own])
         out = []
         for k, number in enumerate(numbers):
-            one, span = slice(k, k + 1), stated.since(spec.course.times[number] - spec.reference)
+            one, span = slice(k, k + 1), stated.between(spec.reference, spec.course.times[number])
             shifts = Shifts(before[one], after[one], measured.covariance[one], cameras, span)
             out.append(Posterior().gain(shifts)[0, self._own])
         return np.array(out)
@@ -236,7 +239,7 @@ class MonitorSeries:
         if stated is not None:
             left = []
             for gain, number in zip(gains, numbers, strict=True):
-                span = stated.since(self.spec.course.times[number] - self.spec.reference)
+                span = stated.between(self.spec.reference, self.spec.course.times[number])
                 root = (gain @ span.spots - span.parameters[self._own]) @ span.root
                 left.append(root @ root.T)
             total = noise + np.array(left)
@@ -261,7 +264,9 @@ class MonitorSeries:
         own, late = self._own, found.smoothed
         block = np.ix_(np.arange(len(times)), own, own)
         return SmoothedReadings(
-            Readings(self.pair, late.values[:, own], late.noise[block], late.total[block]), found.consistency
+            Readings(self.pair, late.values[:, own], late.noise[block], late.total[block]),
+            found.consistency,
+            found.jumps,
         )
 
     def by_camera(self, gains: np.ndarray, shifts: np.ndarray) -> Mapping[str, np.ndarray]:

@@ -10,6 +10,7 @@ from analysis.monitor.monitoring import PER_SI
 from analysis.units import ARCSEC
 from scenes.specs.course import moment
 from scenes.specs.orbit.monitor import PARAMETERS
+from twin.monitor.time_series import jump_text
 from twin.orbit.monitoring.monitoring_numbers import SUMMARY
 from twin.orbit.monitoring.monitoring_plots import PART_NAMES, figure_svg
 from twin.orbit.monitoring.monitoring_run import FALSE_ALARM, MonitorRun, rms
@@ -351,6 +352,8 @@ def _facts(setup: MonitorSetup) -> tuple[tuple[str, str], ...]:
 
 def _warnings(run: MonitorRun) -> tuple[str, ...]:
     out = [*coarse_warnings(run.setup), *run.flight.doubts]
+    together = run.flight.smoothed.get(run.flight.spec.interval)
+    out += [jump_text(one) for one in (together.jumps if together is not None else None) or ()]
     if not run.scatter.agrees:
         low, high = run.scatter.limits
         ratio = run.scatter.spread / run.scatter.sigma

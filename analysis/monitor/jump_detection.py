@@ -1,0 +1,327 @@
+"""Jumps: steps of a body at a time that nobody knows, found in a series of measurements.
+
+Whitened shifts u = L^-1 s of a series in which nothing jumps are independent numbers of unit variance, with L the
+Cholesky factor of their covariance by all else that moves and by noise. A step of amounts z of some motions between the
+measurements k - 1 and k adds G_k A z to them, G_k = L^-1 (e_k x 1), e_k being 1 from measurement k on. The generalised
+likelihood ratio of that step against none, its amounts being free, is
+
+    2 log ratio = b' J^-1 b,   b = A' G_k' u,   J = A' G_k' G_k A,
+
+which without a step is chi-square of as many degrees of freedom as the spots see motions (Willsky, Jones, IEEE Trans.
+Automat. Contr. 21, 1976, 108; Basseville, Nikiforov, Detection of Abrupt Changes, 1993, ch. 7). It is looked for at
+every measurement, with every motion alone and with all motions of a body together. The chance of as large a ratio
+anywhere is at most the sum of the chances of all these looks (Boole's inequality), whatever their correlations, and a
+jump is reported where this sum is below the chance that is stated: a bound that needs no simulation, and from which
+false alarms are rarer than stated. A jump that was found becomes an event, and the next one is looked for in what that
+leaves; the last look, the one that finds nothing, is the one that can be wrong in a series whose jumps have all been
+found, so that further looks do not add up (as in Holm's procedure).
+
+Jumps that are too small to be found remain in the readings. Where it is stated how often a motion jumps, the smoother
+takes them for a walk of their mean square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import gammaincc, gammaln, ndtr
+
+from analysis.chi_square import limit_of
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+
+__all__ = [
+    "MOST",
+    "Candidate",
+    "Jump",
+    "Steps",
+    "candidates",
+    "likeliest",
+    "sized",
+    "steps",
+    "with_jumps",
+    "with_unfound",
+]
+
+Array = NDArray[np.float64]
+MOST = 100
+"""Jumps that are looked for in one series."""
+_UNSEEN = 1e-9
+"""Of the largest eigenvalue of J, in standard deviations that are stated: what the spots see less of is not looked for,
+since there float64 leaves nothing of it."""
+_UNLIKELY = 1e-4
+"""Likelihood over that of the likeliest time, below which the step did not come at a time."""
+_AHEAD = 100.0
+"""Lengths of the series after its end for which a forecast knows that jumps go on."""
+_INFLATIONS = np.logspace(0.0, 8.0, 161)
+"""By how much the variance of a jump is tried to be larger than stated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Motions that may jump together.
+
+    Attributes:
+        body: whose they are.
+        motions: their numbers among the disturbances.
+        spots: (D, r) px, for independent amounts of unit variance that make the stated motions.
+    """
+
+    body: str
+    motions: tuple[int, ...]
+    spots: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Of steps at K times, what all of them need; `likeliest` takes it for motions of any body.
+
+    Attributes:
+        after, until: (K,) the step comes after the one and not after the other, seconds.
+        score: (K, D) G' u.
+        information: (K, D, D) G' G.
+    """
+
+    after: Array
+    until: Array
+    score: Array
+    information: Array
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A jump that was found.
+
+    Attributes:
+        body: that explains it best.
+        motions: numbers of its motions among the disturbances; labels, units: theirs.
+        sizes: of the jump in these units; sigmas: their standard deviations.
+        after, until: between which measurements it is likeliest, seconds.
+        chances: (time, chance that it has come by then), seconds, linear between.
+        log_ratio: of the likelihoods with it and without it.
+        chance: of as large a ratio anywhere in the series if nothing jumps, at most.
+        rivals: other bodies -> their best log ratio at the same time, best first.
+        times: standard deviations of the jump over those stated, which the smoother takes it to have.
+    """
+
+    body: str
+    motions: tuple[int, ...]
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    sizes: tuple[float, ...]
+    sigmas: tuple[float, ...]
+    after: float
+    until: float
+    chances: tuple[tuple[float, float], ...]
+    log_ratio: float
+    chance: float
+    rivals: Mapping[str, float]
+    times: float
+
+    @cached_property
+    def law(self) -> TimeLaw:
+        """What it is once it was found."""
+        return TimeLaw(event=self.chances)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As JSON files have it."""
+        amounts = zip(self.labels, self.units, self.sizes, self.sigmas, strict=True)
+        return {
+            "body": self.body,
+            "after_s": self.after,
+            "until_s": self.until,
+            "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in amounts],
+            "log_ratio": self.log_ratio,
+            "false_alarm": self.chance,
+            "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
+        }
+
+
+def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
+    """What may jump: each motion whose law is `jump` alone, and those of a body together.
+
+    Args:
+        stated: disturbances; motions that move no spot are left out.
+    """
+    jumping = [k for k, law in enumerate(stated.laws) if law.jump and np.any(stated.spots[:, k])]
+    bodies: dict[str, list[int]] = {}
+    for k in jumping:
+        bodies.setdefault(stated.bodies[k], []).append(k)
+    groups = [(k,) for k in jumping] + [tuple(own) for own in bodies.values() if len(own) > 1]
+    out = []
+    for own in groups:
+        values, vectors = np.linalg.eigh(stated.correlation[np.ix_(own, own)])
+        root = vectors * np.sqrt(np.clip(values, 0.0, None))
+        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root))
+    return tuple(out)
+
+
+def steps(root: Array, white: Array, when: Array, inside: slice, reference: float | None) -> Steps:
+    """Steps between any two measurements that follow each other.
+
+    Args:
+        root: L, (n D, n D) lower triangular.
+        white: (n D,) L^-1 s.
+        when: (n,) times of the measurements, seconds, ascending.
+        inside: measurements of which each may be the first after the step; of all, of the piece that is looked at.
+        reference: from when changes are counted, seconds; None for the calibration, and a step before the first
+            measurement is then no step.
+    """
+    each = len(white) // len(when)
+    before = np.concatenate([[np.inf if reference is None else reference], when[:-1]])
+    after = before if reference is None else np.where(when > reference, np.maximum(before, reference), before)
+    at = np.arange(len(when))[inside]
+    at = at[after[at] < when[at]]
+    come = (when[:, None] >= when[at]).astype(np.float64)
+    if reference is not None:
+        come -= reference >= when[at]
+    every = solve_triangular(root, np.kron(come, np.eye(each)), lower=True).reshape(len(white), len(at), each)
+    every = every.transpose(1, 2, 0)
+    return Steps(after[at], when[at], every @ white, every @ every.transpose(0, 2, 1))
+
+
+def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturbances) -> Jump | None:
+    """The jump that is hardest to explain by chance; None where nothing can be looked for. Its sizes are not yet known.
+
+    Args:
+        found: steps at all times that are looked at, piece by piece.
+        may: what may jump.
+        stated: disturbances that have these motions.
+    """
+    parts = [one for one in found if len(one.until)]
+    if not parts or not may:
+        return None
+    score, information = (np.concatenate([getattr(p, name) for p in parts]) for name in ("score", "information"))
+    after, until = (np.concatenate([getattr(p, name) for p in parts]) for name in ("after", "until"))
+    squares, logs = np.empty((len(may), len(until))), np.empty((len(may), len(until)))
+    for c, one in enumerate(may):
+        values, vectors = np.linalg.eigh(one.spots.T @ information @ one.spots)
+        along = np.einsum("kij,ki->kj", vectors, score @ one.spots)
+        seen = values > _UNSEEN * values.max()
+        squares[c] = np.sum(np.where(seen, along**2 / np.where(seen, values, 1.0), 0.0), axis=1)
+        logs[c] = _log_chance(squares[c], np.sum(seen, axis=1))
+    which, k = np.unravel_index(int(np.argmin(logs)), logs.shape)
+    best = may[int(which)]
+    own = list(best.motions)
+    rivals: dict[str, float] = {}
+    for c, one in enumerate(may):
+        if one.body != best.body:
+            rivals[one.body] = max(rivals.get(one.body, 0.0), 0.5 * float(squares[c, k]))
+    return Jump(
+        body=best.body,
+        motions=best.motions,
+        labels=tuple(stated.labels[m] for m in own),
+        units=tuple(stated.units[m] for m in own),
+        sizes=(np.nan,) * len(own),
+        sigmas=(np.nan,) * len(own),
+        after=float(after[k]),
+        until=float(until[k]),
+        chances=_chances(after, until, 0.5 * squares[which]),
+        log_ratio=0.5 * float(squares[which, k]),
+        chance=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
+        rivals=dict(sorted(rivals.items(), key=lambda item: -item[1])),
+        times=_larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
+    )
+
+
+def _log_chance(square: Array, degrees: NDArray[np.int_]) -> Array:
+    """Logarithm of the chance of a larger chi-square, also where the chance is too small for float64."""
+    half, shape = 0.5 * square, 0.5 * np.maximum(degrees, 1)
+    chance = gammaincc(shape, half)
+    far = (shape - 1.0) * np.log(np.maximum(half, 1.0)) - half - gammaln(shape)
+    return np.asarray(np.where(chance > 1e-280, np.log(np.maximum(chance, 1e-280)), far))
+
+
+def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float, float], ...]:
+    """When the step came, all times between the first and the last being as likely before the measurements."""
+    weight = np.exp(log_ratio - log_ratio.max())
+    weight = np.where(weight < _UNLIKELY, 0.0, weight * (until - after))
+    sure = np.cumsum(weight) / weight.sum()
+    knots: dict[float, float] = {}
+    for k in np.flatnonzero(weight):
+        knots.setdefault(float(after[k]), float(sure[k - 1]) if k else 0.0)
+        knots[float(until[k])] = float(sure[k])
+    return tuple(sorted(knots.items()))
+
+
+def _larger(information: Array, score: Array) -> float:
+    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1."""
+    values, vectors = np.linalg.eigh(information)
+    values, along = np.maximum(values, 0.0), vectors.T @ score
+    added = _INFLATIONS[:, None] * values
+    gain = 0.5 * np.sum(_INFLATIONS[:, None] * along**2 / (1.0 + added) - np.log1p(added), axis=1)
+    variance = _INFLATIONS[int(np.argmax(gain))]
+    size = variance * along / (1.0 + variance * values)
+    return float(np.sqrt(max(1.0, variance, size @ size)))
+
+
+def with_jumps(stated: Disturbances, found: Sequence[Jump]) -> Disturbances:
+    """Disturbances in which jumps that were found are events, after all that was stated and in this order.
+
+    Args:
+        stated: disturbances.
+        found: jumps of their motions.
+    """
+    for one in found:
+        stated = stated.with_copies(one.motions, one.times, one.law)
+    return stated
+
+
+def with_unfound(
+    model: Disturbances, found: Sequence[Steps], stated: Disturbances, looks: int, last: float
+) -> Disturbances:
+    """Disturbances with what jumps leave that are too small to be found, where it is stated how often a motion jumps: a
+    walk whose variance grows by the mean square of such steps, the more where measurements are few.
+
+    Args:
+        model: disturbances with the jumps that were found.
+        found: steps at all times, with those jumps known.
+        stated: disturbances as stated, which the first motions of ``model`` are.
+        looks: of the search.
+        last: time of the last measurement, seconds; from there on no jump is found.
+    """
+    after, until, information = (
+        np.concatenate([getattr(one, name) for one in found]) for name in ("after", "until", "information")
+    )
+    if not looks or not len(until):
+        return model
+    size = np.linspace(0.0, 8.0, 401)
+    mean = 2.0 * (size[1] - size[0]) * size**2 * np.exp(-0.5 * size**2) / np.sqrt(2.0 * np.pi)
+    limit = float(np.sqrt(limit_of(stated.jump_false_alarm / looks, 1)))
+    for k, law in enumerate(stated.laws):
+        if law.every_s is None:
+            continue
+        column = stated.spots[:, k]
+        seen = np.sqrt(np.maximum(column @ information @ column, 0.0))
+        left = ndtr(limit - size * seen[:, None]) @ mean
+        grown = np.cumsum(left * (until - after)) / law.every_s
+        ahead = _AHEAD * (last - float(after[0]))
+        knots = [(float(after[0]), 0.0), *zip(until.tolist(), grown.tolist(), strict=True)]
+        knots.append((last + ahead, float(grown[-1]) + ahead / law.every_s))
+        model = model.with_copies((k,), 1.0, TimeLaw(event=tuple(knots)))
+    return model
+
+
+def sized(one: Jump, stated: Disturbances, root: Array, white: Array, when: Array, reference: float | None) -> Jump:
+    """The jump with its sizes, as all measurements and all other jumps leave them.
+
+    Args:
+        one: a jump of some motions.
+        stated: disturbances that have these motions.
+        root: L, with all jumps that were found as events.
+        white: L^-1 s.
+        when: times of the measurements, seconds.
+        reference: from when changes are counted, seconds; None for the calibration.
+    """
+    own = list(one.motions)
+    prior = one.times**2 * stated.correlation[np.ix_(own, own)]
+    come = one.law.come(when) - (0.0 if reference is None else float(one.law.come(reference)))
+    weights = solve_triangular(root, np.kron(come[:, None], stated.spots[:, own] @ prior), lower=True)
+    sizes = stated.sigmas[own] * (weights.T @ white)
+    left = np.maximum(np.diag(prior) - np.sum(weights**2, axis=0), 0.0)
+    return replace(one, sizes=tuple(sizes.tolist()), sigmas=tuple((stated.sigmas[own] * np.sqrt(left)).tolist()))
