@@ -26,7 +26,7 @@ from twin.run.svg import (
     shared_legend,
     to_svg,
 )
-from twin.tolerance.tolerance_run import merit_unit
+from twin.tolerance.merits import merit_unit
 
 _MOST_COMBINATIONS = 12
 _FEW = 3

@@ -19,8 +19,7 @@ from twin.asbuilt.next_step import Advice, advice
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
-from twin.tolerance.merits import Merit
-from twin.tolerance.tolerance_run import merit_unit
+from twin.tolerance.merits import Merit, merit_unit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
 """Quantiles that are told."""

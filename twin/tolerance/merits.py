@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenes.specs.tolerance import MeritSpec
+from analysis.units import ARCSEC
+from scenes.specs.tolerance import MERIT_UNITS, MeritSpec
+from scenes.yaml.units import LENGTH
 from twin.tolerance.monitor_merit import readings_of
 
 
@@ -106,3 +108,11 @@ def merits_of(
         out.append(Merit(name, spec, numbers, slice(start, start + count)))
         start += count
     return tuple(out), np.array(list(fields)).reshape(-1, 2)
+
+
+def merit_unit(merit: Merit) -> tuple[str, float]:
+    """Unit in which people read a merit, and its size in SI."""
+    unit = MERIT_UNITS[merit.spec.kind]
+    if unit is None:
+        return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
+    return ("um", 1e-6) if unit is LENGTH else ("arcsec", ARCSEC)

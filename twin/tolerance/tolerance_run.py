@@ -10,22 +10,20 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from analysis.units import ARCSEC
 from optics.geometry.tree import State
 from optics.numerics.backend import Backend
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.job import JobSpec
 from scenes.specs.load import is_path
-from scenes.specs.tolerance import MERIT_UNITS, AllocationSpec, ToleranceSetup, amount_text
+from scenes.specs.tolerance import AllocationSpec, ToleranceSetup, amount_text
 from scenes.yaml.errors import InputError
-from scenes.yaml.units import LENGTH
 from scenes.yaml.yaml_file import dump_yaml
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
-from twin.tolerance.merits import Merit
+from twin.tolerance.merits import Merit, merit_unit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
@@ -428,14 +426,6 @@ def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
         )
     head = f"# Camera {number} of the tolerance budget of {setup.test.instrument}, with its adjustments\n"
     return head + dump_yaml(data)
-
-
-def merit_unit(merit: Merit) -> tuple[str, float]:
-    """Unit in which people read a merit, and its size in SI."""
-    unit = MERIT_UNITS[merit.spec.kind]
-    if unit is None:
-        return ("waves", 1.0) if merit.spec.kind == "wavefront" else ("", 1.0)
-    return ("um", 1e-6) if unit is LENGTH else ("arcsec", ARCSEC)
 
 
 def _shown(value: float, merit: Merit) -> float | None:
