@@ -75,7 +75,6 @@ def test_windows_that_leave_the_image_on_any_side_are_told(texture, clean):
     assert np.all(np.isnan(fits.place[5:]))
 
 
-@pytest.mark.second
 def test_as_many_steps_as_were_counted_are_enough(clean, templates):
     """Each limit refuses the fits that need more. Where the smoothing is chosen anew the steps begin anew, too, and the
     limit holds for either."""
