@@ -64,13 +64,11 @@ class NextMove:
         amounts: (C,) SI.
         expected: merit after it, by the linear model and with the errors of the move; the part due to what is not known
             of the state is not in it.
-        free: the same if moves of any amount were possible.
         searched: whether all whole steps were enumerated.
     """
 
     amounts: Array
     expected: float
-    free: float
     searched: bool
 
 
@@ -92,12 +90,11 @@ def best_move(residual: Array, slope: Array, actuators: Actuators) -> NextMove:
         left = whole + whole_slope @ amounts
         return float(left @ left + np.sum((amounts != 0.0) * (actuators.absolute * length) ** 2))
 
-    free = _bounded(whole_slope, whole, low, high)
     best, searched = _whole_steps(whole_slope, whole, low, high, actuators.steps)
     still = np.zeros(count)
     if cost(still) <= cost(best):
         best = still
-    return NextMove(best, cost(best), cost(free), searched)
+    return NextMove(best, cost(best), searched)
 
 
 def truncated_move(residual: Array, slope: Array, actuators: Actuators, kept: int) -> Array:

@@ -170,8 +170,8 @@ class BatoidCamera:
     def _at_stop(self, mirrors: dict, start: np.ndarray) -> np.ndarray:
         return np.array(self._traced(mirrors, start, self.spec.stop).r[:, :2])
 
-    def tried(self, errors: Mapping[Error, float]) -> Found:
-        """A camera with errors, SI, in the focus at which the sum of all fields' mean squares is least."""
+    def _aimed(self, errors: Mapping[Error, float]) -> batoid.RayVector:
+        """Rays through the nodes of the stop, behind the last mirror."""
         mirrors, start = self._mirrors(errors), self._start
         for _ in range(10):
             miss = self._target - self._at_stop(mirrors, start)
@@ -180,7 +180,11 @@ class BatoidCamera:
             start = start + np.einsum("nij,nj->ni", self._inverse, miss)
         else:
             raise AssertionError("the rays do not reach the stop")
-        left = self._traced(mirrors, start, tuple(mirrors)[-1])
+        return self._traced(mirrors, start, tuple(mirrors)[-1])
+
+    def tried(self, errors: Mapping[Error, float]) -> Found:
+        """A camera with errors, SI, in the focus at which the sum of all fields' mean squares is least."""
+        left = self._aimed(errors)
 
         def squares(focus: float) -> np.ndarray:
             rays = left.copy()
@@ -197,13 +201,7 @@ class BatoidCamera:
 
     def waves(self, errors: Mapping[Error, float]) -> np.ndarray:
         """Optical paths at the stop's nodes of the designed focus, less the chief rays', (F, N), metres."""
-        mirrors, start = self._mirrors(errors), self._start
-        for _ in range(10):
-            miss = self._target - self._at_stop(mirrors, start)
-            if np.max(np.abs(miss)) < AIMED:
-                break
-            start = start + np.einsum("nij,nj->ni", self._inverse, miss)
-        rays = self._traced(mirrors, start, tuple(mirrors)[-1])
+        rays = self._aimed(errors)
         batoid.intersect(batoid.Plane(), rays, batoid.CoordSys(origin=[0.0, 0.0, self.spec.image.z]))
         beams = (len(rays) // len(self.nodes.points), len(self.nodes.points))
         place, heading, path = rays.r.reshape(*beams, 3), rays.v.reshape(*beams, 3), rays.t.reshape(beams)

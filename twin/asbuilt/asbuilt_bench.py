@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 
@@ -21,6 +21,7 @@ from scenes.specs.tolerance import OF_MONITOR, MeritSpec, ToleranceBudgetSpec, T
 from scenes.yaml.errors import names_text, unknown
 from twin.asbuilt.measured_kinds import KINDS, MeasuredKind, Site, View
 from twin.asbuilt.parameters import Parameters
+from twin.camera.camera_optics import CameraOptics
 from twin.camera.varied_beams import VariedBeams
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.truth import line_points
@@ -29,6 +30,9 @@ from twin.tolerance.tolerance_bench import ToleranceBench
 STEP = 0.05
 """Step of the derivatives, in standard deviations of the prior: central differences of the exact trace, whose error is
 of the square of this times the curvature over a standard deviation."""
+
+_SHARE = 1e-2
+"""Step of the derivatives by actuators, as a share of their range."""
 
 
 class AsBuiltBench(Site):
@@ -73,7 +77,7 @@ class AsBuiltBench(Site):
                 problem = "what a monitor knows rests on its own disturbances, not on how the instrument was assembled"
                 allowed = "`twin.uncertainty` of the instrument that results"
                 raise self.test.error(problem, ("merits", name, "kind"), found=merit.kind, allowed=allowed)
-        self.merits = self.bench(dict(self.test.merits), ("merits",))
+        self.merits = self.bench(dict(self.test.merits))
 
     def _camera_name(self) -> str:
         names = tuple(self.experiment.instrument.cameras)
@@ -94,19 +98,16 @@ class AsBuiltBench(Site):
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
         """Beams of fields, traced once for all that have the same. Raises as ``VariedBeams``."""
         if fields not in self._beams:
-            self._beams[fields] = VariedBeams(self.merit_optics, np.array(fields))
+            self._beams[fields] = VariedBeams(self.optics, np.array(fields))
         return self._beams[fields]
 
     @cached_property
-    def merit_optics(self):  # type: ignore[no-untyped-def]
+    def optics(self) -> CameraOptics:
         """The camera as designed."""
-        from twin.camera.camera_optics import CameraOptics
-
         return CameraOptics.within(self.experiment.instrument, self.camera, self.backend)
 
-    def bench(self, merits: Mapping[str, MeritSpec], key: tuple[str, ...]) -> ToleranceBench:
+    def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
         """A bench on which merits are tried."""
-        del key
         budget = ToleranceBudgetSpec.model_construct(
             instrument=self.test.instrument,
             camera=self.camera,
@@ -115,7 +116,8 @@ class AsBuiltBench(Site):
             merits=FrozenMap(merits),
             allocation=None,
         ).with_source(self.test.source)
-        return ToleranceBench(ToleranceSetup.model_construct(test=budget, base=self.setup.base), self.backend)
+        setup = ToleranceSetup.model_construct(test=budget, base=self.setup.base)
+        return ToleranceBench(setup, self.backend, self.experiment)
 
     # predictions
 
@@ -126,31 +128,28 @@ class AsBuiltBench(Site):
 
     def predict(self, values: np.ndarray) -> np.ndarray:
         """What all measurements would read without errors, (S, D); NaN where the light of a state is lost."""
-        return np.concatenate(self._predicted(values, self.kinds, self.afters), axis=1)
+        return self._predicted(values, self.kinds, self.afters)
 
-    def _predicted(
-        self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]
-    ) -> list[np.ndarray]:
-        try:
-            views = {after: self.view(values, after) for after in afters}
-            return [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
-        except PhysicalError:
-            if len(values) == 1:
-                return [np.full((1, len(kind.labels)), np.nan) for kind in kinds]
-        half = len(values) // 2
-        both = [self._predicted(part, kinds, afters) for part in (values[:half], values[half:])]
-        return [np.concatenate(parts) for parts in zip(*both, strict=True)]
+    def _predicted(self, values: np.ndarray, kinds: Sequence[MeasuredKind], afters: Sequence[str | None]) -> np.ndarray:
+        def read(some: slice) -> np.ndarray:
+            views = {after: self.view(values[some], after) for after in afters}
+            each = [kind.predict(views[after]) for kind, after in zip(kinds, afters, strict=True)]
+            return np.concatenate(each, axis=1)
+
+        return where_lit(read, len(values), (sum(len(kind.labels) for kind in kinds),))
 
     def slope(
         self, values: np.ndarray, kinds: Sequence[MeasuredKind] | None = None, afters: Sequence[str | None] = ()
     ) -> np.ndarray:
         """Derivatives (D, K) of the predictions at parameters (K,), by central differences of the exact trace."""
         kinds, afters = (self.kinds, self.afters) if kinds is None else (kinds, afters)
-        sigma = self.parameters.prior.sigma
-        steps = STEP * sigma
-        moved = np.concatenate([values + np.diag(steps), values - np.diag(steps)])
-        predicted = np.concatenate(self._predicted(moved, kinds, afters), axis=1)
-        ahead, behind = predicted[: len(steps)], predicted[len(steps) :]
+        return self._by_parameters(values, lambda moved: self._predicted(moved, kinds, afters))
+
+    def _by_parameters(self, values: np.ndarray, work: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Derivatives (D, K) of what is worked out of states, (S, K) -> (S, D), at parameters (K,)."""
+        steps = STEP * self.parameters.prior.sigma
+        found = work(np.concatenate([values + np.diag(steps), values - np.diag(steps)]))
+        ahead, behind = found[: len(steps)], found[len(steps) :]
         return np.asarray(((ahead - behind) / (2.0 * steps[:, None])).T)
 
     # the estimate
@@ -180,13 +179,6 @@ class AsBuiltBench(Site):
 
     # a drawn instrument
 
-    @cached_property
-    def drawn_motions(self) -> StatedMotions:
-        """What a simulated instrument is drawn from."""
-        if self.setup.drawn is None:
-            return self.stated
-        return motions_of_spec(self.setup.drawn, self.experiment.instrument)
-
     def draw(self, rng: np.random.Generator, law: str) -> np.ndarray:
         """Parameters (K,) of an instrument of the prior; of components that ``simulate`` states otherwise by that.
 
@@ -197,7 +189,8 @@ class AsBuiltBench(Site):
         prior = self.parameters.prior
         covariance = prior.covariance.copy()
         if self.setup.drawn is not None:
-            own = {one.name: k for k, one in enumerate(self.drawn_motions.components)}
+            drawn = motions_of_spec(self.setup.drawn, self.experiment.instrument)
+            own = {one.name: k for k, one in enumerate(drawn.components)}
             names = [one.name for one in self.stated.components]
             strange = sorted(set(own) - set(names))
             if strange:
@@ -208,7 +201,7 @@ class AsBuiltBench(Site):
             which = [own[names[k]] for k in where]
             count = len(names)
             covariance[:count, :count] = 0.0
-            covariance[np.ix_(where, where)] = self.drawn_motions.covariance[np.ix_(which, which)]
+            covariance[np.ix_(where, where)] = drawn.covariance[np.ix_(which, which)]
         root = type(prior).of(prior.labels, covariance).root
         half = np.sqrt(3.0)
         shape = root.shape[1]
@@ -256,17 +249,11 @@ class AsBuiltBench(Site):
 
     def merit_parts(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Parts of the merits, (S, P), of parameters (S, K); NaN where the light is lost."""
-        try:
-            return self.merits.parts_of(self.parameters.states(values, after, further))
-        except PhysicalError:
-            if len(values) == 1:
-                return np.full((1, self.merits.parts), np.nan)
-        half = len(values) // 2
-        few = (None, None) if further is None else (further, further)
-        if further is not None and further.ndim == 2:
-            few = (further[:half], further[half:])
-        pair = zip((values[:half], values[half:]), few, strict=True)
-        return np.concatenate([self.merit_parts(part, after, own) for part, own in pair])
+        return where_lit(
+            lambda some: self.merits.parts_of(self.parameters.states(values[some], after, of_some(further, some))),
+            len(values),
+            (self.merits.parts,),
+        )
 
     def merit_numbers(self, values: np.ndarray, after: str | None, further: np.ndarray | None = None) -> np.ndarray:
         """Numbers (S, R) whose squares sum to what a move makes least: of each merit the mean square over its fields
@@ -289,17 +276,35 @@ class AsBuiltBench(Site):
             np.array([one.accuracy_si for one in specs]),
         )
 
-    def merit_slopes(self, values: np.ndarray, after: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers of the merit (R,) at parameters (K,), and derivatives by parameters (R, K) and actuators (R, C)."""
-        sigma = self.parameters.prior.sigma
-        steps, count = STEP * sigma, len(self.parameters.names)
-        every = np.concatenate([values[None], values + np.diag(steps), values - np.diag(steps)])
-        found = self.merit_numbers(every, after)
-        own = ((found[1 : 1 + len(steps)] - found[1 + len(steps) :]) / (2.0 * steps[:, None])).T
-        ranges = np.array([one.range_si or 1.0 for one in self.test.actuators.values()])
-        moves = 1e-2 * np.diag(ranges)
-        if not count:
-            return found[0], own, np.zeros((found.shape[1], 0))
-        pushed = self.merit_numbers(np.repeat(values[None], 2 * count, axis=0), after, np.concatenate([moves, -moves]))
-        by_actuators = ((pushed[:count] - pushed[count:]) / (2.0 * 1e-2 * ranges[:, None])).T
-        return found[0], own, by_actuators
+    def merit_slope(self, values: np.ndarray, after: str | None) -> np.ndarray:
+        """Derivatives (R, K) of the merits' numbers by the parameters, at parameters (K,)."""
+        return self._by_parameters(values, lambda moved: self.merit_numbers(moved, after))
+
+    @cached_property
+    def actuator_steps(self) -> np.ndarray:
+        """Steps of the derivatives by the actuators, SI, (C,)."""
+        return _SHARE * np.array([one.range_si or 1.0 for one in self.test.actuators.values()])
+
+
+def where_lit(work: Callable[[slice], np.ndarray], count: int, shape: tuple[int, ...], first: int = 0) -> np.ndarray:
+    """What is worked out of states, (S, *shape), with NaN for each whose light is lost.
+
+    Args:
+        work: of which of the states; raises PhysicalError where the light of one is lost.
+        count: number of states.
+        shape: of what is worked out of one.
+        first: number of the first state.
+    """
+    try:
+        return work(slice(first, first + count))
+    except PhysicalError:
+        if count == 1:
+            return np.full((1, *shape), np.nan)
+    half = count // 2
+    both = ((half, first), (count - half, first + half))
+    return np.concatenate([where_lit(work, own, shape, start) for own, start in both])
+
+
+def of_some(further: np.ndarray | None, some: slice) -> np.ndarray | None:
+    """Moves of some states, where each has its own, (S, C); one for all, (C,), and none stay."""
+    return further if further is None or further.ndim == 1 else further[some]

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from optics.numerics.frozen_map import FrozenMap
-from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses, shown
+from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, shown_unit
+from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table
 from twin.run.report import Report, Section, answer
 from twin.run.svg import (
     BLUE,
@@ -26,7 +26,7 @@ from twin.run.svg import (
     shared_legend,
     to_svg,
 )
-from twin.tolerance.merits import merit_unit
+from twin.tolerance.merits import merit_head, merit_unit, shown_merit
 
 _MOST_COMBINATIONS = 12
 _FEW = 3
@@ -149,16 +149,11 @@ def _short(amount: str | float) -> str:
     return f"{amount:.4g}"
 
 
-def _head(one: Standing) -> str:
-    unit = merit_unit(one.merit)[0]
-    return f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name
-
-
 def _cell(value: float, one: Standing) -> Cell:
-    found = shown(value, one.merit)
+    found = shown_merit(value, one.merit)
     if found is None:
         return None
-    spread = shown(one.now[3], one.merit) or 0.0
+    spread = shown_merit(one.now[3], one.merit) or 0.0
     places = 3 if abs(spread) < 10.0 else 1
     return OwnDecimals(found, places)
 
@@ -166,7 +161,7 @@ def _cell(value: float, one: Standing) -> Cell:
 def _between(values: Sequence[float], one: Standing) -> str:
     if not len(values):
         return ""
-    low, middle, high = (shown(values[k], one.merit) for k in (1, 2, 3))
+    low, middle, high = (shown_merit(values[k], one.merit) for k in (1, 2, 3))
     if low is None or middle is None or high is None:
         return "no light"
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
@@ -179,7 +174,7 @@ def _summary(run: AsBuiltRun) -> Table:
         spec = one.merit.spec
         sign = "at least" if spec.more_is_better else "at most"
         row: list[Cell] = [
-            _head(one),
+            merit_head(one.merit),
             f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g}",
             _cell(one.designed, one),
             _between(one.before, one),

@@ -14,12 +14,12 @@ from optics.numerics.backend import Backend
 from optics.numerics.physical_error import PhysicalError
 from scenes.specs.asbuilt import AsBuiltSetup
 from scenes.specs.tolerance import MeritSpec, amount_text
-from twin.asbuilt.asbuilt_bench import AsBuiltBench
+from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 from twin.asbuilt.next_step import Advice, advice
 from twin.run.procedure import Advance, silent
 from twin.run.quantity import Quantity, Record
 from twin.run.random_streams import stream
-from twin.tolerance.merits import Merit, merit_unit
+from twin.tolerance.merits import Merit, merit_unit, shown_merit
 
 LEVELS = (0.025, 0.16, 0.5, 0.84, 0.975)
 """Quantiles that are told."""
@@ -197,18 +197,14 @@ def _along(
     bench: AsBuiltBench, several: Sequence[tuple[np.ndarray, np.ndarray | None]]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rms wavefront error along the line, of the design, and quantiles of several sets of states with further moves."""
-    field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)}, ("merits",))
+    field = bench.bench({"along": MeritSpec(kind="wavefront", fields=ALONG, at_most=1.0)})
 
     def rms(values: np.ndarray, further: np.ndarray | None) -> np.ndarray:
-        try:
-            states = bench.parameters.states(values, bench.last, further)
+        def work(some: slice) -> np.ndarray:
+            states = bench.parameters.states(values[some], bench.last, of_some(further, some))
             return np.asarray(np.sqrt(np.maximum(field.parts_of(states), 0.0)))
-        except PhysicalError:
-            if len(values) == 1:
-                return np.full((1, len(ALONG)), np.nan)
-        half = len(values) // 2
-        both = slice(0, half), slice(half, None)
-        return np.concatenate([rms(values[own], None if further is None else further[own]) for own in both])
+
+        return where_lit(work, len(values), (len(ALONG),))
 
     designed = np.sqrt(np.maximum(field.parts_of([{}])[0], 0.0))
     return designed, np.stack([np.nanquantile(rms(*one), LEVELS, axis=0) for one in several])
@@ -242,15 +238,10 @@ def _warnings(found: StateEstimate, now: np.ndarray) -> list[str]:
 # numbers
 
 
-def shown(value: float, merit: Merit) -> float | None:
-    """A value in the merit's unit; None for none."""
-    return float(value / merit_unit(merit)[1]) if np.isfinite(value) else None
-
-
 def _row(values: Sequence[float], merit: Merit) -> dict[str, float | None] | None:
     if not len(values):
         return None
-    return {f"p{100 * level:g}": shown(value, merit) for level, value in zip(LEVELS, values, strict=True)}
+    return {f"p{100 * level:g}": shown_merit(value, merit) for level, value in zip(LEVELS, values, strict=True)}
 
 
 def _standing_plain(one: Standing) -> dict[str, Any]:
@@ -258,15 +249,15 @@ def _standing_plain(one: Standing) -> dict[str, Any]:
     out = {
         "kind": merit.spec.kind,
         "unit": merit_unit(merit)[0],
-        "requirement": shown(merit.spec.requirement, merit),
-        "designed": shown(one.designed, merit),
+        "requirement": shown_merit(merit.spec.requirement, merit),
+        "designed": shown_merit(one.designed, merit),
         "prior": _row(one.before, merit),
         "as_built": _row(one.now, merit),
         "meets": one.meets,
         "after_move": _row(one.moved, merit),
         "meets_after_move": None if np.isnan(one.meets_moved) else one.meets_moved,
     }
-    return out if np.isnan(one.true) else {**out, "true": shown(one.true, merit)}
+    return out if np.isnan(one.true) else {**out, "true": shown_merit(one.true, merit)}
 
 
 def _agreement_plain(one: Agreement) -> dict[str, Any]:

@@ -28,6 +28,7 @@ from scenes.specs.tolerance import MeritSpec
 from scenes.yaml.errors import InputError, Problem
 from twin.asbuilt.wavefront_files import read_coefficients
 from twin.camera.varied_beams import VariedBeams
+from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.tolerance.tolerance_bench import ToleranceBench
 
 UNKNOWN_FOCUS = 50e-6
@@ -59,16 +60,17 @@ class Site(ABC):
     """What a kind of measurement may know: the instrument, and nothing of its state."""
 
     test: specs.AsBuiltSpec
-    experiment: Any
+    experiment: MonitorExperiment
     camera: str
+    line: np.ndarray
 
     @abstractmethod
     def beams(self, fields: tuple[tuple[float, float], ...]) -> VariedBeams:
         """Beams of fields, traced once for all that have the same."""
 
     @abstractmethod
-    def bench(self, merits: Mapping[str, MeritSpec], key: tuple[str, ...]) -> ToleranceBench:
-        """A bench on which merits are tried; ``key`` is where the file says them."""
+    def bench(self, merits: Mapping[str, MeritSpec]) -> ToleranceBench:
+        """A bench on which merits are tried."""
 
 
 class MeasuredKind(ABC):
@@ -250,7 +252,7 @@ class MtfReadings(MeasuredKind):
         """A bench with this MTF as its merit."""
         spec = self.spec
         asked = MeritSpec(kind="mtf", fields=spec.fields, frequency=spec.frequency, at_least=0.0)
-        self.tried = self.site.bench({self.name: asked}, self.key)
+        self.tried = self.site.bench({self.name: asked})
         self.labels = tuple(f"{field_text(field)} {way}" for field in spec.fields for way in ("line", "track"))
         self.blocks = tuple(f"field {field_text(field)}" for field in spec.fields for _ in range(2))
 
@@ -278,7 +280,7 @@ class DistortionReadings(MeasuredKind):
         site = self.site
         self.axes = site.experiment.instrument.camera_axes(site.camera)
         self.number = list(site.experiment.instrument.cameras).index(site.camera)
-        self.line = site.line  # type: ignore[attr-defined]
+        self.line = site.line
         nominal = self._tangents([{}])[0]
         if self.spec.file is None:
             half = self.line[-1]
@@ -363,9 +365,7 @@ class SpotReadings(MeasuredKind):
         self.nominal = self._places([{}])[0]
 
     def _places(self, states: Sequence[State]) -> np.ndarray:
-        path = self.path
-        mean = np.einsum("n,bnk->bk", path.nodes.share, path.rays(list(states)).position[..., 1::-1]) / path.pitch
-        return np.asarray(np.swapaxes(mean.reshape(len(path.channels), len(states), 2), 0, 1)).reshape(len(states), -1)
+        return self.path.mean_spots(states).reshape(len(states), -1)
 
     def predict(self, view: View) -> np.ndarray:
         """Energy centroids, as means of rays."""
@@ -378,13 +378,12 @@ class SpotReadings(MeasuredKind):
     def read(self) -> np.ndarray:
         """Places of the file, less those of the design."""
         path = self.file("file", self.spec.file, "a CSV file, or the recovered.json of a run")
-        middle = 0.5 * (np.array(self.site.experiment.path.shape) - 1.0)
         found = self._recovered(path) if path.suffix.lower() == ".json" else self._table(path)
         out = []
         for channel in self.path.channels:
             if (channel.camera, channel.name) not in found:
                 raise self.wrong(f"no spot {channel.name} of {channel.camera}", "file", found=str(path))
-            out.append(np.array(found[channel.camera, channel.name]) - middle)
+            out.append(np.array(found[channel.camera, channel.name]))
         return np.concatenate(out) - self.nominal
 
     def _recovered(self, path: Path) -> dict[tuple[str, str], tuple[float, float]]:

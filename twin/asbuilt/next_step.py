@@ -9,8 +9,7 @@ import numpy as np
 
 from analysis.instrument_state.next_move import NextMove, best_move, measurement_worth, truncated_move
 from analysis.instrument_state.state_estimate import StateEstimate
-from optics.numerics.physical_error import PhysicalError
-from twin.asbuilt.asbuilt_bench import AsBuiltBench
+from twin.asbuilt.asbuilt_bench import AsBuiltBench, of_some, where_lit
 
 MOST_ROUNDS = 3
 """Times that a move is sought about the state that the last one leads to."""
@@ -66,11 +65,10 @@ def _about(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Numbers of the merit (R,) after a move, and their derivatives by the actuators (R, C)."""
     count = len(amounts)
-    ranges = np.array([one.range_si or 1.0 for one in bench.test.actuators.values()])
-    steps = 1e-2 * np.diag(ranges)
+    steps = np.diag(bench.actuator_steps)
     moves = np.concatenate([amounts[None], amounts + steps, amounts - steps])
     found = bench.merit_numbers(np.repeat(mean[None], len(moves), axis=0), after, moves)
-    return found[0], ((found[1 : 1 + count] - found[1 + count :]) / (2e-2 * ranges[:, None])).T
+    return found[0], ((found[1 : 1 + count] - found[1 + count :]) / (2.0 * bench.actuator_steps[:, None])).T
 
 
 def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np.random.Generator) -> Advice:
@@ -89,8 +87,8 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
     move = wanted_move(bench, found.mean, after)
     made = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
     both = [float(np.mean(expected(bench, draws, after, own))) for own in (None, made)]
-    _, by_state, by_actuators = bench.merit_slopes(found.mean, after)
-    unit_slope = by_state @ found.prior.root
+    _, by_actuators = _about(bench, found.mean, after, np.zeros(len(move.amounts)))
+    unit_slope = bench.merit_slope(found.mean, after) @ found.prior.root
     candidates: dict[str, np.ndarray] = {}
     for kind in bench.candidates:
         rows = bench.slope(found.mean, [kind], [after])
@@ -106,17 +104,11 @@ def expected(
     bench: AsBuiltBench, values: np.ndarray, after: str | None, further: np.ndarray | None = None
 ) -> np.ndarray:
     """Merits of states (S,), the sum of squares in units of the requirements; NaN where the light is lost."""
-    try:
-        return np.asarray(np.sum(bench.merit_numbers(values, after, further) ** 2, axis=1))
-    except PhysicalError:
-        if len(values) == 1:
-            return np.full(1, np.nan)
-    half = len(values) // 2
-    parts: Sequence[np.ndarray | None] = (None, None)
-    if further is not None:
-        parts = (further[:half], further[half:]) if further.ndim == 2 else (further, further)
-    pair = zip((values[:half], values[half:]), parts, strict=True)
-    return np.concatenate([expected(bench, own, after, part) for own, part in pair])
+    return where_lit(
+        lambda some: np.sum(bench.merit_numbers(values[some], after, of_some(further, some)) ** 2, axis=1),
+        len(values),
+        (),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,16 +189,15 @@ def _classic(
     """True merits of an instrument moved by the truncated pseudo-inverse of its measured numbers."""
     total = np.zeros(len(bench.actuators.names))
     merits = [float(expected(bench, true[None], None)[0])]
-    ranges = np.array([one.range_si or 1.0 for one in bench.test.actuators.values()])
-    steps = 1e-2 * np.diag(ranges)
-    nominal = np.repeat(np.zeros_like(true)[None], 2 * len(ranges), axis=0)
+    steps = np.diag(bench.actuator_steps)
+    nominal = np.repeat(np.zeros_like(true)[None], 2 * len(steps), axis=0)
     view = bench.view(nominal, None, np.concatenate([steps, -steps]))
     whiteners = [kind.group(np.zeros(len(kind.labels))).whitener() for kind in bench.kinds]
     moved = np.concatenate(
         [kind.predict(view) @ white.T for kind, white in zip(bench.kinds, whiteners, strict=True)], axis=1
     )
-    count = len(ranges)
-    slope = ((moved[:count] - moved[count:]) / (2e-2 * ranges[:, None])).T
+    count = len(steps)
+    slope = ((moved[:count] - moved[count:]) / (2.0 * bench.actuator_steps[:, None])).T
     zero = bench.view(np.zeros_like(true)[None], None)
     for own in errors:
         now = bench.view(true[None], None, total)

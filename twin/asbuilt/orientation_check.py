@@ -118,6 +118,7 @@ def _readings(check: OrientationCheck) -> list[dict[str, Any]]:
             **_plain(one),
             "chi_square": float(found.chi_square[k]),
             "chance": float(found.chance[k]),
+            "log_evidence": float(found.log_evidence[k]),
             "allowed": one in found.allowed,
             "like_the_best": one in found.together,
         }

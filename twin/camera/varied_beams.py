@@ -250,15 +250,14 @@ class VariedBeams:
         return out
 
     @one_blas_thread()
-    def zernike_rows(self, last: int, orthonormal: bool = True) -> np.ndarray:
+    def zernike_rows(self, last: int) -> np.ndarray:
         """From optical paths at the nodes (N,) to Zernike terms Z1 to Z``last`` of the wavefront error, (F, last, N).
 
-        Metres rms, Noll's order, positive where the wavefront is ahead; axes of the stop.
+        Metres rms, Noll's order, positive where the wavefront is ahead; axes of the stop. Of a cut pupil the terms are
+        made orthonormal over its light one after the other: annular ones of a ring.
 
         Args:
             last: highest Noll index.
-            orthonormal: of a cut pupil, terms made orthonormal over its light one after the other (annular ones of a
-                ring), else circle terms fitted to it; the same where nothing cuts.
         """
         out = []
         for x, y, share in self.lit():
@@ -271,8 +270,7 @@ class VariedBeams:
                 raise UnphysicalError(
                     f"{last} Zernike terms are not independent over the light that comes through"
                 ) from error
-            parts = np.linalg.solve(root, basis.T @ (share[:, None] * table))
-            out.append(-(parts if orthonormal else np.linalg.solve(root.T, parts)))
+            out.append(-np.linalg.solve(root, basis.T @ (share[:, None] * table)))
         return np.stack(out)
 
     @cached_property

@@ -296,6 +296,14 @@ class MonitorBeams:
         spots = place.reshape(*by_state, 2), blur.reshape(by_state), aperture.reshape(by_state)
         return CoarseTrace(fan, outgoing, back, uploaded, turn, *spots)
 
+    def mean_spots(self, states: Sequence[State]) -> np.ndarray:
+        """Means of the rays, which are the energy centroids of the images: (S, C, 2), row and column, px from the first
+        pixel's centre. Raises as ``rays``.
+        """
+        mean = np.einsum("n,bnk->bk", self.nodes.share, self.rays(states).position[..., 1::-1]) / self.pitch
+        middle = 0.5 * (np.array(self.shape) - 1.0)
+        return np.asarray(np.swapaxes(mean.reshape(len(self.channels), len(states), 2), 0, 1) + middle)
+
     def rays(self, states: Sequence[State], coarse: CoarseTrace | None = None) -> CcdRays:
         """Rays at the CCDs for C channels x S states, channel-major.
 

@@ -16,7 +16,7 @@ import numpy as np
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import InputError, Issue, Problem
 from twin.orbit.flight.earth import DAY
-from twin.orbit.measured.clock import Readings, calendar, tai_minus_utc
+from twin.orbit.measured.clock import Readings, calendar, single_reading, tai_minus_utc
 
 EPOCH_DAY = 51544
 """Modified Julian day from whose beginning in TAI, 2000-01-01, times are counted."""
@@ -112,10 +112,7 @@ def micros(text: str, scale: str = "UTC", seconds: float = 0.0) -> int:
     Raises:
         Problem: not such a text.
     """
-    try:
-        one = Readings.of_texts([text.strip()])
-    except Problem as problem:
-        raise Problem(problem.problem, problem.found, problem.allowed) from None
+    one = single_reading(text)
     if scale == "UTC" and one.second[0] < DAY:
         second = float(one.second[0]) + _leap(int(one.day[0]))
         return _count(int(one.day[0]), second + seconds)

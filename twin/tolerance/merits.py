@@ -10,6 +10,7 @@ import numpy as np
 from analysis.units import ARCSEC
 from scenes.specs.tolerance import MERIT_UNITS, MeritSpec
 from scenes.yaml.units import LENGTH
+from twin.run.artefact import shown_unit
 from twin.tolerance.monitor_merit import readings_of
 
 
@@ -108,6 +109,17 @@ def merits_of(
         out.append(Merit(name, spec, numbers, slice(start, start + count)))
         start += count
     return tuple(out), np.array(list(fields)).reshape(-1, 2)
+
+
+def shown_merit(value: float, merit: Merit) -> float | None:
+    """A value in the unit in which people read the merit; None where it is not known."""
+    return float(value / merit_unit(merit)[1]) if np.isfinite(value) else None
+
+
+def merit_head(merit: Merit) -> str:
+    """Name of a merit with its unit, for the head of a column."""
+    unit = merit_unit(merit)[0]
+    return f"{merit.name} [{shown_unit(unit)}]" if unit else merit.name
 
 
 def merit_unit(merit: Merit) -> tuple[str, float]:

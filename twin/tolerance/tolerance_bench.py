@@ -85,6 +85,7 @@ class ToleranceBench:
     Args:
         setup: the budget.
         backend: where to trace.
+        experiment: of the budget's instrument, where it is built already.
 
     Attributes:
         numbers: that vary.
@@ -98,10 +99,10 @@ class ToleranceBench:
         InputError: names that do not exist, a merit that the camera cannot have, or a camera without light.
     """
 
-    def __init__(self, setup: ToleranceSetup, backend: Backend) -> None:
+    def __init__(self, setup: ToleranceSetup, backend: Backend, experiment: MonitorExperiment | None = None) -> None:
         self.setup, self.backend = setup, backend
         test = setup.test
-        self.experiment = MonitorExperiment(setup.base, backend)
+        self.experiment = experiment or MonitorExperiment(setup.base, backend)
         instrument = self.instrument = self.experiment.instrument
         self.camera = self._camera_name()
         self.line = line_points(instrument, self.camera)
@@ -309,11 +310,8 @@ class ToleranceBench:
 
     def parts_of(self, states: Sequence[State]) -> np.ndarray:
         """Parts of all merits (S, P) of cameras in any states, as they are. Raises PhysicalError: the light is lost."""
-        return self._parts(states, *self._still(states), self.beams.light(states) if len(self.fields) else None)
-
-    def _still(self, states: Sequence[State]) -> tuple[np.ndarray, np.ndarray]:
-        """Amounts and moves of the bench's own numbers in states that say all themselves: none."""
-        return np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
+        amounts, moves = np.zeros((len(states), len(self.numbers))), np.zeros((len(states), len(self.ranges)))
+        return self._parts(states, amounts, moves, self.beams.light(states) if len(self.fields) else None)
 
     def numbers_of(self, states: Sequence[State]) -> np.ndarray:
         """Numbers (S, R) of cameras whose squares sum to their merits' mean squares over fields or points, each in
@@ -325,7 +323,7 @@ class ToleranceBench:
         count = len(states)
         light = self.beams.light(states) if len(self.fields) else None
         terms = None if light is None else self._residuals(light.paths).reshape(count, len(self.fields), -1)
-        parts = self._parts(states, *self._still(states), light)
+        line = self._line(states)
         out = []
         for merit in self.merits:
             if merit.spec.kind in ("obstruction", *OF_MONITOR):
@@ -335,7 +333,7 @@ class ToleranceBench:
                 own = terms[:, merit.fields].reshape(count, -1) / np.sqrt(len(merit.fields))
                 size = merit.spec.requirement if merit.spec.kind == "wavefront" else 0.25
             else:
-                own = parts[:, merit.parts] / np.sqrt(merit.parts.stop - merit.parts.start)
+                own = self._change(merit, line, light) / np.sqrt(merit.parts.stop - merit.parts.start)
                 size = merit.spec.requirement
             out.append(own / size)
         return np.concatenate(out, axis=1) if out else np.zeros((count, 0))
@@ -386,19 +384,23 @@ class ToleranceBench:
             elif kind == "mtf":
                 assert light is not None
                 own = self._modulations(k, merit, light.eikonals)
-            elif kind == "chief_ray":
-                assert light is not None
-                turn = light.chiefs[:, merit.fields, :2] - self.beams.designed.chiefs[0, merit.fields, :2]
-                own = turn.reshape(len(states), -1)
             elif kind == "obstruction":
                 assert taken is not None
                 own = taken[:, merit.fields]
             elif kind in OF_MONITOR:
                 own = known[merit.name]
             else:
-                own = line[kind]
+                own = self._change(merit, line, light)
             out[:, merit.parts] = own
         return out
+
+    def _change(self, merit: Merit, line: dict[str, np.ndarray], light: BeamLight | None) -> np.ndarray:
+        """Parts of a merit that is a change against the designed camera, of what ``_line`` tells or of chief rays."""
+        if merit.spec.kind != "chief_ray":
+            return line[merit.spec.kind]
+        assert light is not None
+        turn = light.chiefs[:, merit.fields, :2] - self.beams.designed.chiefs[0, merit.fields, :2]
+        return np.asarray(turn.reshape(len(turn), -1))
 
     def _modulations(self, k: int, merit: Merit, eikonals: np.ndarray) -> np.ndarray:
         longer = eikonals - self.beams.designed.eikonals[0]

@@ -11,7 +11,7 @@ from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, d
 from twin.run.report import Report, Section, answer
 from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
 from twin.tolerance.merit_models import FARTHEST
-from twin.tolerance.merits import merit_unit
+from twin.tolerance.merits import merit_head, merit_unit
 from twin.tolerance.monitor_merit import readings_of
 from twin.tolerance.tolerance_run import EXACT, LEVELS, MeritResult, ToleranceRun, Yield
 
@@ -163,11 +163,6 @@ def _scaled(value: float, one: MeritResult, decimals: int | None = None) -> Cell
     return OwnDecimals(value / size, max(places, 1) if merit_unit(one.merit)[0] else max(places, 3))
 
 
-def _head(one: MeritResult) -> str:
-    unit = merit_unit(one.merit)[0]
-    return f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name
-
-
 def _summary(run: ToleranceRun) -> Table:
     rows: list[list[Cell]] = []
     for one in run.merits:
@@ -175,7 +170,7 @@ def _summary(run: ToleranceRun) -> Table:
         sign = "at least" if spec.more_is_better else "at most"
         rows.append(
             [
-                _head(one),
+                merit_head(one.merit),
                 f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g} in {100 * spec.probability:.0f} %",
                 _scaled(one.nominal, one),
                 _scaled(one.mean, one),
@@ -198,9 +193,13 @@ def _levels_table(run: ToleranceRun) -> Table:
     for one in run.merits:
         for k, share in enumerate(LEVELS):
             values = (one.levels[k], one.quadratic[k], one.linear[k])
-            rows.append([_head(one), f"{100 * share:.0f} %", *(_scaled(value, one) for value in values)])
+            rows.append([merit_head(one.merit), f"{100 * share:.0f} %", *(_scaled(value, one) for value in values)])
         rows.append(
-            [_head(one), "yield", *(_percent(share) for share in (one.passing.share, *reversed(one.model_passing)))]
+            [
+                merit_head(one.merit),
+                "yield",
+                *(_percent(share) for share in (one.passing.share, *reversed(one.model_passing))),
+            ]
         )
     caption = "Values that a share of the cameras keep, by exact traces of every camera and by models of all together."
     heads = ("merit", "share", "exact", "quadratic", "linear")
@@ -238,7 +237,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         full.append([*cells, *(_number(limit)[0] * x if np.isfinite(x) else None for limit, x in both)])
     signs = ("\N{MINUS SIGN}", "+")
     moved = [f"move of {name} [{_number(c.range)[1]}]".replace(" []", "") for name, c in adjusted.items()]
-    groups = [*map(_head, run.merits), *moved]
+    groups = [*(merit_head(one.merit) for one in run.merits), *moved]
     heads = ("tolerance", "motion", "limit", *(sign for _ in groups for sign in signs))
     over = (
         ("", 3),
@@ -353,7 +352,9 @@ def _monitor_sections(run: ToleranceRun) -> tuple[Section, ...]:
         if one.merit.name in run.missed:
             spec = one.merit.spec
             readings = ", ".join(readings_of(spec, tuple(run.bench.instrument.cameras)))
-            rows.append([_head(one), readings, spec.estimator, _scaled(one.nominal, one), run.missed[one.merit.name]])
+            rows.append(
+                [merit_head(one.merit), readings, spec.estimator, _scaled(one.nominal, one), run.missed[one.merit.name]]
+            )
     text = (
         f"Standard deviations of the monitor's readings under the disturbances {stated}, with the derivatives and the "
         "noise of each camera as it is built and adjusted; its area CCDs have been set to its spots. Derivatives are "

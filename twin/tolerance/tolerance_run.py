@@ -23,7 +23,7 @@ from twin.run.quantity import Quantity, Record
 from twin.tolerance.allocation import Allocation, allocate
 from twin.tolerance.given_warnings import beam_warnings, given_warnings, missed_warnings
 from twin.tolerance.merit_models import InverseLimits, ScaledModel, Sensitivities, inverse_limits, sensitivities
-from twin.tolerance.merits import Merit, merit_unit
+from twin.tolerance.merits import Merit, merit_unit, shown_merit
 from twin.tolerance.samples import Samples, Workforce, draw_samples
 from twin.tolerance.tolerance_bench import SETTLED, ToleranceBench
 from twin.tolerance.variations import states_of
@@ -428,11 +428,6 @@ def _job_text(data: dict[str, Any], number: int, setup: ToleranceSetup) -> str:
     return head + dump_yaml(data)
 
 
-def _shown(value: float, merit: Merit) -> float | None:
-    size = merit_unit(merit)[1]
-    return float(value / size) if np.isfinite(value) else None
-
-
 def _yield_plain(one: Yield) -> dict[str, Any]:
     return {"share": one.share, "passed": one.passed, "of": one.of, "interval": [one.low, one.high]}
 
@@ -441,16 +436,16 @@ def _merit_plain(one: MeritResult, missed: float | None = None) -> dict[str, Any
     merit = one.merit
 
     def row(values: tuple[float, ...]) -> dict[str, float | None]:
-        return {f"p{100 * share:.0f}": _shown(value, merit) for share, value in zip(LEVELS, values, strict=True)}
+        return {f"p{100 * share:.0f}": shown_merit(value, merit) for share, value in zip(LEVELS, values, strict=True)}
 
     return {
         "kind": merit.spec.kind,
         "unit": merit_unit(merit)[0],
-        "requirement": _shown(merit.spec.requirement, merit),
+        "requirement": shown_merit(merit.spec.requirement, merit),
         "probability": merit.spec.probability,
-        "nominal": _shown(one.nominal, merit),
-        "mean": _shown(one.mean, merit),
-        "std": _shown(one.deviation, merit),
+        "nominal": shown_merit(one.nominal, merit),
+        "mean": shown_merit(one.mean, merit),
+        "std": shown_merit(one.deviation, merit),
         "monte_carlo": row(one.levels),
         "linear": row(one.linear),
         "quadratic": row(one.quadratic),
@@ -468,7 +463,7 @@ def _tolerance_plain(run: ToleranceRun) -> dict[str, Any]:
     bench = run.bench
     for e, (name, one) in enumerate(run.setup.test.tolerances.items()):
         below, above = (
-            {m.name: _shown(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
+            {m.name: shown_merit(float(run.found.values[e, end, k]), m) for k, m in enumerate(bench.merits)}
             for end in (0, 1)
         )
         share = run.inverse.shares[e]
@@ -546,7 +541,7 @@ TOLERANCE: Record[ToleranceRun] = Record(
     Quantity("compensators", _moves_plain, "how far they are moved"),
     Quantity(
         "losses",
-        lambda run: {m.name: _shown(float(run.inverse.losses[k]), m) for k, m in enumerate(run.bench.merits)},
+        lambda run: {m.name: shown_merit(float(run.inverse.losses[k]), m) for k, m in enumerate(run.bench.merits)},
         "of the inverse limits",
     ),
     Quantity("allocation", _allocation_plain, "limits chosen anew", where_known=True),

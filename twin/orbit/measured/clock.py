@@ -175,11 +175,20 @@ def calendar_reading(text: str) -> tuple[int, float]:
     Raises:
         Problem: not such a text.
     """
+    one = single_reading(text)
+    return int(one.day[0]), float(one.second[0])
+
+
+def single_reading(text: str) -> Readings:
+    """What one text shows.
+
+    Raises:
+        Problem: not a text of a date and a time.
+    """
     try:
-        one = Readings.of_texts([text.strip()])
+        return Readings.of_texts([text.strip()])
     except Problem as problem:
         raise Problem(problem.problem, problem.found, problem.allowed) from None
-    return int(one.day[0]), float(one.second[0])
 
 
 def known_scale(name: str) -> str:

@@ -97,10 +97,7 @@ class Chain:
         """Positions (S, C, 2), row and column, px from the first pixel's centre. Raises AimError, BeamMissedError."""
         if not self.experiment.monitored:
             return np.zeros((len(states), 0, 2))
-        path = self.experiment.path.coarse
-        mean = np.einsum("n,bnk->bk", path.nodes.share, path.rays(states).position[..., 1::-1]) / path.pitch
-        middle = 0.5 * (np.array(path.shape) - 1.0)
-        return np.swapaxes(mean.reshape(len(path.channels), len(states), 2), 0, 1) + middle
+        return self.experiment.path.coarse.mean_spots(states)
 
     def sight(self, states: Sequence[State]) -> np.ndarray:
         """Directions of the line CCDs' points, (S, cameras, points, 3). Raises AimError, BeamMissedError."""
