@@ -12,12 +12,13 @@ from astropy.io import fits
 from analysis.wavefront_maps.orientation import READINGS, Orientation
 from optics.geometry import zernike
 from optics.numerics.backend import Backend
+from optics.numerics.physical_error import UnphysicalError
 from scenes.specs.asbuilt import resolve_asbuilt
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from twin.asbuilt.asbuilt_bench import AsBuiltBench
 from twin.asbuilt.asbuilt_run import ASBUILT, run_asbuilt
-from twin.asbuilt.next_step import align, wanted_move
+from twin.asbuilt.next_step import advice, align, expected, wanted_move
 from twin.asbuilt.orientation_check import run_check
 from twin.camera.camera_optics import CameraOptics
 from twin.monitor.image_quality import image_quality
@@ -442,6 +443,31 @@ def test_files_of_the_laboratory_are_read(backend, tmp_path) -> None:
     measured["focus"]["lab"]["file"] = "spoilt.json"
     with pytest.raises(InputError, match="not a JSON file"):
         bench_of(backend, tmp_path, measured, simulate=None)
+
+
+def test_one_state_without_light_leaves_the_others(backend, tmp_path, monkeypatch) -> None:
+    """Its merit is not known, those of the others are as alone, and the next move is still told."""
+    measured = {"focus": {"collimator": {"fields": [[0, 0]], "sigma": "3 um"}}}
+    actuators = {"focus": {"motion": "focal_plane shift z", "range": "1 mm"}}
+    bench = bench_of(backend, tmp_path, measured, actuators=actuators)
+    rng = np.random.default_rng(1)
+    found = bench.estimate(bench.measured(bench.draw(rng, "normal"), rng))
+    draws = found.draw(rng, 5)
+    whole = expected(bench, draws, None)
+    numbers = bench.merit_numbers
+
+    def without(values, after, further=None):
+        if np.any(np.all(values == draws[3], axis=1)):
+            raise UnphysicalError("lost")
+        return numbers(values, after, further)
+
+    monkeypatch.setattr(bench, "merit_numbers", without)
+    told = expected(bench, draws, None)
+    assert np.isnan(told[3])
+    np.testing.assert_allclose(np.delete(told, 3), np.delete(whole, 3), rtol=1e-9)
+    step = advice(bench, found, draws, rng)
+    assert step.before == pytest.approx(np.mean(np.delete(whole, 3)), rel=1e-9)
+    assert np.isfinite(step.after)
 
 
 @pytest.mark.second

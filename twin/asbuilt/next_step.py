@@ -86,7 +86,8 @@ def advice(bench: AsBuiltBench, found: StateEstimate, draws: np.ndarray, rng: np
     after = bench.last
     move = wanted_move(bench, found.mean, after)
     made = bench.actuators.made(move.amounts, rng.standard_normal((len(draws), 2, len(move.amounts))))
-    both = [float(np.mean(expected(bench, draws, after, own))) for own in (None, made)]
+    # states without light are told by themselves, and have no merit
+    both = [float(np.nanmean(expected(bench, draws, after, own))) for own in (None, made)]
     _, by_actuators = _about(bench, found.mean, after, np.zeros(len(move.amounts)))
     unit_slope = bench.merit_slope(found.mean, after) @ found.prior.root
     candidates: dict[str, np.ndarray] = {}
