@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from optics.numerics.frozen_map import FrozenMap
 from twin.asbuilt.asbuilt_run import ALONG, AsBuiltRun, Standing, motions, moves_plain, responses
 from twin.asbuilt.built_instrument import CORRELATION, POSTERIOR, instrument_text, posterior_files
-from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table
+from twin.run.artefact import CameraFile, Cell, CsvFile, OwnDecimals, SvgFigure, Table, plain, significant
 from twin.run.report import Report, Section, answer
 from twin.run.svg import (
     BLUE,
@@ -145,8 +145,8 @@ def _short(amount: str | float) -> str:
     """An amount in words with four digits."""
     if isinstance(amount, str):
         number, _, unit = amount.partition(" ")
-        return f"{float(number):.4g} {unit}"
-    return f"{amount:.4g}"
+        return f"{plain(float(number), 4)} {unit}"
+    return plain(amount, 4)
 
 
 def _cell(value: float, one: Standing) -> Cell:
@@ -164,7 +164,7 @@ def _between(values: Sequence[float], one: Standing) -> str:
     low, middle, high = (shown_merit(values[k], one.merit) for k in (1, 2, 3))
     if low is None or middle is None or high is None:
         return "no light"
-    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+    return f"{significant(middle)} ({significant(low)} to {significant(high)})"
 
 
 def _summary(run: AsBuiltRun) -> Table:
@@ -175,7 +175,7 @@ def _summary(run: AsBuiltRun) -> Table:
         sign = "at least" if spec.more_is_better else "at most"
         row: list[Cell] = [
             merit_head(one.merit),
-            f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g}",
+            f"{sign} {plain(spec.requirement / merit_unit(one.merit)[1])}",
             _cell(one.designed, one),
             _between(one.before, one),
             _between(one.now, one),

@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from scenes.yaml.units import split_quantity
-from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, shown_unit
+from twin.run.artefact import CameraFile, Cell, OwnDecimals, SvgFigure, Table, decimals_for, plain, shown_unit
 from twin.run.report import Report, Section, answer
-from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, to_svg
+from twin.run.svg import BLUE, GREY, INK, ORANGE, VERMILION, look, new_figure, plain_axes, shared_legend, to_svg
 from twin.tolerance.merit_models import FARTHEST
 from twin.tolerance.merits import merit_head, merit_unit
 from twin.tolerance.monitor_merit import readings_of
@@ -20,6 +20,8 @@ _FEW = 3
 _LITTLE = 0.01
 """Share of every merit's variance below which a tolerance may be loosened."""
 _MOST_CURVES = 6
+_ROUNDING = 1e-7
+"""Share of a compensator's range below which a move is none."""
 
 
 def tolerance_report(run: ToleranceRun) -> Report:
@@ -171,7 +173,7 @@ def _summary(run: ToleranceRun) -> Table:
         rows.append(
             [
                 merit_head(one.merit),
-                f"{sign} {spec.requirement / merit_unit(one.merit)[1]:.4g} in {100 * spec.probability:.0f} %",
+                f"{sign} {plain(spec.requirement / merit_unit(one.merit)[1])} in {100 * spec.probability:.0f} %",
                 _scaled(one.nominal, one),
                 _scaled(one.mean, one),
                 _scaled(one.levels[1], one),
@@ -227,7 +229,7 @@ def _sensitivity_table(run: ToleranceRun) -> Table:
         for m, result in enumerate(run.merits):
             cells += [_scaled(float(run.found.values[e, end, m]), result) for end in (0, 1)]
         shares = [
-            float(run.found.moves[e, end, c]) / (compensator.range_si or 1.0)
+            _unless_rounding(float(run.found.moves[e, end, c]) / (compensator.range_si or 1.0))
             for c, compensator in enumerate(adjusted.values())
             for end in (0, 1)
         ]
@@ -273,6 +275,11 @@ def _inverse_table(run: ToleranceRun) -> Table:
         loss, name = float(run.inverse.losses[m]) / size, result.merit.name
         heads.append(f"{name}: loss {loss:.3g} {shown_unit(unit)}".rstrip() if np.isfinite(loss) else name)
     return Table("inverse", "Limits for a loss", "In the unit of the limit.", heads, rows)
+
+
+def _unless_rounding(share: float) -> float:
+    """A share of a range, 0 where it is what the adjustment's rounding leaves."""
+    return 0.0 if abs(share) < _ROUNDING else share
 
 
 def _scaled_limit(limit: str | float, share: float) -> str:
@@ -376,7 +383,7 @@ def _yield_figure(run: ToleranceRun) -> Figure:
         _curve(ax, run, one)
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
-    axes[0].legend(loc="lower right")
+    shared_legend(figure, axes[0])
     return figure
 
 
@@ -393,8 +400,7 @@ def _curve(ax: Axes, run: ToleranceRun, one: MeritResult) -> None:
         ax.plot(known, 100.0 * share, style, color=colour, lw=width, label=label)
     ax.axvline(one.merit.spec.requirement / size, color=VERMILION, lw=1.0)
     ax.axhline(100.0 * one.merit.spec.probability, color=INK, lw=0.5, alpha=0.5)
-    unit = merit_unit(one.merit)[0]
-    ax.set_xlabel(f"{one.merit.name} [{shown_unit(unit)}]" if unit else one.merit.name)
+    ax.set_xlabel(merit_head(one.merit))
     ax.set_ylabel("cameras [%]")
     ax.set_ylim(0.0, 102.0)
     plain_axes(ax)
@@ -414,6 +420,6 @@ def _share_figure(run: ToleranceRun) -> Figure:
         ax.barh(at, [100.0 * one.shares[name] for name in order], 0.9 * step, color=colours[k], label=one.merit.name)
     ax.set_yticks(np.arange(len(order)), order)
     ax.set_xlabel("share of the variance [%]")
-    ax.legend(loc="lower right")
+    shared_legend(figure, ax)
     plain_axes(ax)
     return figure
