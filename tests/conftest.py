@@ -93,6 +93,9 @@ class Calibrated:
         if self.on and free_beams:
             self._kept = [new, *(one for one in self._kept if one not in same)]
 
+    def keep_only(self, one: MonitorExperiment) -> None:
+        self._kept = [one]
+
 
 def _of_one_instrument(one: MonitorExperiment, resolved: ResolvedJob, backend: Backend) -> bool:
     """Equal with the order in which parts are named, which is that of the results and no part of equality."""
