@@ -75,7 +75,7 @@ class TimeLaw:
         if self.period_s is not None:
             out = out * np.cos(2.0 * math.pi * away / self.period_s)
         if self.trend_s is not None or self.relaxation_s is not None:
-            out = out * (self._amplitude(first) * self._amplitude(second))
+            out = out * (self.amplitude(first) * self.amplitude(second))
         if self.event:
             out = out * self.come(np.minimum(first, second))
         return np.asarray(out)
@@ -101,7 +101,8 @@ class TimeLaw:
         before, across, after = (float(self.covariance(*pair)) for pair in times)
         return before, across, after
 
-    def _amplitude(self, time: Array) -> Array:
+    def amplitude(self, time: Array) -> Array:
+        """g(t) of a trend and of a relaxation; 1 without them."""
         out, since = np.ones_like(time), time - self.since_s
         if self.trend_s is not None:
             out = out * since / self.trend_s

@@ -1,0 +1,525 @@
+"""Readings followed one by one: the state now, what comes next, and jumps, with the same work for every reading.
+
+A Kalman filter on the `state_space` of what is stated to move. Beside it stands one that looks for jumps: for a step
+just before each of the last readings it keeps what that step would do to its innovations (Willsky, Jones, IEEE Trans.
+Automat. Contr. 21, 1976, 108). With the response X of its own estimate to a step of unit outputs, E = (picked outputs)
+- H X is that of an innovation nu of covariance S, and
+
+    b = sum E' S^-1 nu,   J = sum E' S^-1 E
+
+are what `jump_detection.likeliest` needs, without going through a reading twice. The chance of a false alarm counts
+every look of the whole life: readings, places of the step and candidates (Boole's inequality, a bound). A jump that is
+told changes the estimate as if it had been known all along, (G - X) times its amounts, G what steps do to the states,
+as a mixture over the readings between which it can have come; so sigma is wide where that is not known.
+
+Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import ndtr
+
+from analysis.chi_square import limit_of
+from analysis.measurement_error import UndeterminedError
+from analysis.monitor.disturbances import Disturbances
+from analysis.monitor.jump_detection import Candidate, Jump, Steps, candidates, likeliest
+from analysis.monitor.series_smoother import SeriesChanges
+from analysis.monitor.state_space import HeatInputs, StateSpace
+
+__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Whitened", "of_shifts", "series_of"]
+
+Array = NDArray[np.float64]
+_UNLIKELY = 1e-4
+"""Of the weight of the likeliest time of a jump, below which it did not come at a time."""
+_SIZES = np.linspace(0.0, 8.0, 201)
+_MEAN_SQUARE = 2.0 * (_SIZES[1] - _SIZES[0]) * _SIZES**2 * np.exp(-0.5 * _SIZES**2) / math.sqrt(2.0 * math.pi)
+"""Shares of the mean square of a normal number by its size in standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """One reading: of all spots, or of d sensors or combinations of parameters.
+
+    Attributes:
+        time: seconds.
+        value: (D,) shifts of the spots since the reference, px; (d,) of another reading, in its unit.
+        noise: its covariance.
+        sensors: numbers of the sensors of `HeatInputs` that read it, d of them.
+        parameters: (d, P) rows on the parameters that it reads.
+    """
+
+    time: float
+    value: Array
+    noise: Array
+    sensors: tuple[int, ...] = ()
+    parameters: Array | None = None
+
+    @property
+    def spots(self) -> bool:
+        """Whether it is one of the spots."""
+        return not self.sensors and self.parameters is None
+
+
+def of_shifts(times: ArrayLike, shifts: Array, noise: Array) -> tuple[Observed, ...]:
+    """Readings of spots.
+
+    Args:
+        times: (N,) seconds, in any order.
+        shifts: (N, D) px.
+        noise: (D, D) of each, or (N, D, D), px^2.
+    """
+    when = np.asarray(times, np.float64)
+    each = np.broadcast_to(noise, (len(when), *noise.shape[-2:]))
+    return tuple(Observed(float(when[k]), shifts[k], each[k]) for k in np.argsort(when, kind="stable"))
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """A reading against what was expected of it before it came.
+
+    Attributes:
+        observed: the reading.
+        expected: its mean; spread: (d, d) covariance about it, noise included.
+        white: (d,) the difference in independent standard deviations.
+        log_score: logarithm of the density that was stated for what came.
+        jump: told at this reading; None for none.
+    """
+
+    observed: Observed
+    expected: Array
+    spread: Array
+    white: Array
+    log_score: float
+    jump: Jump | None = None
+
+    @property
+    def chi_square(self) -> float:
+        """Of as many degrees of freedom as numbers were read."""
+        return float(self.white @ self.white)
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """A filter, and what steps just before each of L readings would do to it.
+
+    Attributes:
+        mean: (n,); covariance: (n, n).
+        response: (L, n, q) of the mean to steps of unit outputs.
+        score: (L, q) b of the module's text; information: (L, q, q) J.
+    """
+
+    mean: Array
+    covariance: Array
+    response: Array
+    score: Array
+    information: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Whitened:
+    """A reading divided by the root of its covariance.
+
+    Attributes:
+        expected: (d,); spread: (d, d) its covariance; root: Cholesky factor of that.
+        white: (d,) root^-1 (value - expected).
+        rows: (d, n) root^-1 H; gain: (d, n) root^-1 H P; picked: (d, q) root^-1 what unit outputs do to it.
+    """
+
+    expected: Array
+    spread: Array
+    root: Array
+    white: Array
+    rows: Array
+    gain: Array
+    picked: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """All that is known from the readings so far.
+
+    Attributes:
+        time: of the newest reading or of the start, seconds.
+        last: time of the newest reading of spots; NaN before the first.
+        after, until: (L,) between which times each step that is looked for comes, seconds.
+        state: the filter. search: the one that looks for jumps, which knows of no walk; None where they are the same.
+        left: (m,) what share of the mean square of jumps cannot be told, of each motion of a stated rate.
+    """
+
+    time: float
+    last: float
+    after: Array
+    until: Array
+    state: _Track
+    search: _Track | None
+    left: Array
+
+    @property
+    def mean(self) -> Array:
+        """(n,) of the states."""
+        return self.state.mean
+
+    @property
+    def covariance(self) -> Array:
+        """(n, n) of the states."""
+        return self.state.covariance
+
+    @property
+    def looking(self) -> _Track:
+        """The filter that looks for jumps."""
+        return self.state if self.search is None else self.search
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesFilter:
+    """Filter of what is stated to move.
+
+    Attributes:
+        stated: what moves, and how it goes on in time.
+        reference_noise: (D, D) px^2 of the spots that shifts are counted from; None for none.
+        heat: temperatures that sensors read; None for none.
+        readings: of spots over the whole life, by which a chance of a false alarm is counted.
+        window: readings for which a jump is looked for.
+        parameters_read: whether there are readings of parameters among those of spots.
+        unfound: whether jumps too small to be told count, where it is stated how often a motion jumps.
+    """
+
+    stated: Disturbances
+    reference_noise: Array | None = None
+    heat: HeatInputs | None = None
+    readings: float = 1e4
+    window: int = 60
+    parameters_read: bool = False
+    unfound: bool = True
+    _may: tuple[Candidate, ...] = field(init=False, default=())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_may", candidates(self._stacked) if self.window else ())
+
+    @cached_property
+    def space(self) -> StateSpace:
+        """The states."""
+        return StateSpace(self.stated, self.reference_noise, self.heat)
+
+    @cached_property
+    def _stacked(self) -> Disturbances:
+        """What moves, all q outputs that readings may be of in place of the spots."""
+        if not self.parameters_read:
+            return self.stated
+        return replace(self.stated, spots=np.concatenate([self.stated.spots, self.stated.parameters]))
+
+    @cached_property
+    def walking(self) -> NDArray[np.int_]:
+        """(m,) numbers of motions that jump at a stated rate."""
+        own = [k for k, law in enumerate(self.stated.laws) if law.every_s is not None and self.unfound]
+        return np.array(own, int)
+
+    @cached_property
+    def _walk(self) -> Array:
+        """(n, m) what one of these does to the states, over the root of its rate."""
+        rates = np.array([1.0 / float(self.stated.laws[k].every_s or 1.0) for k in self.walking])
+        if not len(rates):
+            return np.zeros((self.space.size, 0))
+        return self.space.level_of(self.walking.tolist()) * np.sqrt(rates)
+
+    @property
+    def looks(self) -> float:
+        """For a jump, over the whole life."""
+        return max(1.0, self.readings * self.window * len(self._may))
+
+    @cached_property
+    def _limit(self) -> float:
+        """Ratio below which no candidate can be told, whatever its number of motions."""
+        return float(limit_of(self.stated.jump_false_alarm / self.looks, 1)) if self._may else math.inf
+
+    def start(self, time: float) -> Belief:
+        """What is known before any reading.
+
+        Args:
+            time: not after the first reading, seconds.
+        """
+        mean, covariance = self.space.start(time)
+        size, q = self.space.size, self._stacked.spots.shape[0]
+        track = _Track(mean, covariance, np.zeros((0, size, q)), np.zeros((0, q)), np.zeros((0, q, q)))
+        empty, left = np.zeros(0), np.ones(len(self.walking))
+        return Belief(time, math.nan, empty, empty, track, track if len(left) and self._may else None, left)
+
+    def at(self, belief: Belief, time: float) -> Belief:
+        """What will be known at a later time, if no reading comes until then.
+
+        Args:
+            belief: so far.
+            time: seconds.
+        """
+        state = self._moved(belief.state, belief.time, time, belief.left)
+        search = None if belief.search is None else self._moved(belief.search, belief.time, time, None)
+        return replace(belief, time=max(time, belief.time), state=state, search=search)
+
+    def _moved(self, track: _Track, then: float, now: float, left: Array | None) -> _Track:
+        if now <= then:
+            return track
+        space = self.space
+        covariance = space.spread(track.covariance, then, now)
+        if left is not None and len(left):
+            walk = self._walk * np.sqrt(left * (now - then))
+            covariance = covariance + walk @ walk.T
+        mean = space.moved(track.mean[:, None], then, now)[:, 0]
+        return replace(track, mean=mean, covariance=covariance, response=space.moved(track.response, then, now))
+
+    def update(self, belief: Belief, observed: Observed) -> tuple[Belief, Innovation]:
+        """Take one reading.
+
+        Args:
+            belief: so far.
+            observed: the reading, not before the time of ``belief``.
+
+        Raises:
+            UndeterminedError: the reading has no noise and says what is known already.
+        """
+        now = self.at(belief, observed.time)
+        if observed.spots and self._may and observed.time > belief.last:
+            now = self._with_step(now, belief.last, observed.time)
+        state, found = self._taken(now.state, observed)
+        search = None if now.search is None else self._taken(now.search, observed)[0]
+        last = observed.time if observed.spots else now.last
+        now = replace(now, state=state, search=search, last=last)
+        if not (observed.spots and self._may and len(now.until)):
+            return now, found
+        now = replace(now, left=self.unseen(now.looking.information[:1])[0])
+        jump = self._told(now)
+        if jump is not None:
+            now, jump = self._jumped(now, jump)
+        return now, replace(found, jump=jump)
+
+    def _with_step(self, belief: Belief, after: float, until: float) -> Belief:
+        """With a step that is looked for just before a reading; the oldest is given up."""
+        start = max(0, len(belief.until) + 1 - self.window)
+
+        def more(track: _Track) -> _Track:
+            q = track.score.shape[1]
+            return replace(
+                track,
+                response=np.concatenate([track.response[start:], np.zeros((1, self.space.size, q))]),
+                score=np.concatenate([track.score[start:], np.zeros((1, q))]),
+                information=np.concatenate([track.information[start:], np.zeros((1, q, q))]),
+            )
+
+        return replace(
+            belief,
+            after=np.append(belief.after[start:], after),
+            until=np.append(belief.until[start:], until),
+            state=more(belief.state),
+            search=None if belief.search is None else more(belief.search),
+        )
+
+    def read(self, mean: Array, covariance: Array, observed: Observed) -> tuple[Array, Array, Array, Array]:
+        """What a reading is expected to be: its mean (d,), rows on the states (d, n), covariance (d, d) of what these
+        leave, noise included, and what unit outputs do to it, (d, q).
+
+        Args:
+            mean: (n,) of the states at its time.
+            covariance: (n, n) of them.
+            observed: the reading.
+        """
+        width, q = self.space.width, self._stacked.spots.shape[0]
+        if observed.sensors:
+            rows = self.space.sensor_rows(observed.sensors, observed.time)
+            return rows @ mean, rows, observed.noise, np.zeros((len(rows), q))
+        values, rows, left = self.space.outputs(mean, covariance, observed.time)
+        if observed.parameters is None:
+            return values[:width], rows[:width], observed.noise + left[:width, :width], np.eye(width, q)
+        own = observed.parameters
+        picked = np.concatenate([np.zeros((len(own), width)), own], axis=1)[:, :q]
+        noise = observed.noise + own @ left[width:, width:] @ own.T
+        return own @ values[width:], own @ rows[width:], noise, picked
+
+    def whitened(self, track: _Track, observed: Observed) -> Whitened:
+        """A reading divided by the root of its covariance.
+
+        Args:
+            track: the states at its time.
+            observed: the reading.
+
+        Raises:
+            UndeterminedError: it has no noise and says what is known already.
+        """
+        expected, rows, noise, picked = self.read(track.mean, track.covariance, observed)
+        across = track.covariance @ rows.T
+        spread = rows @ across + noise
+        try:
+            root = np.asarray(np.linalg.cholesky(spread), np.float64)
+        except np.linalg.LinAlgError as error:
+            raise UndeterminedError("filter: readings that say the same twice need noise") from error
+        both = np.concatenate([(observed.value - expected)[:, None], rows, across.T, picked], axis=1)
+        both = solve_triangular(root, both, lower=True, check_finite=False)
+        n = len(track.mean)
+        return Whitened(
+            expected, spread, root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :]
+        )
+
+    def _taken(self, track: _Track, observed: Observed) -> tuple[_Track, Innovation]:
+        w = self.whitened(track, observed)
+        covariance = track.covariance - w.gain.T @ w.gain
+        covariance = 0.5 * (covariance + covariance.T)
+        log_score = -0.5 * float(w.white @ w.white) - float(np.log(np.diag(w.root)).sum())
+        log_score -= 0.5 * len(w.white) * math.log(2.0 * math.pi)
+        response, score, information = track.response, track.score, track.information
+        if len(score):
+            seen = w.picked - w.rows @ response
+            response = response + w.gain.T @ seen
+            score = score + w.white @ seen
+            information = information + seen.transpose(0, 2, 1) @ seen
+        taken = _Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
+        return taken, Innovation(observed, w.expected, w.spread, w.white, log_score)
+
+    def unseen(self, information: Array) -> Array:
+        """(L, m) what share of the mean square of jumps is of those that cannot be told with some information.
+
+        Args:
+            information: (L, q, q) of the amounts of steps.
+        """
+        column = self._stacked.spots[:, self.walking]
+        seen = np.sqrt(np.maximum(np.einsum("qm,kqr,rm->km", column, information, column), 0.0))
+        limit = math.sqrt(self._limit)
+        return np.asarray(ndtr(limit - _SIZES * seen[..., None]) @ _MEAN_SQUARE)
+
+    def _told(self, belief: Belief) -> Jump | None:
+        """The likeliest jump, if chance does not explain it."""
+        track = belief.looking
+        # no candidate explains more than any outputs would
+        values, vectors = np.linalg.eigh(track.information)
+        along = np.einsum("kqr,kq->kr", vectors, track.score)
+        large = values > 1e-12 * values[:, -1:]
+        most = np.sum(np.where(large, along**2 / np.where(large, values, 1.0), 0.0), axis=1)
+        if most.max() < self._limit:
+            return None
+        steps = Steps(belief.after, belief.until, track.score, track.information)
+        own = np.isfinite(belief.after)
+        steps = Steps(*(getattr(steps, name)[own] for name in ("after", "until", "score", "information")))
+        one = likeliest([steps], self._may, self._stacked)
+        if one is None:
+            return None
+        chance = min(1.0, one.chance * self.looks / (len(self._may) * len(steps.until)))
+        return replace(one, chance=chance) if chance <= self.stated.jump_false_alarm else None
+
+    def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
+        """What is known once a jump is told, and the jump with its sizes."""
+        own = list(jump.motions)
+        values, vectors = np.linalg.eigh(self.stated.correlation[np.ix_(own, own)])
+        root = vectors * np.sqrt(np.clip(values, 0.0, None))
+        outputs, level = self._stacked.spots[:, own] @ root, self.space.level_of(own) @ root
+        known = np.isfinite(belief.after)
+        looked = _Amounts.of(belief.looking, outputs, jump.times)
+        weight = np.where(known, looked.log_weight, -np.inf)
+        weight = np.exp(weight - weight.max()) * np.where(known, belief.until - belief.after, 0.0)
+        weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
+        weight /= weight.sum()
+        state = _compensated(belief.state, _Amounts.of(belief.state, outputs, jump.times), weight, level, outputs)
+        search = None
+        if belief.search is not None:
+            search = _compensated(belief.search, looked, weight, level, outputs)
+        amounts = _Amounts.of(belief.state, outputs, jump.times)
+        mean = weight @ amounts.mean
+        away = amounts.mean - mean
+        spread = np.einsum("k,kij->ij", weight, amounts.covariance + away[:, :, None] * away[:, None, :])
+        sigma = self.stated.sigmas[own]
+        sizes, sigmas = sigma * (root @ mean), sigma * np.sqrt(np.diag(root @ spread @ root.T))
+        told = replace(
+            jump,
+            sizes=tuple(sizes.tolist()),
+            sigmas=tuple(sigmas.tolist()),
+            chances=_chances(belief.after, belief.until, weight),
+        )
+        empty = np.zeros(0)
+        return replace(belief, state=state, search=search, after=empty, until=empty), told
+
+    def changes(self, belief: Belief, times: ArrayLike) -> SeriesChanges:
+        """Forecast from what is known: parameters at times that are not before the newest reading.
+
+        Args:
+            belief: so far.
+            times: (T,) seconds.
+        """
+        found = [self.parameters(belief, time) for time in np.asarray(times, np.float64).tolist()]
+        return series_of(found, self.stated.parameters.shape[0])
+
+    def parameters(
+        self, belief: Belief, time: float, more: Array | None = None, gained: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Parameters (P,) and their covariance (P, P).
+
+        Args:
+            belief: so far.
+            time: not before its own, seconds.
+            more: (n,) by which later readings correct the states there.
+            gained: (n, n) by which they do their covariance.
+        """
+        state, width = self._moved(belief.state, belief.time, time, belief.left), self.space.width
+        mean = state.mean if more is None else state.mean + more
+        covariance = state.covariance if gained is None else state.covariance - gained
+        values, rows, left = self.space.outputs(mean, covariance, time)
+        own = rows[width:]
+        return values[width:], own @ covariance @ own.T + left[width:, width:]
+
+
+@dataclass(frozen=True, eq=False)
+class _Amounts:
+    """How much motions have jumped, for each place of the step: mean (L, r), covariance (L, r, r), log weights (L,)."""
+
+    mean: Array
+    covariance: Array
+    log_weight: Array
+
+    @classmethod
+    def of(cls, track: _Track, outputs: Array, times: float) -> _Amounts:
+        """Of amounts whose standard deviations are so many times those that are stated."""
+        information = outputs.T @ track.information @ outputs
+        score = track.score @ outputs
+        prior = np.eye(outputs.shape[1]) / times**2
+        covariance = np.asarray(np.linalg.inv(information + prior), np.float64)
+        mean = np.einsum("kij,kj->ki", covariance, score)
+        _, size = np.linalg.slogdet(np.eye(outputs.shape[1]) + times**2 * information)
+        return cls(mean, covariance, 0.5 * (np.sum(mean * score, axis=1) - size))
+
+
+def _compensated(track: _Track, amounts: _Amounts, weight: Array, level: Array, outputs: Array) -> _Track:
+    """The filter as if it had known of the jump, averaged over its places; nothing is looked for beside it."""
+    moved = level - track.response @ outputs
+    each = np.einsum("knr,kr->kn", moved, amounts.mean)
+    mean = weight @ each
+    spread = np.einsum("k,knr,krs,kms->nm", weight, moved, amounts.covariance, moved, optimize=True)
+    away = (each - mean) * np.sqrt(weight)[:, None]
+    covariance = track.covariance + spread + away.T @ away
+    q = track.score.shape[1]
+    none = np.zeros((0, len(mean), q)), np.zeros((0, q)), np.zeros((0, q, q))
+    return _Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
+
+
+def _chances(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
+    """(time, chance that a step has come by then), linear between."""
+    sure = np.minimum(np.cumsum(weight), 1.0)
+    knots: dict[float, float] = {}
+    for k in np.flatnonzero(weight):
+        knots.setdefault(float(after[k]), float(sure[k - 1]) if k else 0.0)
+        knots[float(until[k])] = float(sure[k])
+    return tuple(sorted(knots.items()))
+
+
+def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:
+    """Parameters and covariances at T times as one series; what noise alone does is not known, NaN.
+
+    Args:
+        found: (P,) and (P, P) at each time.
+        width: P.
+    """
+    values = np.array([one for one, _ in found]).reshape(-1, width)
+    total = np.array([one for _, one in found]).reshape(-1, width, width)
+    return SeriesChanges(values, np.full_like(total, np.nan), total)

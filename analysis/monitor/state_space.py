@@ -1,0 +1,425 @@
+"""State space of stated disturbances: what moves as a process that goes on from one reading to the next.
+
+Every law in time of `analysis.monitor.disturbances` but its products with chance is a process of finitely many states,
+so that the covariances
+
+    g(t) g(t') exp(-|t - t'| / D) cos(2 pi (t - t') / T) C(min(t, t'))
+
+are those of states with a decay, a turn, an amplitude g and a variance C(t) that steps add to (Sarkka, Solin, Applied
+Stochastic Differential Equations, 2019, ch. 12). Motions of one law that move spots and parameters alike need no state
+of their own: of M motions the states are the singular vectors of what they do to the D + P outputs, at most D + P of
+them. Steps, those of events and those of jumps, change one common level.
+
+Temperatures of bodies that have a sensor keep states of their own, since sensors read them, and so does the factor by
+which what heat really does to light is larger than computed: the product of the two is taken to second order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+
+__all__ = ["HeatInputs", "StateSpace"]
+
+Array = NDArray[np.float64]
+_NOTHING = 1e-12
+"""Of the largest singular value of outputs that are scaled to each other, below which nothing but rounding is left."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeatInputs:
+    """Temperatures that sensors read, as inputs with errors.
+
+    Attributes:
+        motions: (m,) numbers of the disturbances that are temperatures or gradients of bodies with sensors.
+        sensors: names of the S sensors.
+        rows: (S, m) kelvin at each sensor for one standard deviation of each motion.
+        factors: (m,) number of the factor by which what each motion does to light differs from what was computed.
+        names: of the factors, bodies.
+        sigma: standard deviation of a factor before any reading.
+    """
+
+    motions: NDArray[np.int_]
+    sensors: tuple[str, ...]
+    rows: Array
+    factors: NDArray[np.int_]
+    names: tuple[str, ...]
+    sigma: float
+
+
+_Stepping = tuple[tuple[TimeLaw, Array], ...]
+_Kind = Literal["level", "law", "heat", "factor", "reference"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """States of one law.
+
+    Attributes:
+        kind: `level` of all that steps, `law` of another law, `heat` of temperatures with sensors, `factor` and
+            `reference`.
+        law: in time.
+        at: their numbers; of a law with a period the first half goes as a cosine, the second as a sine.
+        outputs: (D + P, r) of the first r states, for amplitude 1.
+        covariance: (r, r) of the states where the law's own variance is 1.
+        motions: numbers of the disturbances that they stand for.
+        steps: (law, (r, r)) of events and jumps, of the level alone.
+    """
+
+    kind: _Kind
+    law: TimeLaw
+    at: slice
+    outputs: Array
+    covariance: Array
+    motions: tuple[int, ...] = ()
+    steps: _Stepping = ()
+
+    @property
+    def rank(self) -> int:
+        return int(self.outputs.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpace:
+    """The process of all disturbances, and of the error of the reference that all shifts are counted from.
+
+    Attributes:
+        stated: what moves, D spot coordinates and P parameters.
+        reference_noise: (D, D) px^2 of the reference's spots, the same error in every shift; None for none.
+        heat: temperatures that sensors read; None for none.
+
+    Raises:
+        ValueError: motions of different laws are correlated.
+    """
+
+    stated: Disturbances
+    reference_noise: Array | None = None
+    heat: HeatInputs | None = None
+    _blocks: tuple[_Block, ...] = field(init=False, default=())
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_blocks", tuple(self._made()))
+
+    def _made(self) -> list[_Block]:
+        stated = self.stated
+        outputs = self.outputs_of(range(len(stated.labels)))
+        scale = np.abs(outputs).max(axis=1, initial=0.0)
+        scale = np.where(scale > 0.0, scale, 1.0)[:, None]
+        raw = np.zeros(len(stated.labels), bool)
+        if self.heat is not None:
+            raw[self.heat.motions] = True
+        laws = list(dict.fromkeys(stated.laws))
+        own = {law: np.array([one == law for one in stated.laws]) for law in laws}
+        for law in laws:
+            if np.any(stated.correlation[np.ix_(own[law], ~own[law])]):
+                raise ValueError("state space: motions with different laws in time cannot be correlated")
+        out: list[_Block] = []
+
+        def add(
+            kind: _Kind,
+            law: TimeLaw,
+            columns: Array,
+            covariance: Array,
+            motions: NDArray[np.intp],
+            steps: _Stepping = (),
+        ) -> None:
+            start = out[-1].at.stop if out else 0
+            at = slice(start, start + columns.shape[1] * (1 if law.period_s is None else 2))
+            out.append(_Block(kind, law, at, columns, covariance, tuple(motions.tolist()), steps))
+
+        level = np.array([_is_level(law) for law in stated.laws], bool) & ~raw
+        if np.any(level):
+            basis, _ = _spanned(outputs[:, level] / scale)
+            steps = []
+            for law in filter(_is_level, laws):
+                mine = own[law] & ~raw
+                at = basis.T @ (outputs[:, mine] / scale)
+                steps.append((law, at @ stated.correlation[np.ix_(mine, mine)] @ at.T))
+            none = np.zeros((basis.shape[1],) * 2)
+            add("level", TimeLaw(), scale * basis, none, np.flatnonzero(level), tuple(steps))
+        for law in laws:
+            mine = own[law] & ~raw
+            if not _is_level(law) and np.any(mine):
+                values, vectors = np.linalg.eigh(stated.correlation[np.ix_(mine, mine)])
+                moved = outputs[:, mine] @ (vectors * np.sqrt(np.clip(values, 0.0, None)))
+                basis, sizes = _spanned(moved / scale)
+                add("law", law, scale * (basis * sizes), np.eye(basis.shape[1]), np.flatnonzero(mine))
+        if self.heat is not None:
+            for law in laws:
+                mine = own[law] & raw
+                if np.any(mine):
+                    correlation = stated.correlation[np.ix_(mine, mine)]
+                    add("heat", law, outputs[:, mine], correlation, np.flatnonzero(mine))
+            factors = len(self.heat.names)
+            spread = self.heat.sigma**2 * np.eye(factors)
+            add("factor", TimeLaw(), np.zeros((len(scale), factors)), spread, np.empty(0, int))
+        if self.reference_noise is not None:
+            rows = np.zeros((len(scale), self.width))
+            rows[: self.width] = np.eye(self.width)
+            add("reference", TimeLaw(), rows, self.reference_noise, np.empty(0, int))
+        return out
+
+    @cached_property
+    def size(self) -> int:
+        """Number of states."""
+        return self._blocks[-1].at.stop if self._blocks else 0
+
+    @property
+    def width(self) -> int:
+        """D, spot coordinates."""
+        return int(self.stated.spots.shape[0])
+
+    def outputs_of(self, motions: Sequence[int] | range) -> Array:
+        """(D + P, m) of motions, for one standard deviation: px of spots, then parameters.
+
+        Args:
+            motions: m numbers.
+        """
+        own = list(motions)
+        return np.concatenate([self.stated.spots[:, own], self.stated.parameters[:, own]])
+
+    def level_of(self, motions: Sequence[int]) -> Array:
+        """(n, m) change of the states by steps of motions of one standard deviation each.
+
+        Args:
+            motions: m numbers of motions that jump or have events.
+        """
+        out = np.zeros((self.size, len(motions)))
+        block = self._blocks[0]
+        out[block.at] = self._coordinates(block, motions)
+        return out
+
+    def _coordinates(self, block: _Block, motions: Sequence[int]) -> Array:
+        """(r, m) states of a block that do what motions do."""
+        scale = np.abs(block.outputs).max(axis=1, initial=0.0)
+        scale = np.where(scale > 0.0, scale, 1.0)[:, None]
+        return np.asarray(np.linalg.lstsq(block.outputs / scale, self.outputs_of(motions) / scale, rcond=None)[0])
+
+    def start(self, time: float) -> tuple[Array, Array]:
+        """States before any reading: mean (n,) and covariance (n, n).
+
+        Args:
+            time: seconds.
+        """
+        spread = np.zeros((self.size, self.size))
+        for block in self._blocks:
+            self._add(spread, block, block.covariance * _variance(block.law, time))
+            for law, steps in block.steps:
+                self._add(spread, block, _come(law, time) * steps)
+        return np.zeros(self.size), spread
+
+    @staticmethod
+    def _add(spread: Array, block: _Block, what: Array) -> None:
+        parts = [block.at] if block.law.period_s is None else _halves(block.at)
+        for part in parts:
+            spread[part, part] += what
+
+    def moved(self, states: Array, then: float, now: float, back: bool = False) -> Array:
+        """What states, or anything that goes on as they do, are at another time; (..., n, k).
+
+        Args:
+            states: (..., n, k).
+            then: their time, seconds.
+            now: the later one.
+            back: by the transposed transition: what a smoother carries from ``now`` to ``then``.
+        """
+        if now == then:
+            return states
+        kept, turned = self._transition(now - then)
+        out = np.asarray(states * kept[:, None])
+        for cosine, sine, angle in turned:
+            c, s = math.cos(angle), math.sin(-angle if back else angle)
+            first, second = out[..., cosine, :].copy(), out[..., sine, :].copy()
+            out[..., cosine, :] = c * first - s * second
+            out[..., sine, :] = s * first + c * second
+        return out
+
+    def _transition(self, over: float) -> tuple[Array, list[tuple[slice, slice, float]]]:
+        kept, turned = np.ones(self.size), []
+        for block in self._blocks:
+            kept[block.at] = _kept(block.law, over)
+            if block.law.period_s is not None:
+                turned.append((*_halves(block.at), 2.0 * math.pi * over / block.law.period_s))
+        return kept, turned
+
+    def spread(self, covariance: Array, then: float, now: float) -> Array:
+        """(n, n) covariance of states at a later time, with what has been added since.
+
+        Args:
+            covariance: (n, n) at ``then``.
+            then: its time, seconds.
+            now: the later one.
+        """
+        if now == then:
+            return covariance
+        out = self.moved(covariance, then, now)
+        out = self.moved(out.T.copy(), then, now)
+        for block in self._blocks:
+            gained = _variance(block.law, now) - _kept(block.law, now - then) ** 2 * _variance(block.law, then)
+            if gained > 0.0:
+                self._add(out, block, gained * block.covariance)
+            for law, steps in block.steps:
+                if (come := _come(law, now) - _come(law, then)) > 0.0:
+                    self._add(out, block, come * steps)
+        return out
+
+    def outputs(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array, Array]:
+        """What states do: values (D + P,), rows on the states (D + P, n), and the covariance of what rows leave out.
+
+        Args:
+            mean: (n,) of the states at ``time``.
+            covariance: (n, n) of them.
+            time: seconds.
+        """
+        rows = self._rows(time)
+        left = np.zeros((len(rows), len(rows)))
+        if self.heat is None:
+            return rows @ mean, rows, left
+        rows = rows.copy()
+        values = rows @ mean
+        for factor, at in self._heated:
+            own = rows[:, at].copy()
+            product, cross = mean[factor] * mean[at], covariance[factor, at]
+            values += own @ (product + cross)
+            rows[:, at] = (1.0 + mean[factor]) * own
+            rows[:, factor] = own @ mean[at]
+            second = covariance[factor, factor] * covariance[np.ix_(at, at)] + np.outer(cross, cross)
+            left += own @ second @ own.T
+        return values, rows, left
+
+    def _rows(self, time: float) -> Array:
+        if time not in self._rows_at:
+            self._rows_at.clear()
+            rows = self._still.copy()
+            for block in self._blocks:
+                gain = _gain(block.law, time)
+                if gain != 1.0:
+                    rows[:, block.at] *= gain
+            self._rows_at[time] = rows
+        return self._rows_at[time]
+
+    @cached_property
+    def _rows_at(self) -> dict[float, Array]:
+        return {}
+
+    @cached_property
+    def _still(self) -> Array:
+        rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
+        for block in self._blocks:
+            rows[:, block.at.start : block.at.start + block.rank] = block.outputs
+        return rows
+
+    @cached_property
+    def _heat_states(self) -> dict[int, int]:
+        """Number of a motion with a sensor -> that of its state."""
+        heat = [block for block in self._blocks if block.kind == "heat"]
+        return {motion: block.at.start + k for block in heat for k, motion in enumerate(block.motions)}
+
+    @cached_property
+    def factors(self) -> slice:
+        """States that are factors of what heat does."""
+        return next((block.at for block in self._blocks if block.kind == "factor"), slice(0, 0))
+
+    @cached_property
+    def _heated(self) -> list[tuple[int, NDArray[np.int_]]]:
+        """State of each factor, and the states that it acts on."""
+        assert self.heat is not None
+        states = np.array([self._heat_states[k] for k in self.heat.motions.tolist()], int)
+        return [(self.factors.start + f, states[self.heat.factors == f]) for f in range(len(self.heat.names))]
+
+    def sensor_rows(self, sensors: Sequence[int], time: float) -> Array:
+        """(s, n) kelvin that sensors read of the states.
+
+        Args:
+            sensors: their numbers.
+            time: seconds.
+        """
+        assert self.heat is not None
+        out = np.zeros((len(sensors), self.size))
+        for motion, column in zip(self.heat.motions.tolist(), self.heat.rows.T, strict=True):
+            out[:, self._heat_states[motion]] = _gain(self.stated.laws[motion], time) * column[list(sensors)]
+        return out
+
+    def motion_gain(self, time: float) -> tuple[Array, Array]:
+        """Motions by the states: rows (M, n), and (M, M) covariance of what the states leave of them, in standard
+        deviations, at a time at which all laws but those of steps have the variance that they state.
+
+        Args:
+            time: seconds.
+        """
+        count = len(self.stated.labels)
+        rows, left = np.zeros((count, self.size)), np.zeros((count, count))
+        for block in self._blocks:
+            if block.kind == "heat":
+                for k, motion in enumerate(block.motions):
+                    rows[motion, block.at.start + k] = _gain(block.law, time)
+            if block.kind not in ("level", "law"):
+                continue
+            own = list(block.motions)
+            size = np.array(
+                [_come(law, time) if _is_level(law) else _variance(law, time) for law in map(self._law, own)]
+            )
+            root = np.sqrt(size)
+            prior = root[:, None] * self.stated.correlation[np.ix_(own, own)] * root
+            across = prior @ self._coordinates(block, own).T
+            whole = _variance(block.law, time) * block.covariance
+            whole = whole + sum((_come(law, time) * each for law, each in block.steps), np.zeros_like(whole))
+            gain = across @ np.linalg.pinv(whole, rcond=1e-10, hermitian=True)
+            amplitude = _gain(block.law, time)
+            rows[np.ix_(own, range(block.at.start, block.at.start + block.rank))] = amplitude * gain
+            left[np.ix_(own, own)] = amplitude**2 * (prior - gain @ across.T)
+        return rows, left
+
+    def _law(self, motion: int) -> TimeLaw:
+        return self.stated.laws[motion]
+
+
+def _is_level(law: TimeLaw) -> bool:
+    """Whether it changes by steps alone."""
+    plain = (law.drift_s, law.period_s, law.trend_s, law.relaxation_s) == (None,) * 4
+    return plain and not law.white
+
+
+def _spanned(columns: Array) -> tuple[Array, Array]:
+    """Orthonormal vectors that span columns, and their singular values."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    own = sizes > _NOTHING * max(sizes[0], 1e-300)
+    return np.asarray(left[:, own]), np.asarray(sizes[own])
+
+
+def _halves(at: slice) -> tuple[slice, slice]:
+    middle = (at.start + at.stop) // 2
+    return slice(at.start, middle), slice(middle, at.stop)
+
+
+def _kept(law: TimeLaw, over: float) -> float:
+    """What is left of a state after some seconds."""
+    if law.white:
+        return 0.0 if over > 0.0 else 1.0
+    return 1.0 if law.drift_s is None else math.exp(-over / law.drift_s)
+
+
+def _variance(law: TimeLaw, time: float) -> float:
+    return float(law.come(time)) if law.event else 1.0
+
+
+def _come(law: TimeLaw, time: float) -> float:
+    """Variance of the steps of a law up to a time, over that of one."""
+    if law.jump:
+        return 0.0
+    return float(law.come(time)) if law.event else 1.0
+
+
+def _gain(law: TimeLaw, time: float) -> float:
+    """Amplitude of a trend or a relaxation."""
+    if law.trend_s is None and law.relaxation_s is None:
+        return 1.0
+    return float(law.amplitude(np.array(time)))

@@ -1,0 +1,252 @@
+"""Readings followed one by one, held against the joint normal of the whole series and against what a refit says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from analysis.monitor.disturbances import Disturbances, TimeLaw
+from analysis.monitor.jump_detection import steps
+from analysis.monitor.series_filter import Observed, SeriesFilter, of_shifts
+from analysis.monitor.series_following import follow
+from analysis.monitor.series_smoother import smooth
+from analysis.monitor.state_space import HeatInputs, StateSpace
+
+LAWS = (
+    TimeLaw(),
+    TimeLaw(white=True),
+    TimeLaw(drift_s=30.0),
+    TimeLaw(period_s=7.0),
+    TimeLaw(drift_s=50.0, period_s=11.0),
+    TimeLaw(trend_s=40.0),
+    TimeLaw(trend_s=40.0, period_s=9.0),
+    TimeLaw(relaxation_s=12.0, since_s=5.0),
+    TimeLaw(event=((20.3, 1.0),)),
+    TimeLaw(event=((10.0, 0.0), (15.0, 0.4), (18.0, 1.0))),
+    TimeLaw(event=((30.0, 1.0),), drift_s=10.0, period_s=6.0),
+)
+SPOTS, PARAMETERS = 5, 6
+NOISE, REFERENCE = 0.05, 0.02
+"""Px, of each shift and of the reference that all are counted from."""
+
+
+def stated(laws, seed: int = 0, each: int = 3) -> Disturbances:
+    """Three motions of each law that go together."""
+    rng = np.random.default_rng(seed)
+    count = each * len(laws)
+    correlation = np.eye(count)
+    for k in range(0, count, each):
+        root = rng.normal(size=(each, each))
+        own = root @ root.T + np.eye(each)
+        size = np.sqrt(np.diag(own))
+        correlation[k : k + each, k : k + each] = own / size[:, None] / size
+    names = tuple(f"body{k} shift x" for k in range(count))
+    return Disturbances(
+        "laws",
+        names,
+        tuple(name.split()[0] for name in names),
+        names,
+        np.ones(count),
+        ("um",) * count,
+        rng.normal(size=(SPOTS, count)),
+        1e-6 * rng.normal(size=(PARAMETERS, count)),
+        correlation,
+        tuple(law for law in laws for _ in range(each)),
+    )
+
+
+class Noise:
+    """Of each shift alone, and one error of the reference in all."""
+
+    def covariance(self, images: np.ndarray) -> np.ndarray:
+        together = REFERENCE**2 * np.eye(SPOTS)
+        return np.kron(np.eye(len(images)), NOISE**2 * np.eye(SPOTS)) + np.kron(np.ones((len(images),) * 2), together)
+
+
+def series(count: int, size: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Shifts of a size that mean nothing."""
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.uniform(0.0, 60.0, count))
+    times[count // 3] = times[count // 3 - 1]  # two readings of one moment
+    return times, size * rng.normal(size=(count, SPOTS))
+
+
+@pytest.mark.parametrize("laws", [(law,) for law in LAWS] + [LAWS], ids=lambda laws: str(len(laws)))
+def test_the_same_as_the_joint_normal_of_the_series(laws) -> None:
+    """Values to 1e-9 of sigma and covariances to 1e-9 of themselves, at readings, between, before and after them."""
+    told, (times, shifts) = stated(laws), series(40, NOISE)
+    wanted = np.concatenate([times, np.random.default_rng(2).uniform(-3.0, 70.0, 25)])
+    whole = smooth(told, times, shifts, Noise(), wanted)
+    how = SeriesFilter(told, REFERENCE**2 * np.eye(SPOTS), window=0)
+    found = follow(how, of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), wanted)
+    for one, two in ((whole.filtered, found.filtered), (whole.smoothed, found.smoothed)):
+        sigma = np.sqrt(np.diagonal(one.total, 0, 1, 2))
+        # beside float64's rounding of what is known of the states before any reading
+        prior = np.sqrt(np.diag(told.parameter_covariance))
+        assert np.all(np.abs(one.values - two.values) <= 1e-9 * sigma + 1e-11 * prior)
+        limit = 1e-9 * sigma[:, :, None] * sigma[:, None, :] + 1e-13 * np.outer(prior, prior)
+        assert np.all(np.abs(one.total - two.total) <= limit)
+    squares = np.array([one.chi_square for one in found.innovations])
+    assert squares.sum() == pytest.approx(whole.consistency.chi_square, rel=1e-9)
+
+
+def test_pieces_do_not_matter(monkeypatch) -> None:
+    told, (times, shifts) = stated(LAWS[:6]), series(30, 1.0)
+    how, read = SeriesFilter(told, window=0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
+    whole = follow(how, read, times)
+    monkeypatch.setattr("analysis.monitor.series_following._PIECE", 7)
+    pieces = follow(how, read, times)
+    sigma = np.sqrt(np.diagonal(whole.smoothed.total, 0, 1, 2))
+    assert np.all(np.abs(whole.smoothed.values - pieces.smoothed.values) < 1e-9 * sigma)
+    assert np.allclose(whole.smoothed.total, pieces.smoothed.total, rtol=1e-9, atol=0.0)
+
+
+def test_states_are_no_more_than_outputs() -> None:
+    """40 motions of one law move five spots and six parameters: eleven states."""
+    assert StateSpace(stated((LAWS[2],), each=40)).size == SPOTS + PARAMETERS
+    assert StateSpace(stated((LAWS[3],), each=40)).size == 2 * (SPOTS + PARAMETERS)
+
+
+JUMPING = (TimeLaw(drift_s=30.0), TimeLaw(), TimeLaw(jump=True))
+
+
+def test_what_is_looked_for_is_that_of_the_whole_series() -> None:
+    """Scores and information of steps before each reading, found one by one, against the Cholesky factor of all."""
+    told, (times, shifts) = stated(JUMPING, seed=4), series(20, NOISE)
+    how = SeriesFilter(told, window=60)
+    belief = how.start(times[0])
+    for one in of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)):
+        belief, _ = how.update(belief, one)
+    space = StateSpace(told)
+    pairs = np.zeros((len(times), SPOTS, len(times), SPOTS))
+    for i, early in enumerate(times):
+        mean, covariance = space.start(early)
+        for j in range(i, len(times)):
+            rows = [space.outputs(mean, covariance, t)[1][:SPOTS] for t in (early, times[j])]
+            pairs[j, :, i] = rows[1] @ space.moved(covariance, early, times[j]) @ rows[0].T
+            pairs[i, :, j] = pairs[j, :, i].T
+    spread = pairs.reshape(len(times) * SPOTS, -1) + NOISE**2 * np.eye(len(times) * SPOTS)
+    root = np.linalg.cholesky(spread)
+    white = np.linalg.solve(root, shifts.ravel())
+    whole = steps(root, white, times, slice(0, len(times)), None)
+    # the first reading has none before it, and of two readings of one moment the second has none either
+    assert np.array_equal(belief.until, whole.until)
+    assert np.allclose(belief.state.score, whole.score, rtol=1e-9, atol=1e-9 * np.abs(whole.score).max())
+    assert np.allclose(belief.state.information, whole.information, rtol=1e-9, atol=1e-9 * whole.information.max())
+
+
+def jumped(size: float, seed: int = 6, count: int = 30) -> tuple[Disturbances, np.ndarray, np.ndarray]:
+    """A series of what is stated in which one motion jumps before reading 20."""
+    rng, told = np.random.default_rng(seed), stated(JUMPING, seed=4)
+    times = np.arange(float(count))
+    shifts = NOISE * rng.normal(size=(count, SPOTS))
+    drift = np.zeros((count, 3))
+    drift[0] = rng.normal(size=3)
+    for k in range(1, count):
+        kept = np.exp(-1.0 / 30.0)
+        drift[k] = kept * drift[k - 1] + np.sqrt(1.0 - kept**2) * rng.normal(size=3)
+    shifts += 0.1 * drift @ told.spots[:, :3].T
+    shifts += (times >= 20.0)[:, None] * size * told.spots[:, 7]
+    scale = np.ones(9)
+    scale[:3] = 0.1
+    return told.scaled(scale), times, shifts
+
+
+def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
+    """The estimate after it is that of a filter that was told of the jump's time and prior before."""
+    told, times, shifts = jumped(3.0)
+    how = SeriesFilter(told, readings=30.0)
+    read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
+    found = follow(how, read, times)
+    (jump,) = found.jumps
+    assert (jump.body, jump.after, jump.until) == ("body7", 19.0, 20.0)
+    (size,), (sigma,) = jump.sizes, jump.sigmas
+    assert abs(size - 3.0) < 4.0 * sigma
+    knowing = SeriesFilter(
+        told.with_copies(jump.motions, jump.times, TimeLaw(event=((19.5, 1.0),))), readings=30.0, window=0
+    )
+    known = follow(knowing, read, times)
+    sigmas = np.sqrt(np.diagonal(known.filtered.total, 0, 1, 2))
+    after = slice(25, None)
+    assert np.all(np.abs(found.filtered.values - known.filtered.values)[after] < 1e-6 * sigmas[after])
+    assert np.allclose(found.filtered.total[after], known.filtered.total[after], rtol=1e-6)
+
+
+def test_no_jump_is_told_where_none_is() -> None:
+    """40 series of 30 readings at a chance of one in a thousand each."""
+    for seed in range(40):
+        told, times, shifts = jumped(0.0, seed)
+        assert not follow(
+            SeriesFilter(told, readings=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []
+        ).jumps
+
+
+def test_more_readings_never_hurt() -> None:
+    """Of what is at work at all times: every further reading, of spots or of a parameter, leaves no sigma larger."""
+    told, (times, shifts) = stated(LAWS[:6]), series(12, 1.0)
+    how = SeriesFilter(told, window=0, parameters_read=True)
+    read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
+    row = np.eye(PARAMETERS)[:1]
+    one = Observed(30.0, np.array([1e-6]), np.array([[1e-14]]), parameters=row)
+    more = sorted([*read, one], key=lambda each: each.time)
+    few, many = (follow(how, which, times).smoothed.total for which in (read, more))
+    gained = np.linalg.eigvalsh((few - many) / 1e-12)
+    assert gained.min() > -1e-8
+    assert gained.max() > 1e-3
+
+
+def heated(sigma: float) -> tuple[Disturbances, HeatInputs]:
+    """Two bodies that wander in temperature, with a sensor each, beside a mount that drifts."""
+    told = stated((TimeLaw(drift_s=30.0), TimeLaw(drift_s=200.0)), seed=9, each=2)
+    told = replace(told, correlation=np.eye(4))
+    motions = np.array([0, 1])
+    return told, HeatInputs(motions, ("body0", "body1"), np.diag([0.5, 0.8]), motions, ("body0", "body1"), sigma)
+
+
+def test_a_factor_of_what_heat_does_is_found() -> None:
+    """What the first body's heat does is 1.4 times the computed. Sensors tell how warm it is, spots what that does."""
+    told, heat = heated(0.3)
+    rng, factor, times = np.random.default_rng(3), np.array([1.4, 1.0]), np.arange(0.0, 400.0, 2.0)
+    warm = np.zeros((len(times), 2))
+    for k in range(1, len(times)):
+        kept = np.exp(-2.0 / 30.0)
+        warm[k] = kept * warm[k - 1] + np.sqrt(1.0 - kept**2) * rng.normal(size=2)
+    how = SeriesFilter(told, heat=heat, window=0)
+    belief = how.start(0.0)
+    for time, state in zip(times.tolist(), warm, strict=True):
+        read = Observed(time, np.array([0.5, 0.8]) * state + 0.01 * rng.normal(size=2), 1e-4 * np.eye(2), (0, 1))
+        belief, _ = how.update(belief, read)
+        shifts = told.spots[:, :2] @ (factor * state) + NOISE * rng.normal(size=SPOTS)
+        belief, _ = how.update(belief, Observed(time, shifts, NOISE**2 * np.eye(SPOTS)))
+    own = how.space.factors
+    found, sigma = 1.0 + belief.mean[own], np.sqrt(np.diag(belief.covariance[own, own]))
+    assert np.all(np.abs(found - factor) < 4.0 * sigma)
+    assert np.all(sigma < 0.05)
+
+
+def test_a_sensor_says_what_a_body_does() -> None:
+    """With exact coefficients the answer is that of one joint normal, sensors being further rows."""
+    told, heat = heated(1e-9)
+    how = SeriesFilter(told, heat=heat, window=0)
+    belief = how.start(0.0)
+    read, shift = np.array([0.3, -0.2]), np.full(SPOTS, 0.4)
+    belief, _ = how.update(belief, Observed(1.0, read, 1e-4 * np.eye(2), (0, 1)))
+    belief, _ = how.update(belief, Observed(1.0, shift, NOISE**2 * np.eye(SPOTS)))
+    found = how.changes(belief, [1.0])
+    rows = np.concatenate([np.pad(heat.rows, ((0, 0), (0, 2))), told.spots])
+    noise = np.diag([1e-4, 1e-4, *[NOISE**2] * SPOTS])
+    across = told.parameters @ rows.T
+    gain = across @ np.linalg.inv(rows @ rows.T + noise)
+    assert np.allclose(found.values[0], gain @ np.concatenate([read, shift]), rtol=1e-6, atol=1e-14)
+    assert np.allclose(found.total[0], told.parameters @ told.parameters.T - gain @ across.T, rtol=1e-5, atol=1e-18)
+
+
+def test_motions_of_a_state_are_those_of_one_joint_normal() -> None:
+    told, shift = stated(LAWS[:3], seed=8), np.full(SPOTS, 0.7)
+    how = SeriesFilter(told, window=0)
+    belief, _ = how.update(how.start(0.0), Observed(0.0, shift, NOISE**2 * np.eye(SPOTS)))
+    rows, left = how.space.motion_gain(0.0)
+    found, spread = rows @ belief.mean, rows @ belief.covariance @ rows.T + left
+    gain = told.correlation @ told.spots.T @ np.linalg.inv(told.spot_covariance + NOISE**2 * np.eye(SPOTS))
+    assert np.allclose(found, gain @ shift, atol=1e-9)
+    assert np.allclose(spread, told.correlation - gain @ told.spots @ told.correlation, atol=1e-9)
