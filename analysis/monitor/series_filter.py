@@ -34,7 +34,7 @@ from analysis.monitor.jump_detection import Candidate, Jump, Steps, candidates, 
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
 
-__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Whitened", "of_shifts", "series_of"]
+__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Step", "Whitened", "of_shifts", "series_of"]
 
 Array = NDArray[np.float64]
 _UNLIKELY = 1e-4
@@ -79,6 +79,34 @@ def of_shifts(times: ArrayLike, shifts: Array, noise: Array) -> tuple[Observed, 
     when = np.asarray(times, np.float64)
     each = np.broadcast_to(noise, (len(when), *noise.shape[-2:]))
     return tuple(Observed(float(when[k]), shifts[k], each[k]) for k in np.argsort(when, kind="stable"))
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
+
+    Attributes:
+        motions: numbers of the disturbances.
+        chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
+            known moment, seconds.
+        times: standard deviations of the step over those that are stated.
+    """
+
+    motions: tuple[int, ...]
+    chances: tuple[tuple[float, float], ...]
+    times: float = 1.0
+
+    @classmethod
+    def of(cls, jump: Jump) -> Step:
+        """Of a jump."""
+        return cls(jump.motions, jump.chances, jump.times)
+
+    def come(self, time: float) -> float:
+        """Chance that it has come by a time, seconds."""
+        at, chance = np.array(self.chances).T
+        if len(at) == 1:
+            return float((time >= at[0]) * chance[0])
+        return float(np.interp(time, at, chance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +216,9 @@ class SeriesFilter:
         heat: temperatures that sensors read; None for none.
         readings: of spots over the whole life, by which a chance of a false alarm is counted.
         window: readings for which a jump is looked for.
+        stepping: numbers of motions that may step although their own law is another one.
         parameters_read: whether there are readings of parameters among those of spots.
+        steps: that are known of beside what is stated.
         unfound: whether jumps too small to be told count, where it is stated how often a motion jumps.
     """
 
@@ -197,7 +227,9 @@ class SeriesFilter:
     heat: HeatInputs | None = None
     readings: float = 1e4
     window: int = 60
+    stepping: tuple[int, ...] = ()
     parameters_read: bool = False
+    steps: tuple[Step, ...] = ()
     unfound: bool = True
     _may: tuple[Candidate, ...] = field(init=False, default=())
 
@@ -207,7 +239,32 @@ class SeriesFilter:
     @cached_property
     def space(self) -> StateSpace:
         """The states."""
-        return StateSpace(self.stated, self.reference_noise, self.heat)
+        return StateSpace(self.stated, self.reference_noise, self.heat, self.stepping)
+
+    @cached_property
+    def _step_levels(self) -> list[Array]:
+        """(n, n) covariance of the states by each step."""
+        out = []
+        for one in self.steps:
+            own = list(one.motions)
+            level = self.space.level_of(own)
+            out.append(one.times**2 * level @ self.stated.correlation[np.ix_(own, own)] @ level.T)
+        return out
+
+    @cached_property
+    def _step_ends(self) -> Array:
+        """(S, 2) seconds between which each comes."""
+        return np.array([(one.chances[0][0], one.chances[-1][0]) for one in self.steps]).reshape(-1, 2)
+
+    def _stepped(self, covariance: Array, then: float, now: float) -> Array:
+        """With the steps that come after one time and not after another."""
+        ends = self._step_ends
+        for k in np.flatnonzero((ends[:, 1] > then) & (ends[:, 0] <= now)).tolist():
+            one = self.steps[k]
+            come = one.come(now) - (one.come(then) if math.isfinite(then) else 0.0)
+            if come > 0.0:
+                covariance = covariance + come * self._step_levels[k]
+        return covariance
 
     @cached_property
     def _stacked(self) -> Disturbances:
@@ -247,6 +304,7 @@ class SeriesFilter:
             time: not after the first reading, seconds.
         """
         mean, covariance = self.space.start(time)
+        covariance = self._stepped(covariance, -math.inf, time)
         size, q = self.space.size, self._stacked.spots.shape[0]
         track = _Track(mean, covariance, np.zeros((0, size, q)), np.zeros((0, q)), np.zeros((0, q, q)))
         empty, left = np.zeros(0), np.ones(len(self.walking))
@@ -267,7 +325,7 @@ class SeriesFilter:
         if now <= then:
             return track
         space = self.space
-        covariance = space.spread(track.covariance, then, now)
+        covariance = self._stepped(space.spread(track.covariance, then, now), then, now)
         if left is not None and len(left):
             walk = self._walk * np.sqrt(left * (now - then))
             covariance = covariance + walk @ walk.T

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.monitor.jump_detection import Jump, with_jumps
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
+from analysis.monitor.jump_detection import Jump
+from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Step, Whitened, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 
 __all__ = ["Followed", "follow"]
@@ -81,7 +81,7 @@ def follow(
     for k in order[ahead:]:
         filtered[k] = how.parameters(belief, times[k])
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
-    knowing = replace(how, stated=with_jumps(how.stated, jumps), window=0)
+    knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
     smoothed = _smoothed(knowing, observed, times, order, earliest, left)
     width = how.stated.parameters.shape[0]
     return Followed(series_of(filtered, width), series_of(smoothed, width), tuple(innovations), jumps, belief)

@@ -95,6 +95,7 @@ class StateSpace:
         stated: what moves, D spot coordinates and P parameters.
         reference_noise: (D, D) px^2 of the reference's spots, the same error in every shift; None for none.
         heat: temperatures that sensors read; None for none.
+        stepping: numbers of motions of any law that may step, beside those of which this is the law.
 
     Raises:
         ValueError: motions of different laws are correlated.
@@ -103,6 +104,7 @@ class StateSpace:
     stated: Disturbances
     reference_noise: Array | None = None
     heat: HeatInputs | None = None
+    stepping: tuple[int, ...] = ()
     _blocks: tuple[_Block, ...] = field(init=False, default=())
 
     def __post_init__(self) -> None:
@@ -136,8 +138,10 @@ class StateSpace:
             out.append(_Block(kind, law, at, columns, covariance, tuple(motions.tolist()), steps))
 
         level = np.array([_is_level(law) for law in stated.laws], bool) & ~raw
-        if np.any(level):
-            basis, _ = _spanned(outputs[:, level] / scale)
+        if np.any(level) or self.stepping:
+            spanning = level.copy()
+            spanning[list(self.stepping)] = True
+            basis, _ = _spanned(outputs[:, spanning] / scale)
             steps = []
             for law in filter(_is_level, laws):
                 mine = own[law] & ~raw
