@@ -41,6 +41,7 @@ READ_BY = {
     "tolerance": "`python -m twin.tolerance FILE`",
     "asbuilt": "`python -m twin.asbuilt FILE`, `python -m twin.asbuilt check FILE`",
     "telemetry": "`python -m twin.operate ingest RECORD FILE`",
+    "operation": "`python -m twin.operate init RECORD INSTRUMENT --plan FILE`, `status|forecast RECORD FILE`",
     "three_line_camera": "tests in orbit, which name it: `camera: th1`",
     "study": "`python -m twin.study FILE`",
 }

@@ -16,6 +16,7 @@ from scenes.specs.job import JobSpec
 from scenes.specs.measured.monitor_frames import MeasurementSpec
 from scenes.specs.measured.orbit_data import OrbitDataSpec
 from scenes.specs.measured.telemetry import TelemetrySpec
+from scenes.specs.operation import OperationSpec
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.procedures import PROCEDURES, FileKind
 from scenes.specs.study import StudySpec
@@ -68,6 +69,7 @@ FILE_KINDS = (
         "three_line_camera", ThreeLineCameraSpec, "a three-line payload", place="`camera: FILE` of a test in orbit"
     ),
     FileKind("telemetry", TelemetrySpec, "what tables of readings hold", "twin.operate ingest"),
+    FileKind("operation", OperationSpec, "a plan of operation", "twin.operate status"),
     FileKind("study", StudySpec, "a study", "twin.study"),
     FileKind("tolerance", ToleranceBudgetSpec, "a tolerance budget", "twin.tolerance"),
 )

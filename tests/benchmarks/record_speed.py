@@ -10,8 +10,9 @@ from pathlib import Path
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
+from twin.operate.database import FILE
 from twin.operate.entries import Entry
-from twin.operate.history import FILE, History
+from twin.operate.history import History
 
 MS = 50.0
 GROWS = 1.5

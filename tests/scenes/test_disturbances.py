@@ -341,7 +341,7 @@ def test_what_a_file_says_wrong(tmp_path, case) -> None:
 
 OF_JOB = {
     "no such file": ("orbitt", "no such name in disturbances", "did you mean 'orbit'"),
-    "no such file at all": ("nowhere/at_all.yaml", "no such file", "assembled, launch, orbit, paper_001, none"),
+    "no such file at all": ("nowhere/at_all.yaml", "no such file", "in_service, launch, orbit, paper_001, none"),
     "no cause left out": ("{file: orbit, without: [mirror_heat]}", "disturbances.without[0]: no such cause", "mirror_"),
     "left out twice": ("{without: [base_heat, base_heat]}", "disturbances.without[1]", "left out twice"),
     "changed and left out": (

@@ -25,6 +25,7 @@ FOLDERS = {
     "examples/tolerance": "tolerance",
     "examples/asbuilt": "asbuilt",
     "examples/telemetry": "telemetry",
+    "examples/operation": "operation",
     "examples/as_built": "as_built_instrument",
     "examples/cassegrain": "camera",
     "examples/": "job",

@@ -8,6 +8,7 @@ import re
 import shutil
 import sqlite3
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,8 +23,9 @@ from tests.twin.commands import invoke
 from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, table, temperatures
 from twin.operate import schema
 from twin.operate.__main__ import app
-from twin.operate.entries import Entry, Given, digest_of_job, instrument_digest, micros, utc_text
-from twin.operate.history import FILE, History, content_of, initialised, url_of
+from twin.operate.database import FILE, url_of
+from twin.operate.entries import Alarm, Entry, Given, digest_of_job, instrument_digest, micros, utc_text
+from twin.operate.history import History, content_of, initialised
 from twin.operate.record_tables import tables
 from twin.operate.run_readings import run_entries
 from twin.operate.schema import NotARecord
@@ -409,14 +411,20 @@ def test_times_count_leap_seconds() -> None:
 def test_the_database_refuses_to_alter_a_record(record: Path) -> None:
     with History(str(record)) as history:
         history.take(given("a", [*temperatures(1, 1), *temperatures(0, 1)]))
+        history.keep_plan("plan.yaml", {"window": 60})
+        history.raise_alarm(Alarm("jump", "base/forward/M2", START, "it jumped"))
+        history.acknowledge(1, "Ann", "looked at")
+        history.save_checkpoint("a" * 64, 0, START + 2 * MINUTE, 1, b"state")
     base = sqlite3.connect(record / FILE)
     names = [name for (name,) in base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
     full = [name for name in names if base.execute(f"SELECT count(*) FROM {name}").fetchone()[0]]
-    assert {"entry", "refused", "source", "instrument", "record_schema"} <= set(full)
-    for name in full:
+    given_once = {"entry", "refused", "source", "instrument", "record_schema", "plan", "alarm", "acknowledgement"}
+    assert given_once | {"checkpoint"} == set(full)
+    for name in given_once:
         for what in (f"DELETE FROM {name}", f"UPDATE {name} SET id = id + 1"):
             with pytest.raises(sqlite3.IntegrityError, match="a record is never altered"):
                 base.execute(what)
+    base.execute("DELETE FROM checkpoint")  # derived: it is made again
     base.close()
 
 
@@ -438,6 +446,29 @@ CREATE TABLE entry (id INTEGER NOT NULL PRIMARY KEY, sha256 VARCHAR(64) NOT NULL
 CREATE INDEX entry_stream ON entry (kind, subject, time_us);
 """
 """A record of version 1, as it was: what was refused was not kept, nor where a reading was found from."""
+
+
+TWO = """
+ALTER TABLE entry ADD COLUMN origin VARCHAR(64);
+CREATE INDEX entry_origin ON entry (origin);
+CREATE TABLE refused (id INTEGER NOT NULL PRIMARY KEY, sha256 VARCHAR(64) NOT NULL,
+  source_id INTEGER NOT NULL REFERENCES source (id), line INTEGER, reason TEXT NOT NULL, entry VARCHAR(64),
+  refused_utc VARCHAR(32) NOT NULL, UNIQUE (sha256));
+CREATE INDEX refused_entry ON refused (entry);
+CREATE TRIGGER refused_no_update BEFORE UPDATE ON refused
+  BEGIN SELECT RAISE(ABORT, 'a record is never altered: UPDATE of refused'); END;
+CREATE TRIGGER refused_no_delete BEFORE DELETE ON refused
+  BEGIN SELECT RAISE(ABORT, 'a record is never altered: DELETE of refused'); END;
+INSERT INTO record_schema VALUES (2, 2, '2026-02-01T00:00:00Z', 'space-camera-twin 1.1.0');
+"""
+"""What version 2 added to it: no plans, no alarms and nothing that is derived."""
+
+
+def frozen_two(place: Path) -> None:
+    frozen_one(place)
+    base = sqlite3.connect(place / FILE)
+    base.executescript(TWO)
+    base.close()
 
 
 def frozen_one(place: Path) -> None:
@@ -479,13 +510,19 @@ def shape(place: Path) -> dict:
     }
 
 
-def test_a_record_of_version_one_is_brought_up(tmp_path: Path, record: Path) -> None:
+@pytest.mark.parametrize(("frozen", "passed"), [(frozen_one, [2, 3]), (frozen_two, [3])], ids=["one", "two"])
+def test_a_record_of_an_earlier_version_is_brought_up(
+    frozen: Callable[[Path], None], passed: list[int], tmp_path: Path, record: Path
+) -> None:
     old = tmp_path / "old"
-    frozen_one(old)
-    with pytest.raises(NotARecord, match=r"is of version 1, this program writes 2; python -m twin\.operate init"):
+    frozen(old)
+    found = passed[0] - 1
+    with pytest.raises(
+        NotARecord, match=rf"is of version {found}, this program writes 3; python -m twin\.operate init"
+    ):
         History(str(old))
     result = run("init", old, "gf7_pair", "--json")
-    assert (result.exit_code, json.loads(result.stdout)["versions"]) == (0, [2])
+    assert (result.exit_code, json.loads(result.stdout)["versions"]) == (0, passed)
     assert shape(old) == shape(record)
     with History(str(old)) as history:
         taken = history.take(given("b", temperatures(0, 2)))

@@ -25,7 +25,9 @@ from tests.twin.record_bench import (
 )
 from tests.twin.test_durability import mounted
 from twin.operate.__main__ import app
-from twin.operate.history import FILE, History, RecordFailed
+from twin.operate.database import FILE, RecordFailed
+from twin.operate.entries import Alarm
+from twin.operate.history import History
 from twin.operate.record_tables import tables
 from twin.run.data_files import TABLE_FORMATS
 
@@ -175,7 +177,7 @@ def test_the_command_tells_of_a_database_that_fails(tmp_path: Path, monkeypatch:
     made(tmp_path / "record").close()
     base = sqlite3.connect(tmp_path / "record" / FILE)
     base.execute("BEGIN EXCLUSIVE")
-    monkeypatch.setattr("twin.operate.history.WAIT", 0.1)
+    monkeypatch.setattr("twin.operate.database.WAIT", 0.1)
     result = invoke(app, "status", tmp_path / "record")
     base.close()
     assert (result.exit_code, "database is locked" in result.stderr) == (1, True)
@@ -227,9 +229,50 @@ def test_the_same_record_on_a_postgresql_server(server: str, tmp_path: Path) -> 
         assert (told["entries"], told["guarded"], told["open"], len(told["refused"])) == (605, True, 0, 5)
         assert told["streams"] == two.status()["streams"]
     with psycopg.connect(dbname="record", user="twin", host=server.partition("host=")[2]) as base:
-        for what in ("DELETE FROM entry", "UPDATE source SET file = 'x'", "TRUNCATE refused"):
+        for what in ("DELETE FROM entry", "UPDATE source SET file = 'x'", "TRUNCATE refused", "DELETE FROM alarm"):
             with pytest.raises(psycopg.errors.RaiseException, match="a record is never altered"), base.transaction():
                 base.execute(what)
+
+
+@HAS_SERVER
+@pytest.mark.second
+def test_what_is_derived_on_a_postgresql_server(server: str) -> None:
+    """Plans, checkpoints and alarms as in SQLite; and a record of version 2 gets their tables as a new one has them."""
+    import psycopg
+
+    url = database(server, "derived")
+    with made(url) as history:
+        assert history.take(given("a", temperatures(0, 3))).new == 3
+        assert history.keep_plan("plan.yaml", {"window": 60})
+        assert history.raise_alarm(Alarm("jump", "base", 0, "it jumped"))
+        history.acknowledge(1, "Ann", "seen")
+        times = [row["time_us"] for row in history.entries()]
+        for k, time_us in enumerate(times):
+            assert history.save_checkpoint("a" * 64, k, time_us, 3, b"\0%d" % k)
+        assert history.save_checkpoint("a" * 64, 0, times[0], 3, b"other")
+        assert history.take(given("b", temperatures(1, 1, "base/forward"))).new == 1
+        assert [(one.number, one.content) for one in history.checkpoints("a" * 64)] == [(0, b"other")]
+        assert history.drop_checkpoints("a" * 64, 0) == 1
+        assert history.alarms()[0]["acknowledged"]["by"] == "Ann"
+    shape = (
+        "SELECT tablename AS t, indexdef AS d FROM pg_indexes WHERE schemaname = 'public' UNION "
+        "SELECT table_name, column_name || data_type || is_nullable FROM information_schema.columns "
+        "WHERE table_schema = 'public' UNION SELECT event_object_table, trigger_name || event_manipulation "
+        "FROM information_schema.triggers ORDER BY t, d"
+    )
+    with psycopg.connect(dbname="derived", user="twin", host=server.partition("host=")[2]) as base:
+        new = base.execute(shape).fetchall()
+        base.execute("DROP TABLE acknowledgement, alarm, plan, checkpoint")
+        base.execute("DROP INDEX entry_time")
+        base.execute("ALTER TABLE record_schema DISABLE TRIGGER ALL")
+        base.execute("UPDATE record_schema SET version = 2")
+        base.execute("ALTER TABLE record_schema ENABLE TRIGGER ALL")
+        assert base.execute(shape).fetchall() != new
+    assert json.loads(invoke(app, "init", url, "gf7_pair", "--json").stdout)["versions"] == [3]
+    with psycopg.connect(dbname="derived", user="twin", host=server.partition("host=")[2]) as base:
+        assert base.execute(shape).fetchall() == new
+    with History(url) as history:
+        assert (history.status()["guarded"], history.alarms()) == (True, [])
 
 
 @HAS_SERVER

@@ -35,7 +35,8 @@ from twin.run.cli import (
 
 if TYPE_CHECKING:
     from twin.operate.entries import Given
-    from twin.operate.history import History, Taken
+    from twin.operate.history import History
+    from twin.operate.taking import Taken
 
 POLL = 10.0
 """Seconds between two looks at what is watched."""
@@ -71,7 +72,7 @@ def main() -> None:
 @contextmanager
 def _told() -> Iterator[Console]:
     """Errors as one sentence and an exit code."""
-    from twin.operate.history import RecordFailed
+    from twin.operate.database import RecordFailed
     from twin.operate.schema import NotARecord
 
     errors = Console(stderr=True)
@@ -104,29 +105,43 @@ def init(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Readings are simulated: their times may be still to come.")
     ] = False,
+    plan: Annotated[
+        Path | None,
+        typer.Option(readable=False, help="Plan of operation that counts from now on; `status` and `forecast` use it."),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Make the record of an instrument, or bring one that an earlier program made up to this one.
 
     The record states the content of the instrument's file and its cameras' by a hash: readings of another instrument
-    are refused.
+    are refused. It keeps every plan of operation; the newest counts.
 
-    Example: `python -m twin.operate init record gf7_pair`
+    For example:
+
+        python -m twin.operate init record gf7_pair
+        python -m twin.operate init record gf7_pair --plan scenes/examples/operation.yaml
 
     Exit codes: 0 success, 2 bad input, 1 anything else.
     """
+    from scenes.specs.operation import read_operation
+    from scenes.specs.resolved import resolve_with
     from twin.operate.history import History, initialised
+    from twin.operate.plans import keep_plan, read_plan
 
     with _told() as errors:
-        from scenes.specs.resolved import resolve_with
-
+        if plan is not None:  # a mistake in it is told before anything is made
+            read_operation(plan)
         passed = initialised(record, resolve_with(instrument), simulated)
         with History(record) as history:
+            kept = plan is not None and keep_plan(read_plan(plan, history), plan, history)
             what = f"version {', '.join(map(str, passed))}" if passed else "as it was"
+            what += "" if plan is None else f"; the plan {plan} counts" if kept else f"; the plan {plan} counted before"
             text = f"record of {history.name} ({history.sha256[:12]}) in {history.url}: {what}"
-            data = {"record": history.url, "instrument": history.name, "instrument_sha256": history.sha256}
-        _tell(errors, as_json, quiet, {**data, "versions": list(passed)}, lambda console: _plain(console, text))
+            data: dict[str, Any] = {"record": history.url, "instrument": history.name}
+            data["instrument_sha256"] = history.sha256
+        data |= {"versions": list(passed), "plan": None if plan is None else str(plan.absolute()), "new_plan": kept}
+        _tell(errors, as_json, quiet, data, lambda console: _plain(console, text))
 
 
 @app.command("ingest")

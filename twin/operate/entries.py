@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from typing import Any
@@ -75,6 +75,47 @@ class Refused:
     reason: str
     line: int | None = None
     entry: Entry | None = None
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """Something of which a person has to know.
+
+    Attributes:
+        kind: what is wrong: ``broken``, ``breaks``, ``jump``, ``sensor`` or ``contradiction``.
+        subject: quantity, body or sensor.
+        time: to which it belongs, microseconds of TAI since 2000.
+        text: a sentence.
+        content: the numbers behind it, plain data.
+    """
+
+    kind: str
+    subject: str
+    time: int
+    text: str
+    content: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 by which it is recognised: one of a kind and subject at a time, whatever its numbers."""
+        return digest_of_data([self.kind, self.subject, self.time])
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Where an estimate stood at some time.
+
+    Attributes:
+        number: counts the checkpoints of a plan.
+        time: up to which readings are in it, microseconds of TAI since 2000.
+        entry: the largest id of the entries that are in it.
+        content: the estimate.
+    """
+
+    number: int
+    time: int
+    entry: int
+    content: bytes
 
 
 @dataclass(frozen=True)

@@ -5,101 +5,43 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, func, insert, select
-from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
+from sqlalchemy import Connection, delete, func, insert, or_, select
+from sqlalchemy.exc import IntegrityError
 
 from optics.numerics.backend import load_backend
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
+from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.json_file import parse_json
 from twin.operate import schema
-from twin.operate.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, digest_of_job, now, utc_text
-from twin.operate.schema import ENTRY, FRAME, INSTRUMENT, REFUSED, SOURCE, NotARecord
+from twin.operate.database import RecordFailed, engine_of, failures_told, opened, said, url_of, writing
+from twin.operate.entries import (
+    Alarm,
+    Checkpoint,
+    Given,
+    canonical,
+    digest_of_data,
+    digest_of_job,
+    now,
+    utc_text,
+)
+from twin.operate.schema import (
+    ACKNOWLEDGEMENT,
+    ALARM,
+    CHECKPOINT,
+    ENTRY,
+    INSTRUMENT,
+    PLAN,
+    REFUSED,
+    SOURCE,
+    NotARecord,
+)
+from twin.operate.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder
-
-FILE = "record.sqlite"
-"""Of a record in a folder."""
-WAIT = 60.0
-"""Seconds that a writer waits for another one."""
-_TOGETHER = 500
-"""Rows asked for or written at once."""
-_LOCK = 7_236_001
-"""Number of the lock by which writers on a PostgreSQL server take turns."""
-AHEAD = 24 * 3600 * MICRO
-"""A reading later than this after the computer's clock comes of a clock that is wrong."""
-
-
-class RecordFailed(Exception):
-    """The database did not do what it was asked: a full disk, a server that is gone. Nothing is half done."""
-
-
-@dataclass(frozen=True)
-class Taken:
-    """What became of one file.
-
-    Attributes:
-        file: its path.
-        new: readings and events that are now in the record.
-        known: that were in it already.
-        refused: what was not taken: line, reason.
-        before: whether the same file had been taken before.
-    """
-
-    file: str
-    new: int
-    known: int
-    refused: tuple[tuple[int | None, str], ...]
-    before: bool = False
-
-
-def url_of(place: str) -> URL:
-    """Address of the database of a folder, or the address itself.
-
-    Raises:
-        NotARecord: not an address that SQLAlchemy knows.
-    """
-    if "://" not in place:
-        return URL.create("sqlite", database=str(Path(place).absolute() / FILE))
-    try:
-        return make_url(place)
-    except (ArgumentError, ValueError):
-        raise NotARecord("not an address of a database; write DIALECT://USER@HOST/DATABASE, or a folder") from None
-
-
-def _engine(url: URL) -> Engine:
-    more: dict[str, Any] = {"connect_args": {"timeout": WAIT}} if url.get_backend_name() == "sqlite" else {}
-    try:
-        engine = create_engine(url, **more)
-    except NoSuchModuleError:
-        raise NotARecord(f"no such kind of database: {url.drivername}; sqlite or postgresql") from None
-    except ModuleNotFoundError as error:
-        raise NotARecord(
-            f"{error.name} is not installed, which speaks to this database; for PostgreSQL: "
-            ".venv/bin/python -m pip install -e .[postgres]"
-        ) from None
-    if engine.dialect.name == "sqlite":
-        event.listen(engine, "connect", _on_connect)
-        event.listen(engine, "begin", _on_begin)
-    return engine
-
-
-def _on_connect(connection: Any, record: object) -> None:
-    """SQLAlchemy begins transactions, not the driver; each is on the disk, with its folder, before it is over."""
-    connection.isolation_level = None
-    for pragma in ("journal_mode = DELETE", "synchronous = EXTRA", "foreign_keys = ON", "trusted_schema = OFF"):
-        connection.execute(f"PRAGMA {pragma}").close()
-
-
-def _on_begin(connection: Connection) -> None:
-    """A writer takes its turn before it reads what it is going to compare with."""
-    writing = connection.get_execution_options().get("writing", False)
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writing else "BEGIN")
 
 
 class History:
@@ -116,7 +58,7 @@ class History:
 
     def __init__(self, place: str) -> None:
         url = url_of(place)
-        self._engine = _opened(url)
+        self._engine = opened(url)
         self.url = url.render_as_string(hide_password=True)
         with self.reading() as connection:
             found = schema.version(connection)
@@ -162,28 +104,49 @@ class History:
         for attempt in (True, False):
             try:
                 with writing(self._engine) as connection:
-                    return _Taking(self, connection, late).take(given)
+                    return Taking(connection, self.simulated, late).take(given)
             except IntegrityError as error:  # of databases without a lock: another writer was first
                 if not attempt:
-                    raise RecordFailed(_said(error)) from None
+                    raise RecordFailed(said(error)) from None
         raise AssertionError
 
-    def entries(self, kind: str = "", subject: str = "") -> Iterator[dict[str, Any]]:
+    def entries(
+        self,
+        kind: str = "",
+        subject: str = "",
+        after_us: int | None = None,
+        after_id: int | None = None,
+        until_us: int | None = None,
+    ) -> Iterator[dict[str, Any]]:
         """Readings and events in the order of time, those of one moment in the order in which they were taken.
+
+        SQLite has no writer while they are read: take what is wanted, and write then.
 
         Args:
             kind: of reading; all if empty.
             subject: likewise.
+            after_us: those after this time, microseconds of TAI since 2000.
+            after_id: those that were taken after the one of this id; beside ``after_us`` of those at that time only,
+                so that the two together name a place in the order.
+            until_us: those up to this time, it included.
 
         Yields:
-            ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``, which is
-            plain data.
+            ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``, ``sha256``, ``line``, ``file`` and ``content``,
+            which is plain data.
         """
-        query = select(*ENTRY.c, SOURCE.c.file).join(SOURCE, ENTRY.c.source_id == SOURCE.c.id)
-        query = query.where(ENTRY.c.kind == kind) if kind else query
-        query = query.where(ENTRY.c.subject == subject) if subject else query
+        c = ENTRY.c
+        query = select(*c, SOURCE.c.file).join(SOURCE, c.source_id == SOURCE.c.id)
+        query = query.where(c.kind == kind) if kind else query
+        query = query.where(c.subject == subject) if subject else query
+        if after_us is not None and after_id is not None:
+            query = query.where(c.time_us >= after_us, or_(c.time_us > after_us, c.id > after_id))
+        elif after_us is not None:
+            query = query.where(c.time_us > after_us)
+        elif after_id is not None:
+            query = query.where(c.id > after_id)
+        query = query if until_us is None else query.where(c.time_us <= until_us)
         with self.reading() as connection:
-            yield from map(dict, connection.execute(query.order_by(ENTRY.c.time_us, ENTRY.c.id)).mappings())
+            yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
     def refusals(self) -> list[dict[str, Any]]:
         """What was refused, in the order in which it was; ``taken_since`` says whether the reading is there by now."""
@@ -229,127 +192,131 @@ class History:
             "open": sum(not one["taken_since"] for one in refused),
         }
 
+    def keep_plan(self, file: str, content: Mapping[str, Any]) -> bool:
+        """Keep a plan of operation, which from now on counts.
 
-class _Taking:
-    """One file on its way into the record, in one transaction."""
+        Args:
+            file: from which it is.
+            content: plain data.
 
-    def __init__(self, history: History, connection: Connection, late: bool) -> None:
-        self.history, self.connection, self.late = history, connection, late
-        self.newest: dict[tuple[str, str], int | None] = {}
-        self.seen: dict[tuple[str, str], int] = {}
+        Returns:
+            Whether it is another one than before.
+        """
+        digest = digest_of_data(content)
+        with writing(self._engine) as connection:
+            newest = select(PLAN.c.sha256).order_by(PLAN.c.id.desc()).limit(1)
+            if connection.execute(newest).scalar() == digest:
+                return False
+            row = {"sha256": digest, "file": file, "content": canonical(content), "kept_utc": utc_text(now())}
+            connection.execute(insert(PLAN).values(**row))
+        return True
 
-    def take(self, given: Given) -> Taken:
-        """Compare what the file holds with the record and add what is new."""
-        taking = digest_of_data([given.sha256, given.meaning])
-        source = self.connection.execute(select(SOURCE.c.id).where(SOURCE.c.taking == taking)).first()
-        entries = [(one, one.digest) for one in given.items if isinstance(one, Entry)]
-        known = self._known(ENTRY.c.sha256, [digest for _, digest in entries])
-        digests, refused, kept = iter(entries), [], []
-        again = 0
-        for item in given.items:
-            if isinstance(item, Refused):
-                refused.append((item, item.entry.digest if item.entry else None))
-                continue
-            one, digest = next(digests)
-            stream = (one.kind, one.subject)
-            if digest in known:
-                again += 1
-            elif reason := self._wrong(one):
-                refused.append((Refused(reason, one.line, one), digest))
-                continue
-            else:
-                kept.append((one, digest))
-                known.add(digest)
-            self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
-        before = source is not None
-        if kept or refused or not before:
-            self._write(given, taking, None if source is None else int(source[0]), kept, refused)
-        told = tuple((one.line, one.reason) for one, _ in refused)
-        return Taken(given.file, len(kept), again, told, before)
+    def plan(self) -> dict[str, Any] | None:
+        """The plan that counts: ``sha256``, ``file``, ``content`` and ``kept_utc``; None where none was kept."""
+        with self.reading() as connection:
+            row = connection.execute(select(PLAN).order_by(PLAN.c.id.desc()).limit(1)).mappings().first()
+        return None if row is None else {**row, "content": content_of(dict(row))}
 
-    def _known(self, column: Any, digests: list[str]) -> set[str]:
-        found: set[str] = set()
-        for k in range(0, len(digests), _TOGETHER):
-            query = select(column).where(column.in_(digests[k : k + _TOGETHER]))
-            found |= set(self.connection.execute(query).scalars())
-        return found
+    def checkpoints(self, plan: str) -> list[Checkpoint]:
+        """Where the estimate under a plan stood, in the order of time.
 
-    def _wrong(self, one: Entry) -> str:
-        """Why a reading that is new cannot be true of this record; empty where it can."""
-        c, stream = ENTRY.c, (one.kind, one.subject)
-        if not self.history.simulated and one.time > now() + AHEAD:
-            return (
-                f"{utc_text(one.time)} is still to come: the clock of the file, its time_scale or its epoch is wrong; "
-                "a record of simulated readings is made with init --simulated"
-            )
-        if one.origin:
-            query = select(c.time_utc).where(c.origin == one.origin, c.time_us != one.time).limit(1)
-            if (other := self.connection.execute(query).scalar()) is not None:
-                return f"found from the same frames as the reading of {other}; give it that time, or its own frames"
-        if stream not in self.newest:
-            query = select(func.max(c.time_us)).where(c.kind == one.kind, c.subject == one.subject)
-            self.newest[stream] = self.connection.execute(query).scalar()
-        newest, before = self.newest[stream], self.seen.get(stream)
-        if before is not None and one.time < before:
-            text = f"the clock runs backwards: {utc_text(one.time)} after {utc_text(before)}"
-            return f"{text}; sort the rows, or leave out those before the clock was set"
-        if before is not None and one.time == before:
-            return f"another reading of {one.subject} at {utc_text(one.time)} in this file; one of them is wrong"
-        if newest is not None and one.time <= newest:
-            query = select(c.id).where(c.kind == one.kind, c.subject == one.subject, c.time_us == one.time).limit(1)
-            if self.connection.execute(query).scalar() is not None:
-                return f"the record has other numbers of {one.subject} at {utc_text(one.time)}, which stay"
-            if not self.late:
-                text = f"{utc_text(one.time)} is before the newest reading of {one.subject}, {utc_text(newest)}"
-                return f"{text}: a clock that was set back, or a reading that comes late; --late takes it"
-        return ""
+        Args:
+            plan: digest of all that the estimate rests on besides the readings.
+        """
+        c = CHECKPOINT.c
+        with self.reading() as connection:
+            rows = connection.execute(select(CHECKPOINT).where(c.plan == plan).order_by(c.time_us, c.number)).all()
+        return [Checkpoint(row.number, row.time_us, row.entry_id, row.content) for row in rows]
 
-    def _write(
-        self,
-        given: Given,
-        taking: str,
-        source: int | None,
-        kept: list[tuple[Entry, str]],
-        refused: list[tuple[Refused, str | None]],
-    ) -> None:
-        moment = utc_text(now())
-        if source is None:
-            row = {"file": given.file, "sha256": given.sha256, "taking": taking, "taken_utc": moment}
-            written = self.connection.execute(insert(SOURCE).values(**row, rows_read=len(given.items)))
-            source = int(written.inserted_primary_key[0])  # type: ignore[index]
-            frames = [{"source_id": source, "file": f, "sha256": d} for f, d in given.frames.items()]
-            self._insert(FRAME, frames)
-        rows = [
+    def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
+        """Keep where an estimate stands, in place of what was kept under the number.
+
+        Args:
+            plan: digest of all that the estimate rests on besides the readings.
+            number: counts the checkpoints of a plan.
+            time_us: up to which readings are in it.
+            entry_id: the largest id that the record had when they were read.
+            content: the estimate.
+
+        Returns:
+            Whether it is kept; it is not if a reading up to that time has come since.
+        """
+        row = {"plan": plan, "number": number, "time_us": time_us, "entry_id": entry_id, "content": content}
+        newer = select(ENTRY.c.id).where(ENTRY.c.id > entry_id, ENTRY.c.time_us <= time_us).limit(1)
+        with writing(self._engine) as connection:
+            if connection.execute(newer).first() is not None:
+                return False
+            connection.execute(delete(CHECKPOINT).where(CHECKPOINT.c.plan == plan, CHECKPOINT.c.number == number))
+            connection.execute(insert(CHECKPOINT).values(**row))
+        return True
+
+    def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
+        """Remove checkpoints of a plan from a time on; how many there were."""
+        c = CHECKPOINT.c
+        with writing(self._engine) as connection:
+            gone = connection.execute(delete(CHECKPOINT).where(c.plan == plan, c.time_us >= from_time_us))
+        return int(gone.rowcount)
+
+    def raise_alarm(self, alarm: Alarm) -> bool:
+        """Add an alarm, once.
+
+        Returns:
+            Whether it is new.
+        """
+        digest = alarm.digest
+        row = {"sha256": digest, "kind": alarm.kind, "subject": alarm.subject, "time_us": alarm.time}
+        row |= {"text": alarm.text, "content": canonical(alarm.content), "raised_utc": utc_text(now())}
+        with writing(self._engine) as connection:
+            if connection.execute(select(ALARM.c.id).where(ALARM.c.sha256 == digest)).first() is not None:
+                return False
+            connection.execute(insert(ALARM).values(**row))
+        return True
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """All alarms in the order in which they were raised: ``id``, ``kind``, ``subject``, ``time_us``, ``time_utc``,
+        ``raised_utc``, ``text``, ``content``, and ``acknowledged``: ``by``, ``note`` and ``acknowledged_utc``, or None.
+        """
+        a = ACKNOWLEDGEMENT.c
+        query = select(*ALARM.c, a.by, a.note, a.acknowledged_utc).join(
+            ACKNOWLEDGEMENT, a.alarm_id == ALARM.c.id, isouter=True
+        )
+        with self.reading() as connection:
+            rows = connection.execute(query.order_by(ALARM.c.id)).mappings().all()
+        keys = ("id", "kind", "subject", "time_us", "raised_utc", "text")
+        seen = ("by", "note", "acknowledged_utc")
+        return [
             {
-                "sha256": digest,
-                "kind": one.kind,
-                "subject": one.subject,
-                "time_us": one.time,
-                "time_utc": utc_text(one.time),
-                "content": canonical(one.content),
-                "source_id": source,
-                "line": one.line,
-                "origin": one.origin or None,
+                **{key: row[key] for key in keys},
+                "time_utc": utc_text(row["time_us"]),
+                "content": content_of(dict(row)),
+                "acknowledged": None if row["by"] is None else {key: row[key] for key in seen},
             }
-            for one, digest in kept
+            for row in rows
         ]
-        self._insert(ENTRY, rows)
-        told = {
-            digest_of_data([taking, one.line, one.reason, entry]): {
-                "source_id": source,
-                "line": one.line,
-                "reason": one.reason,
-                "entry": entry,
-                "refused_utc": moment,
-            }
-            for one, entry in refused
-        }
-        there = self._known(REFUSED.c.sha256, list(told))
-        self._insert(REFUSED, [{"sha256": key, **row} for key, row in told.items() if key not in there])
 
-    def _insert(self, table: Any, rows: list[dict[str, Any]]) -> None:
-        for k in range(0, len(rows), _TOGETHER):
-            self.connection.execute(insert(table), rows[k : k + _TOGETHER])
+    def acknowledge(self, alarm: int, by: str, note: str) -> None:
+        """Say who has seen an alarm, and what is done about it.
+
+        Args:
+            alarm: its id.
+            by: name of a person.
+            note: what is done.
+
+        Raises:
+            Problem: there is no such alarm, or somebody has said so.
+        """
+        a = ACKNOWLEDGEMENT.c
+        with writing(self._engine) as connection:
+            known = connection.execute(select(ALARM.c.id).order_by(ALARM.c.id)).scalars().all()
+            if alarm not in known:
+                allowed = names_text(known[-10:]) if known else "none: no alarm was raised"
+                raise Problem("no such alarm", str(alarm), allowed)
+            before = connection.execute(select(a.by, a.acknowledged_utc).where(a.alarm_id == alarm)).first()
+            if before is not None:
+                text = f"alarm {alarm} was acknowledged by {before.by} at {before.acknowledged_utc}"
+                raise Problem(text, None, "an alarm is acknowledged once")
+            row = {"alarm_id": alarm, "by": by, "note": note, "acknowledged_utc": utc_text(now())}
+            connection.execute(insert(ACKNOWLEDGEMENT).values(**row))
 
 
 def content_of(row: Mapping[str, Any]) -> Any:
@@ -386,7 +353,7 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
             make_folders(folder)
         except OSError as error:
             raise NotARecord(f"no folder can be made at {folder}: {error.strerror}") from None
-    engine, digest = _engine(url), digest_of_job(job)
+    engine, digest = engine_of(url), digest_of_job(job)
     try:
         with writing(engine) as connection:
             found = schema.version(connection)
@@ -412,34 +379,3 @@ def initialised(place: str, job: ResolvedJob, simulated: bool = False) -> tuple[
     if folder is not None:
         sync_folder(folder)
     return passed
-
-
-def _opened(url: URL) -> Engine:
-    """The database of a record that is there."""
-    if url.get_backend_name() == "sqlite" and not Path(str(url.database)).is_file():
-        raise NotARecord(f"no record at {url.database}; python -m twin.operate init DIR INSTRUMENT makes one")
-    return _engine(url)
-
-
-@contextmanager
-def writing(engine: Engine) -> Iterator[Connection]:
-    """A transaction of the one writer of this moment."""
-    with failures_told(), engine.connect().execution_options(writing=True) as connection, connection.begin():
-        if engine.dialect.name == "postgresql":
-            connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
-        yield connection
-
-
-@contextmanager
-def failures_told() -> Iterator[None]:
-    """What a database says when it cannot do what it should. Raises RecordFailed."""
-    try:
-        yield
-    except IntegrityError:
-        raise
-    except DBAPIError as error:
-        raise RecordFailed(_said(error)) from None
-
-
-def _said(error: DBAPIError) -> str:
-    return " ".join(str(error.orig).split())

@@ -13,10 +13,12 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     MetaData,
     String,
     Table,
     Text,
+    UniqueConstraint,
     func,
     inspect,
     select,
@@ -26,7 +28,7 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 
 from optics.numerics.frozen_map import FrozenMap
 
-VERSION = 2
+VERSION = 3
 _METADATA = MetaData()
 _NUMBER = BigInteger().with_variant(Integer(), "sqlite")
 """SQLite counts rows by itself only where their type is INTEGER."""
@@ -86,6 +88,7 @@ ENTRY = _table(
     _digest("origin"),
     Index("entry_stream", "kind", "subject", "time_us"),
     Index("entry_origin", "origin"),
+    Index("entry_time", "time_us", "id"),
 )
 """A row for each reading or event, as `twin.operate.entries.Entry`."""
 REFUSED = _table(
@@ -99,6 +102,46 @@ REFUSED = _table(
     Index("refused_entry", "entry"),
 )
 """A row for what was not taken, once for each reason; ``entry`` is the digest of the reading, if it is one."""
+PLAN = _table(
+    "plan",
+    _digest("sha256", nullable=False),
+    Column("file", Text, nullable=False),
+    Column("content", Text, nullable=False),
+    Column("kept_utc", String(32), nullable=False),
+)
+"""A row for each plan of operation under which the record was followed; the newest counts."""
+ALARM = _table(
+    "alarm",
+    _digest("sha256", nullable=False, unique=True),
+    Column("kind", String(32), nullable=False),
+    Column("subject", String(200), nullable=False),
+    Column("time_us", BigInteger, nullable=False),
+    Column("raised_utc", String(32), nullable=False),
+    Column("text", Text, nullable=False),
+    Column("content", Text, nullable=False),
+    Index("alarm_stream", "kind", "subject", "time_us"),
+)
+"""A row for each alarm, as `twin.operate.entries.Alarm`."""
+ACKNOWLEDGEMENT = _table(
+    "acknowledgement",
+    Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),
+    Column("by", Text, nullable=False),
+    Column("note", Text, nullable=False),
+    Column("acknowledged_utc", String(32), nullable=False),
+)
+"""A row for each alarm that somebody has seen."""
+CHECKPOINT = _table(
+    "checkpoint",
+    _digest("plan", nullable=False),
+    Column("number", Integer, nullable=False),
+    Column("time_us", BigInteger, nullable=False),
+    Column("entry_id", _NUMBER, nullable=False),
+    Column("content", LargeBinary, nullable=False),
+    UniqueConstraint("plan", "number"),
+    Index("checkpoint_time", "time_us"),
+)
+"""Where an estimate stood at some time: derived from the entries, and the only rows that may be altered and removed."""
+_DERIVED = (CHECKPOINT.name,)
 
 
 class NotARecord(Exception):
@@ -148,7 +191,7 @@ def guarded(connection: Connection) -> bool:
     query = names.get(connection.dialect.name)
     if query is None:
         return False
-    return int(connection.execute(text(query)).scalar_one()) >= 2 * len(_METADATA.tables)
+    return int(connection.execute(text(query)).scalar_one()) >= 2 * (len(_METADATA.tables) - len(_DERIVED))
 
 
 def create(connection: Connection) -> None:
@@ -156,7 +199,8 @@ def create(connection: Connection) -> None:
     _METADATA.create_all(connection)
     _guard_function(connection)
     for table in _METADATA.sorted_tables:
-        _guard(connection, table.name)
+        if table.name not in _DERIVED:
+            _guard(connection, table.name)
 
 
 def version(connection: Connection) -> int:
@@ -169,16 +213,31 @@ def version(connection: Connection) -> int:
 def _to_two(connection: Connection) -> None:
     """Add where a reading was found from, and what was refused; old rows get no origin, since none is altered."""
     connection.execute(text("ALTER TABLE entry ADD COLUMN origin VARCHAR(64)"))
-    for index in ENTRY.indexes:
-        if index.name == "entry_origin":
-            connection.execute(CreateIndex(index))
-    connection.execute(CreateTable(REFUSED))
-    for index in REFUSED.indexes:
+    _make_index(connection, ENTRY, "entry_origin")
+    _make_table(connection, REFUSED)
+
+
+def _to_three(connection: Connection) -> None:
+    """Add plans of operation, what is derived under them, alarms, and who has seen them."""
+    _make_index(connection, ENTRY, "entry_time")
+    for table in (PLAN, ALARM, ACKNOWLEDGEMENT, CHECKPOINT):
+        _make_table(connection, table)
+
+
+def _make_table(connection: Connection, table: Table) -> None:
+    connection.execute(CreateTable(table))
+    for index in table.indexes:
         connection.execute(CreateIndex(index))
-    _guard(connection, REFUSED.name)
+    if table.name not in _DERIVED:
+        _guard(connection, table.name)
 
 
-MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two})
+def _make_index(connection: Connection, table: Table, name: str) -> None:
+    (index,) = (one for one in table.indexes if one.name == name)
+    connection.execute(CreateIndex(index))
+
+
+MIGRATIONS: Mapping[int, Callable[[Connection], None]] = FrozenMap({1: _to_two, 2: _to_three})
 """Version -> what makes the next one of it. Rows are added, none is altered."""
 
 

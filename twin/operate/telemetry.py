@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from scenes.specs.events import EVENTS
 from scenes.specs.load import INSTRUMENTS, find_named
 from scenes.specs.measured.telemetry import (
     EVENT,
-    EVENTS,
     QUATERNION,
     VALUES,
     ReadingColumnSpec,

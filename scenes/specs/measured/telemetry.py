@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from optics.numerics.frozen_map import FrozenMap
+from scenes.specs.events import Event
 from scenes.specs.measured.pass_files import ClockReading, TimeScale
 from scenes.yaml.errors import Problem, names_text, nearest
 from scenes.yaml.spec import Paths, Reference, Spec, Text, not_empty, short_for
@@ -24,11 +25,8 @@ VALUES: Mapping[str, tuple[Kind, Kind]] = FrozenMap(
 RUNS = ("monitor", "calibration", "angle")
 """Sorts of reading that a run folder holds, which a row of a table names."""
 EVENT = "event"
-EVENTS = ("safe_mode", "heater_set_point", "refocus", "eclipse_season_begins", "eclipse_season_ends")
-"""What can happen to an instrument, other than being read."""
 QUATERNION = "quaternion"
 """Unit of an attitude whose four columns are a quaternion."""
-Event = Literal["safe_mode", "heater_set_point", "refocus", "eclipse_season_begins", "eclipse_season_ends"]
 Heads = Annotated[tuple[Text, ...], short_for(None, str, schema=Text | tuple[Text, ...]), Field(min_length=1)]
 
 
