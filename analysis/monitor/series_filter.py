@@ -214,7 +214,8 @@ class SeriesFilter:
         stated: what moves, and how it goes on in time.
         reference_noise: (D, D) px^2 of the spots that shifts are counted from; None for none.
         heat: temperatures that sensors read; None for none.
-        readings: of spots over the whole life, by which a chance of a false alarm is counted.
+        life_s: seconds over which ``stated.jump_false_alarm`` counts, all looks together: each gets the share of it that
+            the time between its two readings is of the life, whatever the cadence of the readings.
         window: readings for which a jump is looked for.
         stepping: numbers of motions that may step although their own law is another one.
         parameters_read: whether there are readings of parameters among those of spots.
@@ -225,7 +226,7 @@ class SeriesFilter:
     stated: Disturbances
     reference_noise: Array | None = None
     heat: HeatInputs | None = None
-    readings: float = 1e4
+    life_s: float = 10.0 * 365.25 * 86_400.0
     window: int = 60
     stepping: tuple[int, ...] = ()
     parameters_read: bool = False
@@ -287,15 +288,19 @@ class SeriesFilter:
             return np.zeros((self.space.size, 0))
         return self.space.level_of(self.walking.tolist()) * np.sqrt(rates)
 
-    @property
-    def looks(self) -> float:
-        """For a jump, over the whole life."""
-        return max(1.0, self.readings * self.window * len(self._may))
+    def looks(self, between: ArrayLike) -> Array:
+        """By how much the chance of one look for a jump is to be multiplied for that of all in the whole life.
 
-    @cached_property
-    def _limit(self) -> float:
+        Args:
+            between: seconds between the two readings of the look, of any shape.
+        """
+        share = np.asarray(between, np.float64) / self.life_s
+        return np.asarray(self.window * len(self._may) / np.minimum(share, 1.0))
+
+    def _limit(self, belief: Belief) -> float:
         """Ratio below which no candidate can be told, whatever its number of motions."""
-        return float(limit_of(self.stated.jump_false_alarm / self.looks, 1)) if self._may else math.inf
+        between = belief.until - belief.after
+        return float(limit_of(self.stated.jump_false_alarm / self.looks(between.max()), 1))
 
     def start(self, time: float) -> Belief:
         """What is known before any reading.
@@ -351,7 +356,7 @@ class SeriesFilter:
         now = replace(now, state=state, search=search, last=last)
         if not (observed.spots and self._may and len(now.until)):
             return now, found
-        now = replace(now, left=self.unseen(now.looking.information[:1])[0])
+        now = replace(now, left=self.unseen(now, 1)[0])
         jump = self._told(now)
         if jump is not None:
             now, jump = self._jumped(now, jump)
@@ -438,16 +443,18 @@ class SeriesFilter:
         taken = _Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
         return taken, Innovation(observed, w.expected, w.spread, w.white, log_score)
 
-    def unseen(self, information: Array) -> Array:
-        """(L, m) what share of the mean square of jumps is of those that cannot be told with some information.
+    def unseen(self, belief: Belief, count: int | None = None) -> Array:
+        """(L, m) what share of the mean square of jumps is of those that cannot be told, before each reading.
 
         Args:
-            information: (L, q, q) of the amounts of steps.
+            belief: so far, with what is known of each step.
+            count: of the oldest steps; all by default.
         """
+        information, between = belief.looking.information[:count], belief.until[:count] - belief.after[:count]
         column = self._stacked.spots[:, self.walking]
         seen = np.sqrt(np.maximum(np.einsum("qm,kqr,rm->km", column, information, column), 0.0))
-        limit = math.sqrt(self._limit)
-        return np.asarray(ndtr(limit - _SIZES * seen[..., None]) @ _MEAN_SQUARE)
+        limit = np.sqrt(limit_of(self.stated.jump_false_alarm / self.looks(between), 1))
+        return np.asarray(ndtr(limit[:, None, None] - _SIZES * seen[..., None]) @ _MEAN_SQUARE)
 
     def _told(self, belief: Belief) -> Jump | None:
         """The likeliest jump, if chance does not explain it."""
@@ -457,15 +464,14 @@ class SeriesFilter:
         along = np.einsum("kqr,kq->kr", vectors, track.score)
         large = values > 1e-12 * values[:, -1:]
         most = np.sum(np.where(large, along**2 / np.where(large, values, 1.0), 0.0), axis=1)
-        if most.max() < self._limit:
+        if most.max() < self._limit(belief):
             return None
-        steps = Steps(belief.after, belief.until, track.score, track.information)
-        own = np.isfinite(belief.after)
-        steps = Steps(*(getattr(steps, name)[own] for name in ("after", "until", "score", "information")))
-        one = likeliest([steps], self._may, self._stacked)
+        one = likeliest([Steps(belief.after, belief.until, track.score, track.information)], self._may, self._stacked)
         if one is None:
             return None
-        chance = min(1.0, one.chance * self.looks / (len(self._may) * len(steps.until)))
+        # `likeliest` counts its own looks at these readings
+        alone = one.chance / (len(self._may) * len(belief.until))
+        chance = min(1.0, alone * float(self.looks(one.until - one.after)))
         return replace(one, chance=chance) if chance <= self.stated.jump_false_alarm else None
 
     def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
@@ -474,10 +480,8 @@ class SeriesFilter:
         values, vectors = np.linalg.eigh(self.stated.correlation[np.ix_(own, own)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         outputs, level = self._stacked.spots[:, own] @ root, self.space.level_of(own) @ root
-        known = np.isfinite(belief.after)
         looked = _Amounts.of(belief.looking, outputs, jump.times)
-        weight = np.where(known, looked.log_weight, -np.inf)
-        weight = np.exp(weight - weight.max()) * np.where(known, belief.until - belief.after, 0.0)
+        weight = np.exp(looked.log_weight - looked.log_weight.max()) * (belief.until - belief.after)
         weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
         weight /= weight.sum()
         state = _compensated(belief.state, _Amounts.of(belief.state, outputs, jump.times), weight, level, outputs)

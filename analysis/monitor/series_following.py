@@ -103,7 +103,7 @@ class _Left:
         """Keep it of the oldest steps that are looked for, or of all."""
         if self._share.shape[1] and len(belief.until[:count]):
             at = [self._number[time] for time in belief.until[:count].tolist()]
-            self._share[at] = self._how.unseen(belief.looking.information[:count])
+            self._share[at] = self._how.unseen(belief, count)
 
     def __getitem__(self, number: int) -> Array:
         """(m,) before reading ``number``."""

@@ -155,7 +155,7 @@ def jumped(size: float, seed: int = 6, count: int = 30) -> tuple[Disturbances, n
 def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
     """The estimate after it is that of a filter that was told of the jump's time and prior before."""
     told, times, shifts = jumped(3.0)
-    how = SeriesFilter(told, readings=30.0)
+    how = SeriesFilter(told, life_s=30.0)
     read = of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS))
     found = follow(how, read, times)
     (jump,) = found.jumps
@@ -163,7 +163,7 @@ def test_a_jump_is_told_and_counts_as_if_it_had_been_known() -> None:
     (size,), (sigma,) = jump.sizes, jump.sigmas
     assert abs(size - 3.0) < 4.0 * sigma
     knowing = SeriesFilter(
-        told.with_copies(jump.motions, jump.times, TimeLaw(event=((19.5, 1.0),))), readings=30.0, window=0
+        told.with_copies(jump.motions, jump.times, TimeLaw(event=((19.5, 1.0),))), life_s=30.0, window=0
     )
     known = follow(knowing, read, times)
     sigmas = np.sqrt(np.diagonal(known.filtered.total, 0, 1, 2))
@@ -177,7 +177,7 @@ def test_no_jump_is_told_where_none_is() -> None:
     for seed in range(40):
         told, times, shifts = jumped(0.0, seed)
         assert not follow(
-            SeriesFilter(told, readings=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []
+            SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []
         ).jumps
 
 
