@@ -37,10 +37,13 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 
 __all__ = [
     "MOST",
+    "Amounts",
     "Candidate",
     "Jump",
+    "Step",
     "Steps",
     "candidates",
+    "knots",
     "likeliest",
     "sized",
     "steps",
@@ -142,6 +145,61 @@ class Jump:
         }
 
 
+@dataclass(frozen=True, eq=False)
+class Step:
+    """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
+
+    Attributes:
+        motions: numbers of the disturbances.
+        chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
+            known moment, seconds.
+        times: standard deviations of the step over those that are stated.
+    """
+
+    motions: tuple[int, ...]
+    chances: tuple[tuple[float, float], ...]
+    times: float = 1.0
+
+    @classmethod
+    def of(cls, jump: Jump) -> Step:
+        """Of a jump."""
+        return cls(jump.motions, jump.chances, jump.times)
+
+    def come(self, time: float) -> float:
+        """Chance that it has come by a time, seconds."""
+        at, chance = np.array(self.chances).T
+        if len(at) == 1:
+            return float((time >= at[0]) * chance[0])
+        return float(np.interp(time, at, chance))
+
+
+@dataclass(frozen=True, eq=False)
+class Amounts:
+    """How much motions have jumped, for each place of the step: mean (L, r), covariance (L, r, r), log weights (L,)."""
+
+    mean: Array
+    covariance: Array
+    log_weight: Array
+
+    @classmethod
+    def of(cls, score: Array, information: Array, outputs: Array, times: float) -> Amounts:
+        """By what is known of steps.
+
+        Args:
+            score: (L, q) as of `Steps`.
+            information: (L, q, q) likewise.
+            outputs: (q, r) what the motions do.
+            times: their standard deviations over those of ``outputs``.
+        """
+        information = outputs.T @ information @ outputs
+        score = score @ outputs
+        prior = np.eye(outputs.shape[1]) / times**2
+        covariance = np.asarray(np.linalg.inv(information + prior), np.float64)
+        mean = np.einsum("kij,kj->ki", covariance, score)
+        _, size = np.linalg.slogdet(np.eye(outputs.shape[1]) + times**2 * information)
+        return cls(mean, covariance, 0.5 * (np.sum(mean * score, axis=1) - size))
+
+
 def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
     """What may jump: each motion whose law is `jump` alone, and those of a body together.
 
@@ -241,12 +299,23 @@ def _chances(after: Array, until: Array, log_ratio: Array) -> tuple[tuple[float,
     """When the step came, all times between the first and the last being as likely before the measurements."""
     weight = np.exp(log_ratio - log_ratio.max())
     weight = np.where(weight < _UNLIKELY, 0.0, weight * (until - after))
-    sure = np.cumsum(weight) / weight.sum()
-    knots: dict[float, float] = {}
+    return knots(after, until, weight / weight.sum())
+
+
+def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
+    """(time, chance that a step has come by then), linear between.
+
+    Args:
+        after: (L,) seconds, ascending; the step comes after the one and not after the other.
+        until: (L,) likewise.
+        weight: (L,) chances of each place, together 1.
+    """
+    sure = np.minimum(np.cumsum(weight), 1.0)
+    out: dict[float, float] = {}
     for k in np.flatnonzero(weight):
-        knots.setdefault(float(after[k]), float(sure[k - 1]) if k else 0.0)
-        knots[float(until[k])] = float(sure[k])
-    return tuple(sorted(knots.items()))
+        out.setdefault(float(after[k]), float(sure[k - 1]) if k else 0.0)
+        out[float(until[k])] = float(sure[k])
+    return tuple(sorted(out.items()))
 
 
 def _larger(information: Array, score: Array) -> float:

@@ -30,11 +30,11 @@ from scipy.special import ndtr
 from analysis.chi_square import limit_of
 from analysis.measurement_error import UndeterminedError
 from analysis.monitor.disturbances import Disturbances
-from analysis.monitor.jump_detection import Candidate, Jump, Steps, candidates, likeliest
+from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Steps, candidates, knots, likeliest
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
 
-__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Step", "Whitened", "of_shifts", "series_of"]
+__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Whitened", "of_shifts", "series_of"]
 
 Array = NDArray[np.float64]
 _UNLIKELY = 1e-4
@@ -79,34 +79,6 @@ def of_shifts(times: ArrayLike, shifts: Array, noise: Array) -> tuple[Observed, 
     when = np.asarray(times, np.float64)
     each = np.broadcast_to(noise, (len(when), *noise.shape[-2:]))
     return tuple(Observed(float(when[k]), shifts[k], each[k]) for k in np.argsort(when, kind="stable"))
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
-
-    Attributes:
-        motions: numbers of the disturbances.
-        chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
-            known moment, seconds.
-        times: standard deviations of the step over those that are stated.
-    """
-
-    motions: tuple[int, ...]
-    chances: tuple[tuple[float, float], ...]
-    times: float = 1.0
-
-    @classmethod
-    def of(cls, jump: Jump) -> Step:
-        """Of a jump."""
-        return cls(jump.motions, jump.chances, jump.times)
-
-    def come(self, time: float) -> float:
-        """Chance that it has come by a time, seconds."""
-        at, chance = np.array(self.chances).T
-        if len(at) == 1:
-            return float((time >= at[0]) * chance[0])
-        return float(np.interp(time, at, chance))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +186,8 @@ class SeriesFilter:
         stated: what moves, and how it goes on in time.
         reference_noise: (D, D) px^2 of the spots that shifts are counted from; None for none.
         heat: temperatures that sensors read; None for none.
-        life_s: seconds over which ``stated.jump_false_alarm`` counts, all looks together: each gets the share of it that
-            the time between its two readings is of the life, whatever the cadence of the readings.
+        life_s: seconds over which ``stated.jump_false_alarm`` counts, all looks together: each gets the share of it
+            that the time between its two readings is of the life, whatever the cadence of the readings.
         window: readings for which a jump is looked for.
         stepping: numbers of motions that may step although their own law is another one.
         parameters_read: whether there are readings of parameters among those of spots.
@@ -480,15 +452,21 @@ class SeriesFilter:
         values, vectors = np.linalg.eigh(self.stated.correlation[np.ix_(own, own)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
         outputs, level = self._stacked.spots[:, own] @ root, self.space.level_of(own) @ root
-        looked = _Amounts.of(belief.looking, outputs, jump.times)
+        looked = Amounts.of(belief.looking.score, belief.looking.information, outputs, jump.times)
         weight = np.exp(looked.log_weight - looked.log_weight.max()) * (belief.until - belief.after)
         weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
         weight /= weight.sum()
-        state = _compensated(belief.state, _Amounts.of(belief.state, outputs, jump.times), weight, level, outputs)
+        state = _compensated(
+            belief.state,
+            Amounts.of(belief.state.score, belief.state.information, outputs, jump.times),
+            weight,
+            level,
+            outputs,
+        )
         search = None
         if belief.search is not None:
             search = _compensated(belief.search, looked, weight, level, outputs)
-        amounts = _Amounts.of(belief.state, outputs, jump.times)
+        amounts = Amounts.of(belief.state.score, belief.state.information, outputs, jump.times)
         mean = weight @ amounts.mean
         away = amounts.mean - mean
         spread = np.einsum("k,kij->ij", weight, amounts.covariance + away[:, :, None] * away[:, None, :])
@@ -498,7 +476,7 @@ class SeriesFilter:
             jump,
             sizes=tuple(sizes.tolist()),
             sigmas=tuple(sigmas.tolist()),
-            chances=_chances(belief.after, belief.until, weight),
+            chances=knots(belief.after, belief.until, weight),
         )
         empty = np.zeros(0)
         return replace(belief, state=state, search=search, after=empty, until=empty), told
@@ -513,46 +491,47 @@ class SeriesFilter:
         found = [self.parameters(belief, time) for time in np.asarray(times, np.float64).tolist()]
         return series_of(found, self.stated.parameters.shape[0])
 
-    def parameters(
-        self, belief: Belief, time: float, more: Array | None = None, gained: Array | None = None
-    ) -> tuple[Array, Array]:
+    def parameters(self, belief: Belief, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
 
         Args:
             belief: so far.
             time: not before its own, seconds.
-            more: (n,) by which later readings correct the states there.
-            gained: (n, n) by which they do their covariance.
         """
-        state, width = self._moved(belief.state, belief.time, time, belief.left), self.space.width
-        mean = state.mean if more is None else state.mean + more
-        covariance = state.covariance if gained is None else state.covariance - gained
+        state = self._moved(belief.state, belief.time, time, belief.left)
+        return self.parameters_of(state.mean, state.covariance, time)
+
+    def parameters_of(self, mean: Array, covariance: Array, time: float) -> tuple[Array, Array]:
+        """Parameters (P,) and their covariance (P, P).
+
+        Args:
+            mean: (n,) of the states.
+            covariance: (n, n) of them.
+            time: of them, seconds.
+        """
+        width = self.space.width
         values, rows, left = self.space.outputs(mean, covariance, time)
         own = rows[width:]
         return values[width:], own @ covariance @ own.T + left[width:, width:]
 
+    def motions_of(self, mean: Array, covariance: Array, time: float, since: float) -> tuple[Array, Array]:
+        """Motions (M,) and their covariance (M, M), in the standard deviations that are stated.
 
-@dataclass(frozen=True, eq=False)
-class _Amounts:
-    """How much motions have jumped, for each place of the step: mean (L, r), covariance (L, r, r), log weights (L,)."""
-
-    mean: Array
-    covariance: Array
-    log_weight: Array
-
-    @classmethod
-    def of(cls, track: _Track, outputs: Array, times: float) -> _Amounts:
-        """Of amounts whose standard deviations are so many times those that are stated."""
-        information = outputs.T @ track.information @ outputs
-        score = track.score @ outputs
-        prior = np.eye(outputs.shape[1]) / times**2
-        covariance = np.asarray(np.linalg.inv(information + prior), np.float64)
-        mean = np.einsum("kij,kj->ki", covariance, score)
-        _, size = np.linalg.slogdet(np.eye(outputs.shape[1]) + times**2 * information)
-        return cls(mean, covariance, 0.5 * (np.sum(mean * score, axis=1) - size))
+        Args:
+            mean: (n,) of the states.
+            covariance: (n, n) of them.
+            time: of them, seconds.
+            since: from when on jumps have come that were not told, seconds.
+        """
+        more = [(one.motions, one.times**2 * one.come(time)) for one in self.steps]
+        for motion in self.walking.tolist():
+            every = float(self.stated.laws[motion].every_s or math.inf)
+            more.append(((motion,), max(time - since, 0.0) / every))
+        rows, left = self.space.motion_gain(time, more)
+        return rows @ mean, rows @ covariance @ rows.T + left
 
 
-def _compensated(track: _Track, amounts: _Amounts, weight: Array, level: Array, outputs: Array) -> _Track:
+def _compensated(track: _Track, amounts: Amounts, weight: Array, level: Array, outputs: Array) -> _Track:
     """The filter as if it had known of the jump, averaged over its places; nothing is looked for beside it."""
     moved = level - track.response @ outputs
     each = np.einsum("knr,kr->kn", moved, amounts.mean)
@@ -563,16 +542,6 @@ def _compensated(track: _Track, amounts: _Amounts, weight: Array, level: Array, 
     q = track.score.shape[1]
     none = np.zeros((0, len(mean), q)), np.zeros((0, q)), np.zeros((0, q, q))
     return _Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
-
-
-def _chances(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float], ...]:
-    """(time, chance that a step has come by then), linear between."""
-    sure = np.minimum(np.cumsum(weight), 1.0)
-    knots: dict[float, float] = {}
-    for k in np.flatnonzero(weight):
-        knots.setdefault(float(after[k]), float(sure[k - 1]) if k else 0.0)
-        knots[float(until[k])] = float(sure[k])
-    return tuple(sorted(knots.items()))
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

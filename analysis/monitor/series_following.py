@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from analysis.monitor.jump_detection import Jump
-from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Step, Whitened, series_of
+from analysis.monitor.jump_detection import Jump, Step
+from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 
-__all__ = ["Followed", "follow"]
+__all__ = ["Followed", "follow", "smoothed"]
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 _PIECE = 400
 """Readings whose covariances are held at once."""
@@ -82,9 +84,10 @@ def follow(
         filtered[k] = how.parameters(belief, times[k])
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
-    smoothed = _smoothed(knowing, observed, times, order, earliest, left)
+    shares = [left[k] for k in range(len(observed))]
+    late = smoothed(knowing, knowing.start(earliest), observed, times, shares, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
-    return Followed(series_of(filtered, width), series_of(smoothed, width), tuple(innovations), jumps, belief)
+    return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
 
 
 class _Left:
@@ -116,59 +119,66 @@ def _of_nothing(count: int) -> list[tuple[Array, Array]]:
     return [(np.empty(0), np.empty(0))] * count
 
 
-def _smoothed(
-    how: SeriesFilter, observed: Sequence[Observed], times: Array, order: NDArray[np.intp], start: float, left: _Left
-) -> list[tuple[Array, Array]]:
-    """Parameters at all times by all readings: forward to where pieces begin, then backward piece by piece."""
-    beliefs, belief = [], how.start(start)
+def smoothed(
+    how: SeriesFilter,
+    start: Belief,
+    observed: Sequence[Observed],
+    wanted: ArrayLike,
+    left: Sequence[Array],
+    each: Callable[[Array, Array, float], T],
+) -> list[T]:
+    """What all readings say of times past: forward to where pieces begin, then backward piece by piece.
+
+    Args:
+        how: a filter that looks for no jumps, since it knows of them.
+        start: what is known before the first reading.
+        observed: N readings in the order of time.
+        wanted: (T,) times, seconds, in any order, none before ``start``.
+        left: N times (m,) what share of the mean square of jumps cannot be told, before each reading.
+        each: (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
+    """
+    times = np.asarray(wanted, np.float64)
+    order = np.argsort(times, kind="stable")
+    beliefs, belief = [start], start
     for k, one in enumerate(observed):
-        if k % _PIECE == 0:
+        if k and k % _PIECE == 0:
             beliefs.append(belief)
         belief, _ = how.update(replace(belief, left=left[k]), one)
-    if not observed:
-        beliefs.append(belief)
-    out = _of_nothing(len(times))
-    size = how.space.size
+    out: dict[int, T] = {}
+    size, moved = how.space.size, how.space.moved
     carried, known = np.zeros(size), np.zeros((size, size))
-    when = np.array([one.time for one in observed])
     # number of the first reading after each wanted time: it is worked out in the piece of that one
-    behind = np.searchsorted(when, times[order], side="right")
+    behind = np.searchsorted(np.array([one.time for one in observed]), times[order], side="right")
+    for k in order[behind == len(observed)]:  # after the last reading nothing comes to correct the filter
+        there = how.at(belief, times[k])
+        out[int(k)] = each(there.mean, there.covariance, float(times[k]))
     for piece in reversed(range(len(beliefs))):
         first, last = piece * _PIECE, min((piece + 1) * _PIECE, len(observed))
-        final = last == len(observed)
-        steps = list(_again(how, beliefs[piece], observed[first:last], [left[k] for k in range(first, last)]))
-        belief = beliefs[piece] if not steps else steps[-1][0]
-        own = order[behind == last] if final else order[:0]
-        for k in own[::-1]:  # after the last reading nothing comes to correct the filter
-            out[k] = how.parameters(belief, times[k])
+        steps = list(_again(how, beliefs[piece], observed[first:last], left[first:last]))
         for number in reversed(range(first, last)):
-            before, whitened = steps[number - first][1:]
-            moved = how.space.moved
+            before, whitened = steps[number - first]
+            now = observed[number].time
             # across the reading; the short form, in which N's own terms cancel, is not stable
             kept = np.eye(size) - whitened.gain.T @ whitened.rows
             known = kept.T @ known @ kept + whitened.rows.T @ whitened.rows
             carried = kept.T @ carried + whitened.rows.T @ whitened.white
-            for k in order[behind == number][::-1]:
-                time = times[k]
-                there = how.at(replace(before, left=left[number]), time)
-                back = moved(carried[:, None], time, observed[number].time, back=True)[:, 0]
-                both = moved(
-                    moved(known, time, observed[number].time, back=True).T, time, observed[number].time, back=True
-                )
+            for k in order[behind == number]:
+                there = how.at(before, times[k])
+                back = moved(carried[:, None], times[k], now, back=True)[:, 0]
+                both = moved(moved(known, times[k], now, back=True).T, times[k], now, back=True)
                 gained = there.covariance @ both @ there.covariance
-                out[k] = how.parameters(there, time, there.covariance @ back, gained)
-            then, now = before.time, observed[number].time
-            carried = moved(carried[:, None], then, now, back=True)[:, 0]
-            known = moved(moved(known, then, now, back=True).T, then, now, back=True)
-    return out
+                out[int(k)] = each(there.mean + there.covariance @ back, there.covariance - gained, float(times[k]))
+            carried = moved(carried[:, None], before.time, now, back=True)[:, 0]
+            known = moved(moved(known, before.time, now, back=True).T, before.time, now, back=True)
+    return [out[k] for k in range(len(times))]
 
 
 def _again(
     how: SeriesFilter, belief: Belief, observed: Sequence[Observed], left: Sequence[Array]
-) -> Iterator[tuple[Belief, Belief, Whitened]]:
-    """What is known after each reading, before it was moved to, and the reading, of one piece."""
+) -> Iterator[tuple[Belief, Whitened]]:
+    """What is known before each reading of one piece, before it was moved to it, and the reading."""
     for one, share in zip(observed, left, strict=True):
         before = replace(belief, left=share)
-        whitened = how.whitened(how.at(before, one.time).state, one)
-        belief, _ = how.update(before, one)
-        yield belief, before, whitened
+        there = how.at(before, one.time)
+        yield before, how.whitened(there.state, one)
+        belief, _ = how.update(there, one)

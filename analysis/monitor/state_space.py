@@ -339,6 +339,18 @@ class StateSpace:
         states = np.array([self._heat_states[k] for k in self.heat.motions.tolist()], int)
         return [(self.factors.start + f, states[self.heat.factors == f]) for f in range(len(self.heat.names))]
 
+    def heat_outputs(self, mean: Array, time: float) -> Array:
+        """(D + P,) of the outputs what heat of bodies with sensors does.
+
+        Args:
+            mean: (n,) of the states.
+            time: seconds.
+        """
+        rows, out = self._rows(time), np.zeros(self.width + self.stated.parameters.shape[0])
+        for factor, at in self._heated if self.heat is not None else ():
+            out += (1.0 + mean[factor]) * (rows[:, at] @ mean[at])
+        return out
+
     def sensor_rows(self, sensors: Sequence[int], time: float) -> Array:
         """(s, n) kelvin that sensors read of the states.
 
@@ -352,15 +364,20 @@ class StateSpace:
             out[:, self._heat_states[motion]] = _gain(self.stated.laws[motion], time) * column[list(sensors)]
         return out
 
-    def motion_gain(self, time: float) -> tuple[Array, Array]:
+    def motion_gain(self, time: float, steps: Sequence[tuple[Sequence[int], float]] = ()) -> tuple[Array, Array]:
         """Motions by the states: rows (M, n), and (M, M) covariance of what the states leave of them, in standard
-        deviations, at a time at which all laws but those of steps have the variance that they state.
+        deviations.
 
         Args:
             time: seconds.
+            steps: motions that have stepped beside their laws, and by which variance over the stated one.
         """
         count = len(self.stated.labels)
         rows, left = np.zeros((count, self.size)), np.zeros((count, count))
+        stepped = np.zeros((count, count))
+        for motions, variance in steps:
+            at = np.ix_(list(motions), list(motions))
+            stepped[at] += variance * self.stated.correlation[at]
         for block in self._blocks:
             if block.kind == "heat":
                 for k, motion in enumerate(block.motions):
@@ -368,18 +385,18 @@ class StateSpace:
             if block.kind not in ("level", "law"):
                 continue
             own = list(block.motions)
-            size = np.array(
-                [_come(law, time) if _is_level(law) else _variance(law, time) for law in map(self._law, own)]
-            )
-            root = np.sqrt(size)
-            prior = root[:, None] * self.stated.correlation[np.ix_(own, own)] * root
-            across = prior @ self._coordinates(block, own).T
-            whole = _variance(block.law, time) * block.covariance
-            whole = whole + sum((_come(law, time) * each for law, each in block.steps), np.zeros_like(whole))
-            gain = across @ np.linalg.pinv(whole, rcond=1e-10, hermitian=True)
+            if block.kind == "level":
+                own = sorted({*own, *np.flatnonzero(np.diag(stepped)).tolist()})
+                root = np.array([math.sqrt(_come(law, time)) if _is_level(law) else 0.0 for law in map(self._law, own)])
+                prior = root[:, None] * self.stated.correlation[np.ix_(own, own)] * root + stepped[np.ix_(own, own)]
+            else:
+                prior = _variance(block.law, time) * self.stated.correlation[np.ix_(own, own)]
+            at_states = self._coordinates(block, own)
+            across = prior @ at_states.T
+            gain = across @ np.linalg.pinv(at_states @ across, rcond=1e-10, hermitian=True)
             amplitude = _gain(block.law, time)
-            rows[np.ix_(own, range(block.at.start, block.at.start + block.rank))] = amplitude * gain
-            left[np.ix_(own, own)] = amplitude**2 * (prior - gain @ across.T)
+            rows[np.ix_(own, range(block.at.start, block.at.start + block.rank))] += amplitude * gain
+            left[np.ix_(own, own)] += amplitude**2 * (prior - gain @ across.T)
         return rows, left
 
     def _law(self, motion: int) -> TimeLaw:

@@ -245,8 +245,7 @@ def test_motions_of_a_state_are_those_of_one_joint_normal() -> None:
     told, shift = stated(LAWS[:3], seed=8), np.full(SPOTS, 0.7)
     how = SeriesFilter(told, window=0)
     belief, _ = how.update(how.start(0.0), Observed(0.0, shift, NOISE**2 * np.eye(SPOTS)))
-    rows, left = how.space.motion_gain(0.0)
-    found, spread = rows @ belief.mean, rows @ belief.covariance @ rows.T + left
+    found, spread = how.motions_of(belief.mean, belief.covariance, 0.0, 0.0)
     gain = told.correlation @ told.spots.T @ np.linalg.inv(told.spot_covariance + NOISE**2 * np.eye(SPOTS))
     assert np.allclose(found, gain @ shift, atol=1e-9)
     assert np.allclose(spread, told.correlation - gain @ told.spots @ told.correlation, atol=1e-9)
