@@ -18,7 +18,7 @@ from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 
-__all__ = ["Followed", "follow", "smoothed"]
+__all__ = ["Followed", "Untold", "follow", "smoothed"]
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -66,7 +66,7 @@ def follow(
     order = np.argsort(times, kind="stable")
     belief, filtered = how.start(earliest), _of_nothing(len(times))
     innovations: list[Innovation] = []
-    left = _Left(how, observed)
+    left = Untold(how)
     ahead = 0
     for k, one in enumerate(observed):
         while ahead < len(order) and times[order[ahead]] < one.time:
@@ -74,45 +74,60 @@ def follow(
             ahead += 1
         before = belief
         belief, found = how.update(belief, one)
+        left.take(before, belief)
         innovations.append(found)
-        if found.jump is not None:
-            left.note(before)
-        left.note(belief, 1)
         advance(k + 1)
-    left.note(belief)
     for k in order[ahead:]:
         filtered[k] = how.parameters(belief, times[k])
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
-    shares = [left[k] for k in range(len(observed))]
+    shares = left.shares(belief, observed)
     late = smoothed(knowing, knowing.start(earliest), observed, times, shares, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
     return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
 
 
-class _Left:
-    """What share of the mean square of jumps before each reading cannot be told, once all is known that will be."""
+class Untold:
+    """What share of the mean square of jumps before each reading cannot be told, once all is known that will be.
 
-    def __init__(self, how: SeriesFilter, observed: Sequence[Observed]) -> None:
+    Args:
+        how: the filter.
+    """
+
+    def __init__(self, how: SeriesFilter) -> None:
         self._how = how
-        self._number = {one.time: k for k, one in enumerate(observed) if one.spots}
-        self._share = np.ones((len(observed), len(how.walking)))
-        spots = np.array([one.spots for one in observed], bool)
-        # of other readings that of the next one of spots
-        self._next = np.minimum(np.cumsum(np.append(False, spots[:-1])), max(int(spots.sum()) - 1, 0))
-        self._spots = np.flatnonzero(spots)
+        self._share: dict[float, Array] = {}
 
-    def note(self, belief: Belief, count: int | None = None) -> None:
-        """Keep it of the oldest steps that are looked for, or of all."""
-        if self._share.shape[1] and len(belief.until[:count]):
-            at = [self._number[time] for time in belief.until[:count].tolist()]
-            self._share[at] = self._how.unseen(belief, count)
+    def take(self, before: Belief, after: Belief) -> None:
+        """Keep it of the oldest step that is looked for, and of all where the search began anew.
 
-    def __getitem__(self, number: int) -> Array:
-        """(m,) before reading ``number``."""
-        if not len(self._spots):
-            return self._share[number]
-        return np.asarray(self._share[self._spots[self._next[number]]])
+        Args:
+            before: what was known before a reading.
+            after: what is known after it.
+        """
+        if len(after.until):
+            self._note(after, 1)
+        else:
+            self._note(before, None)
+
+    def _note(self, belief: Belief, count: int | None) -> None:
+        if len(self._how.walking) and len(belief.until[:count]):
+            shares = self._how.unseen(belief, count)
+            self._share.update(zip(belief.until[:count].tolist(), shares, strict=True))
+
+    def shares(self, belief: Belief, observed: Sequence[Observed]) -> list[Array]:
+        """(m,) before each reading; before one that is not of spots that of the next that is.
+
+        Args:
+            belief: what is known after the last.
+            observed: the readings in the order of time.
+        """
+        self._note(belief, None)
+        out, share = [], belief.left
+        for one in reversed(observed):
+            share = self._share.get(one.time, share) if one.spots else share
+            out.append(share)
+        return out[::-1]
 
 
 def _of_nothing(count: int) -> list[tuple[Array, Array]]:
