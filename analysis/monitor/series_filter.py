@@ -34,7 +34,7 @@ from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Step
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
 
-__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Whitened", "of_shifts", "series_of"]
+__all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitened", "of_shifts", "series_of"]
 
 Array = NDArray[np.float64]
 _UNLIKELY = 1e-4
@@ -107,7 +107,7 @@ class Innovation:
 
 
 @dataclass(frozen=True, eq=False)
-class _Track:
+class Track:
     """A filter, and what steps just before each of L readings would do to it.
 
     Attributes:
@@ -121,6 +121,10 @@ class _Track:
     response: Array
     score: Array
     information: Array
+
+    def alone(self) -> Track:
+        """The filter without steps that are looked for."""
+        return replace(self, response=self.response[:0], score=self.score[:0], information=self.information[:0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +162,8 @@ class Belief:
     last: float
     after: Array
     until: Array
-    state: _Track
-    search: _Track | None
+    state: Track
+    search: Track | None
     left: Array
 
     @property
@@ -173,7 +177,7 @@ class Belief:
         return self.state.covariance
 
     @property
-    def looking(self) -> _Track:
+    def looking(self) -> Track:
         """The filter that looks for jumps."""
         return self.state if self.search is None else self.search
 
@@ -283,7 +287,7 @@ class SeriesFilter:
         mean, covariance = self.space.start(time)
         covariance = self._stepped(covariance, -math.inf, time)
         size, q = self.space.size, self._stacked.spots.shape[0]
-        track = _Track(mean, covariance, np.zeros((0, size, q)), np.zeros((0, q)), np.zeros((0, q, q)))
+        track = Track(mean, covariance, np.zeros((0, size, q)), np.zeros((0, q)), np.zeros((0, q, q)))
         empty, left = np.zeros(0), np.ones(len(self.walking))
         return Belief(time, math.nan, empty, empty, track, track if len(left) and self._may else None, left)
 
@@ -298,7 +302,7 @@ class SeriesFilter:
         search = None if belief.search is None else self._moved(belief.search, belief.time, time, None)
         return replace(belief, time=max(time, belief.time), state=state, search=search)
 
-    def _moved(self, track: _Track, then: float, now: float, left: Array | None) -> _Track:
+    def _moved(self, track: Track, then: float, now: float, left: Array | None) -> Track:
         if now <= then:
             return track
         space = self.space
@@ -338,7 +342,7 @@ class SeriesFilter:
         """With a step that is looked for just before a reading; the oldest is given up."""
         start = max(0, len(belief.until) + 1 - self.window)
 
-        def more(track: _Track) -> _Track:
+        def more(track: Track) -> Track:
             q = track.score.shape[1]
             return replace(
                 track,
@@ -376,7 +380,7 @@ class SeriesFilter:
         noise = observed.noise + own @ left[width:, width:] @ own.T
         return own @ values[width:], own @ rows[width:], noise, picked
 
-    def whitened(self, track: _Track, observed: Observed) -> Whitened:
+    def whitened(self, track: Track, observed: Observed) -> Whitened:
         """A reading divided by the root of its covariance.
 
         Args:
@@ -400,7 +404,7 @@ class SeriesFilter:
             expected, spread, root, both[:, 0], both[:, 1 : n + 1], both[:, n + 1 : 2 * n + 1], both[:, 2 * n + 1 :]
         )
 
-    def _taken(self, track: _Track, observed: Observed) -> tuple[_Track, Innovation]:
+    def _taken(self, track: Track, observed: Observed) -> tuple[Track, Innovation]:
         w = self.whitened(track, observed)
         covariance = track.covariance - w.gain.T @ w.gain
         covariance = 0.5 * (covariance + covariance.T)
@@ -412,7 +416,7 @@ class SeriesFilter:
             response = response + w.gain.T @ seen
             score = score + w.white @ seen
             information = information + seen.transpose(0, 2, 1) @ seen
-        taken = _Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
+        taken = Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
         return taken, Innovation(observed, w.expected, w.spread, w.white, log_score)
 
     def unseen(self, belief: Belief, count: int | None = None) -> Array:
@@ -531,7 +535,7 @@ class SeriesFilter:
         return rows @ mean, rows @ covariance @ rows.T + left
 
 
-def _compensated(track: _Track, amounts: Amounts, weight: Array, level: Array, outputs: Array) -> _Track:
+def _compensated(track: Track, amounts: Amounts, weight: Array, level: Array, outputs: Array) -> Track:
     """The filter as if it had known of the jump, averaged over its places; nothing is looked for beside it."""
     moved = level - track.response @ outputs
     each = np.einsum("knr,kr->kn", moved, amounts.mean)
@@ -541,7 +545,7 @@ def _compensated(track: _Track, amounts: Amounts, weight: Array, level: Array, o
     covariance = track.covariance + spread + away.T @ away
     q = track.score.shape[1]
     none = np.zeros((0, len(mean), q)), np.zeros((0, q)), np.zeros((0, q, q))
-    return _Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
+    return Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

@@ -302,7 +302,7 @@ class StateSpace:
     def _rows(self, time: float) -> Array:
         if time not in self._rows_at:
             self._rows_at.clear()
-            rows = self._still.copy()
+            rows = self.basis.copy()
             for block in self._blocks:
                 gain = _gain(block.law, time)
                 if gain != 1.0:
@@ -315,7 +315,8 @@ class StateSpace:
         return {}
 
     @cached_property
-    def _still(self) -> Array:
+    def basis(self) -> Array:
+        """(D + P, n) what the states do where all amplitudes are 1."""
         rows = np.zeros((self.width + self.stated.parameters.shape[0], self.size))
         for block in self._blocks:
             rows[:, block.at.start : block.at.start + block.rank] = block.outputs

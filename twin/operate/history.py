@@ -217,6 +217,45 @@ class History:
             row = connection.execute(select(PLAN).order_by(PLAN.c.id.desc()).limit(1)).mappings().first()
         return None if row is None else {**row, "content": content_of(dict(row))}
 
+    def first(self, kind: str) -> dict[str, Any] | None:
+        """The earliest entry of a kind, as of `entries`; None for none."""
+        c = ENTRY.c
+        query = select(*c).where(c.kind == kind).order_by(c.time_us, c.id).limit(1)
+        with self.reading() as connection:
+            row = connection.execute(query).mappings().first()
+        return None if row is None else dict(row)
+
+    def subjects(self, kind: str) -> list[str]:
+        """Of what there are readings of a kind, in alphabetical order."""
+        query = select(ENTRY.c.subject).where(ENTRY.c.kind == kind).distinct()
+        with self.reading() as connection:
+            return sorted(connection.execute(query).scalars())
+
+    def newest_id(self) -> int:
+        """The largest id of an entry; 0 where there is none."""
+        with self.reading() as connection:
+            return int(connection.execute(select(func.max(ENTRY.c.id))).scalar_one() or 0)
+
+    def checkpoint(
+        self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
+    ) -> Checkpoint | None:
+        """The newest of what was kept of an estimate; None for none.
+
+        Args:
+            plan: as of `save_checkpoint`.
+            number: the one of this number alone; without it none of a negative number.
+            before_us: the newest before this time, microseconds of TAI since 2000.
+            valid: only one up to whose time no reading has come since it was kept.
+        """
+        c, e = CHECKPOINT.c, ENTRY.c
+        query = select(CHECKPOINT).where(c.plan == plan, c.number >= 0 if number is None else c.number == number)
+        query = query if before_us is None else query.where(c.time_us < before_us)
+        if valid:
+            query = query.where(~select(e.id).where(e.id > c.entry_id, e.time_us <= c.time_us).exists())
+        with self.reading() as connection:
+            row = connection.execute(query.order_by(c.time_us.desc(), c.number.desc()).limit(1)).first()
+        return None if row is None else Checkpoint(row.number, row.time_us, row.entry_id, row.content)
+
     def checkpoints(self, plan: str) -> list[Checkpoint]:
         """Where the estimate under a plan stood, in the order of time.
 

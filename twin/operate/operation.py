@@ -1,0 +1,524 @@
+"""The estimate of an instrument's state from its record: now, at any time past and ahead, with its sigma.
+
+A reading changes the estimate with the same work whatever the length of the record: where the estimate stands is kept
+in the record beside the readings, and what comes later goes on from there. What came late begins anew from what was
+kept before it. The result is the same to the bit whenever it is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from analysis.monitor.jump_detection import Jump, Step
+from analysis.monitor.limits import Quantity
+from analysis.monitor.series_following import Untold, smoothed
+from optics.numerics.backend import load_backend
+from optics.numerics.threads import one_blas_thread
+from scenes.specs.operation import OperationSetup
+from scenes.yaml.errors import Problem
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.entries import MICRO, digest_of_data, utc_text
+from twin.operate.history import History, content_of
+from twin.operate.operation_model import OperationModel, traced_model
+from twin.operate.plans import plan_digest
+from twin.operate.standing import Scores, Standing, Taking
+from twin.run.provenance import source_digest
+
+__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState"]
+
+Array = NDArray[np.float64]
+DAY = 86_400 * MICRO
+EVERY = 1000
+"""Readings after which it is kept for good where the estimate stands."""
+_USED = ("monitor", "temperature")
+"""Sorts of entries that change the estimate; events do by what they step."""
+_MODEL, _HEAD = -1, 0
+"""Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Estimate at T times.
+
+    Attributes:
+        times: (T,) microseconds of TAI since 2000.
+        quantities: Q that are read.
+        values: (T, Q) in each one's unit, changes since the calibration.
+        sigmas: (T, Q) their total standard deviations.
+        changes: (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
+        covariance: (T, 4 K, 4 K) of their errors.
+    """
+
+    times: NDArray[np.int64]
+    quantities: tuple[Quantity, ...]
+    values: Array
+    sigmas: Array
+    changes: Array
+    covariance: Array
+
+    @property
+    def utc(self) -> tuple[str, ...]:
+        """The times."""
+        return tuple(utc_text(int(time)) for time in self.times)
+
+    def column(self, group: str, key: str) -> int:
+        """Number of a quantity. Raises ValueError."""
+        return [(one.group, one.key) for one in self.quantities].index((group, key))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: group -> key -> values at all times, with sigmas beside them."""
+        out: dict[str, Any] = {"times_utc": list(self.utc)}
+        for k, one in enumerate(self.quantities):
+            own = out.setdefault(one.group, {})
+            own |= {one.key: self.values[:, k].tolist(), f"{one.key}_sigma": self.sigmas[:, k].tolist()}
+        return out
+
+
+@dataclass(frozen=True)
+class FoundJump:
+    """A jump that was told.
+
+    Attributes:
+        body: that explains it best; rivals: others -> their log likelihood ratio.
+        after_us, until_us: between which readings it came; told_us: at which it was told.
+        sizes: (motion, unit, size, sigma).
+        log_ratio: of the likelihoods with it and without it, when it was told.
+        false_alarm: chance of as large a ratio anywhere in the whole life without a jump, at most.
+    """
+
+    body: str
+    after_us: int
+    until_us: int
+    told_us: int
+    sizes: tuple[tuple[str, str, float, float], ...]
+    log_ratio: float
+    false_alarm: float
+    rivals: Mapping[str, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "body": self.body,
+            "after_utc": utc_text(self.after_us),
+            "until_utc": utc_text(self.until_us),
+            "told_utc": utc_text(self.told_us),
+            "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in self.sizes],
+            "log_ratio": self.log_ratio,
+            "false_alarm": self.false_alarm,
+            "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
+        }
+
+
+@dataclass(frozen=True)
+class SensorState:
+    """What a sensor of temperature is worth.
+
+    Attributes:
+        body: where it is.
+        state: ``ok``, ``dead``, ``stuck`` or ``doubtful``.
+        since_us: since when; last_us: its newest reading.
+        reason: why, empty where it is ok.
+    """
+
+    body: str
+    state: str
+    since_us: int
+    last_us: int
+    reason: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        times = {"since_utc": utc_text(self.since_us), "last_utc": utc_text(self.last_us)}
+        return {"body": self.body, "state": self.state, "reason": self.reason, **times}
+
+
+@dataclass(frozen=True)
+class Break:
+    """A requirement.
+
+    Attributes:
+        quantity: group and key; unit: of its limit.
+        limit: that the size of its change must not exceed; probability: with which.
+        chance_now: that it does now.
+        holds_now: whether that is rare enough.
+        breaks_us: time from which on it is not, within the horizon; None if it does not come.
+    """
+
+    quantity: str
+    unit: str
+    limit: float
+    probability: float
+    chance_now: float
+    holds_now: bool
+    breaks_us: int | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        own = {key: value for key, value in vars(self).items() if key != "breaks_us"}
+        return {**own, "breaks_utc": None if self.breaks_us is None else utc_text(self.breaks_us)}
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Every stated motion at one time.
+
+    Attributes:
+        time: microseconds.
+        labels: M names; units: theirs.
+        mean: (M,) in these units. covariance: (M, M) of their errors.
+    """
+
+    time: int
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """What is known after all readings of a record.
+
+    Attributes:
+        time: of the newest, microseconds.
+        readings: of the monitor that were used.
+        now: the state.
+        scores: of predictions made before each reading came.
+        innovations: (time_us, chi-square, degrees of freedom) of the last readings.
+        jumps: that were told.
+        events: (time_us, name, causes that stepped).
+        sensors: what those of temperature are worth.
+        left_out: (time_us, kind, subject, reason) of the last entries that were not used.
+        explained: quantity -> share of its scatter that temperatures explain.
+        breaks: the requirements.
+    """
+
+    time: int
+    readings: int
+    now: Course
+    scores: Scores
+    innovations: tuple[tuple[int, float, int], ...]
+    jumps: tuple[FoundJump, ...]
+    events: tuple[tuple[int, str, tuple[str, ...]], ...]
+    sensors: tuple[SensorState, ...]
+    left_out: tuple[tuple[int, str, str, str], ...]
+    explained: Mapping[str, float]
+    breaks: tuple[Break, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data."""
+        return {
+            "time_utc": utc_text(self.time),
+            "readings": self.readings,
+            "now": self.now.to_dict(),
+            "scores": vars(self.scores),
+            "innovations": [
+                {"time_utc": utc_text(t), "chi_square": square, "degrees_of_freedom": degrees}
+                for t, square, degrees in self.innovations
+            ],
+            "jumps": [one.to_dict() for one in self.jumps],
+            "events": [{"time_utc": utc_text(t), "name": name, "causes": list(c)} for t, name, c in self.events],
+            "sensors": [one.to_dict() for one in self.sensors],
+            "left_out": [
+                {"time_utc": utc_text(t), "kind": kind, "subject": subject, "reason": reason}
+                for t, kind, subject, reason in self.left_out
+            ],
+            "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
+            "requirements": [one.to_dict() for one in self.breaks],
+        }
+
+
+class Operation:
+    """The estimate of a record under a plan.
+
+    Args:
+        history: the record.
+        plan: with its instrument, that of the record.
+        advance: called with the number of readings that were taken, of how many.
+
+    Raises:
+        Problem: the record has no reading of the monitor.
+        InputError: the plan states what its instrument cannot do.
+    """
+
+    def __init__(
+        self,
+        history: History,
+        plan: OperationSetup,
+        advance: Callable[[int, int], None] = lambda done, of: None,
+    ) -> None:
+        self.history, self.plan, self._advance = history, plan, advance
+        first = history.first("monitor")
+        if first is None:
+            allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
+            raise Problem("no reading of the monitor is in the record", None, allowed)
+        self.epoch = int(first["time_us"])
+        before = [
+            (camera, channel, one["before"])
+            for camera, own in content_of(first)["numbers"]["spots"].items()
+            for channel, one in own.items()
+        ]
+        self._before = {(camera, channel): one for camera, channel, one in before}
+        self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
+        self.key = digest_of_data(
+            [source_digest(), plan_digest(plan), self.epoch, list(self._sensors), [list(one) for one in before]]
+        )
+        """By which it is recognised what an estimate rests on beside the readings."""
+
+    @cached_property
+    def experiment(self) -> MonitorExperiment:
+        """The instrument."""
+        return MonitorExperiment(self.plan.model, load_backend())
+
+    @cached_property
+    def model(self) -> OperationModel:
+        """What was traced; of a record that knows it already it is taken from there."""
+        kept = self.history.checkpoint(self.key, number=_MODEL)
+        if kept is not None:
+            return OperationModel.from_bytes(kept.content)
+        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in self._before.values()])
+        made = traced_model(self.plan, sigma, self._sensors, self.experiment)
+        self.history.save_checkpoint(self.key, _MODEL, -(2**62), 0, made.to_bytes())
+        return made
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """All that is read."""
+        return self.model.quantities
+
+    @cached_property
+    def events(self) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
+        """(time_us, name, causes) of the record's events that step something."""
+        found = ((int(one["time_us"]), str(one["subject"])) for one in self.history.entries("event"))
+        known = self.plan.operation.events
+        return tuple((time, name, tuple(known[name])) for time, name in found if known.get(name))
+
+    @cached_property
+    def _taking(self) -> Taking:
+        causes = self.model.how.stated.causes
+        steps = []
+        for time, _, own in self.events:
+            motions = tuple(k for k, cause in enumerate(causes) if cause in own)
+            steps.append(Step(motions, (((time - self.epoch) / MICRO, 1.0),)))
+        how = replace(self.model.how, steps=tuple(steps))
+        reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
+        return Taking(self.model, how, self.epoch, reference, self.history.temperature)
+
+    def _moments(self, after_us: int | None, until_us: int | None = None) -> Iterator[list[dict[str, Any]]]:
+        """Entries that are used, those of one time together, in the order of time."""
+        own = (one for one in self.history.entries(after_us=after_us, until_us=until_us) if one["kind"] in _USED)
+        for _, together in groupby(own, key=lambda one: int(one["time_us"])):
+            yield [{**one, "content": content_of(one)} for one in together]
+
+    @cached_property
+    def _standing(self) -> Standing:
+        """After all readings."""
+        with one_blas_thread():
+            return self._followed()
+
+    def _followed(self) -> Standing:
+        taking, newest, standing = self._taking, self.history.newest_id(), None
+        kept = self.history.checkpoint(self.key, valid=True)
+        if kept is not None:
+            standing = Standing.from_bytes(kept.content)
+            if not self._fits(standing):
+                self.history.drop_checkpoints(self.key, self.epoch)
+                standing = None
+        moments = list(self._moments(None if standing is None else standing.time))
+        for count, entries in enumerate(moments):
+            if standing is None:
+                standing = taking.start(int(entries[0]["time_us"]))
+            before = standing.scores.readings
+            standing, _ = taking.take(standing, entries)
+            number = standing.scores.readings // EVERY
+            if number > before // EVERY:
+                self._keep(standing, number, newest)
+            self._advance(count + 1, len(moments))
+        assert standing is not None  # there is a reading of the monitor
+        if moments:
+            self._keep(standing, _HEAD, newest)
+        return standing
+
+    def _fits(self, standing: Standing) -> bool:
+        """Whether states that were kept are those of this computer's linear algebra."""
+        own = self._taking.how.space.basis
+        if standing.basis.shape != own.shape:
+            return False
+        return bool(np.all(np.abs(standing.basis - own) <= 1e-9 * np.abs(own).max(axis=1, keepdims=True)))
+
+    def _keep(self, standing: Standing, number: int, newest: int) -> None:
+        self.history.save_checkpoint(self.key, number, standing.time, newest, standing.to_bytes())
+
+    def follow(self) -> Following:
+        """Take all readings that are new, and tell what is known."""
+        standing = self._standing
+        now = self.forecast([standing.time])
+        jumps = tuple(self._found(one.time, one.jump) for one in standing.jumps)
+        sensors = []
+        for one in standing.sensors.values():
+            state, since, reason = one.state(standing.time)
+            sensors.append(SensorState(one.body, state, since, one.last_us, reason))
+        names = [f"{one.group} {one.key}" for one in self.quantities]
+        return Following(
+            standing.time,
+            standing.scores.readings,
+            now,
+            standing.scores,
+            standing.innovations,
+            jumps,
+            self.events,
+            tuple(sorted(sensors, key=lambda one: one.body)),
+            standing.left_out,
+            dict(zip(names, standing.explained.tolist(), strict=True)),
+            self._breaks(),
+        )
+
+    def _found(self, told: int, jump: Jump) -> FoundJump:
+        sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
+        after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
+        return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals)
+
+    def _breaks(self) -> tuple[Break, ...]:
+        operation, start = self.plan.operation, self._standing.time
+        if not operation.requirements:
+            return ()
+        days = max(1, round(operation.horizon * MICRO / DAY))
+        ahead = self.forecast([start + round(k * operation.horizon * MICRO / days) for k in range(days + 1)])
+        out = []
+        for one in operation.requirements:
+            k = ahead.column(one.group, one.key)
+            chance = beyond(ahead.values[:, k], ahead.sigmas[:, k], one.largest)
+            broken = np.flatnonzero(chance > 1.0 - one.probability)
+            breaks = int(ahead.times[broken[0]]) if len(broken) else None
+            unit = self.quantities[k].parameter.unit
+            holds = not (len(broken) and broken[0] == 0)
+            out.append(Break(one.name, unit, one.largest, one.probability, float(chance[0]), holds, breaks))
+        return tuple(out)
+
+    def forecast(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
+        """What is expected at times ahead, by all readings.
+
+        Args:
+            times_us: (T,) microseconds of TAI since 2000, not before the newest reading.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times = np.asarray(times_us, np.int64)
+        if len(times) and times.min() < self._standing.time:
+            allowed = f"times from {utc_text(self._standing.time)} on, that of the newest reading"
+            raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
+        how, belief = self._taking.how, self._standing.belief
+        with one_blas_thread():
+            return self._course(times, [how.parameters(belief, self._taking.seconds(int(time))) for time in times])
+
+    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]]) -> Course:
+        rows = self.model.rows
+        changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
+        covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
+        variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
+        sigmas = np.sqrt(np.maximum(variance, 0.0))
+        return Course(times, self.quantities, changes @ rows.T, sigmas, changes, covariance)
+
+    def smoothed(self, times_us: Sequence[int] | NDArray[np.int64]) -> Course:
+        """What all readings say of times; of those after the newest it is the forecast.
+
+        Args:
+            times_us: (T,) microseconds of TAI since 2000, from the first reading on.
+
+        Raises:
+            Problem: a time before it.
+        """
+        times = np.asarray(times_us, np.int64)
+        return self._course(times, self._past(times, self._taking.how.parameters_of))
+
+    def motions(self, time_us: int) -> Motions:
+        """Every stated motion at one time, by all readings.
+
+        Args:
+            time_us: microseconds of TAI since 2000, from the first reading on.
+
+        Raises:
+            Problem: a time before it.
+        """
+        stated = self.model.how.stated
+        how = replace(self._taking.how, steps=(*self._taking.how.steps, *self._steps(self._standing)))
+        since = self._taking.seconds(self.epoch)
+        found = self._past(
+            np.array([time_us], np.int64),
+            lambda mean, covariance, time: how.motions_of(mean, covariance, time, since),
+        )
+        (mean, spread), size = found[0], stated.sigmas
+        return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
+
+    @staticmethod
+    def _steps(standing: Standing, told_after: int | None = None) -> tuple[Step, ...]:
+        own = (one for one in standing.jumps if told_after is None or one.time > told_after)
+        return tuple(Step.of(one.jump) for one in own)
+
+    def _past(
+        self, times: NDArray[np.int64], each: Callable[[Array, Array, float], tuple[Array, Array]]
+    ) -> list[tuple[Array, Array]]:
+        """What is made of the states at times, by all readings."""
+        taking, last = self._taking, self._standing
+        begin = self._begin()
+        if not len(times):
+            return []
+        if times.min() < begin:
+            allowed = f"times from {utc_text(begin)} on, that of the first reading"
+            raise Problem("a time before all readings", utc_text(int(times.min())), allowed)
+        with one_blas_thread():
+            start = self._before_all(int(times.min()))
+            standing = taking.start(begin) if start is None else start
+            first, left, observed = standing, Untold(taking.how), []
+            for entries in self._moments(None if start is None else start.time):
+                before = standing.belief
+                standing, used = taking.take(standing, entries)
+                observed += used
+                left.take(before, standing.belief)
+            known = replace(
+                taking.how,
+                steps=(*taking.how.steps, *self._steps(last, None if start is None else start.time)),
+                window=0,
+            )
+            belief = replace(first.belief, search=None, after=np.zeros(0), until=np.zeros(0))
+            belief = replace(belief, state=belief.state.alone())
+            shares = left.shares(standing.belief, observed)
+            seconds = [taking.seconds(int(time)) for time in times]
+            return smoothed(known, belief, observed, seconds, shares, each)
+
+    def _begin(self) -> int:
+        first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
+        return first
+
+    def _before_all(self, time: int) -> Standing | None:
+        """The newest that was kept before a time and before all jumps that were told since; None for none."""
+        last = self._standing
+        while True:
+            kept = self.history.checkpoint(self.key, before_us=time, valid=True)
+            if kept is None:
+                return None
+            earlier = [self.epoch + int(one.jump.chances[0][0] * MICRO) for one in last.jumps if one.time > kept.time]
+            if not earlier or min(earlier) >= kept.time:
+                return Standing.from_bytes(kept.content)
+            time = min(earlier)
+
+
+def beyond(value: Array, sigma: Array, limit: float) -> Array:
+    """Chance that the size of something is larger than a limit.
+
+    Args:
+        value: what is expected of it.
+        sigma: its standard deviation, likewise.
+        limit: in the same unit.
+    """
+    scale = np.where(sigma > 0.0, sigma, 1e-300)
+    return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))
