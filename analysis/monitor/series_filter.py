@@ -332,7 +332,7 @@ class SeriesFilter:
         now = replace(now, state=state, search=search, last=last)
         if not (observed.spots and self._may and len(now.until)):
             return now, found
-        now = replace(now, left=self.unseen(now, 1)[0])
+        now = replace(now, left=self._unseen(now))
         jump = self._told(now)
         if jump is not None:
             now, jump = self._jumped(now, jump)
@@ -419,18 +419,15 @@ class SeriesFilter:
         taken = Track(track.mean + w.gain.T @ w.white, covariance, response, score, information)
         return taken, Innovation(observed, w.expected, w.spread, w.white, log_score)
 
-    def unseen(self, belief: Belief, count: int | None = None) -> Array:
-        """(L, m) what share of the mean square of jumps is of those that cannot be told, before each reading.
-
-        Args:
-            belief: so far, with what is known of each step.
-            count: of the oldest steps; all by default.
+    def _unseen(self, belief: Belief) -> Array:
+        """(m,) what share of the mean square of jumps is of those that cannot be told, by what is known of the oldest
+        step that is looked for.
         """
-        information, between = belief.looking.information[:count], belief.until[:count] - belief.after[:count]
+        information, between = belief.looking.information[0], belief.until[0] - belief.after[0]
         column = self._stacked.spots[:, self.walking]
-        seen = np.sqrt(np.maximum(np.einsum("qm,kqr,rm->km", column, information, column), 0.0))
-        limit = np.sqrt(limit_of(self.stated.jump_false_alarm / self.looks(between), 1))
-        return np.asarray(ndtr(limit[:, None, None] - _SIZES * seen[..., None]) @ _MEAN_SQUARE)
+        seen = np.sqrt(np.maximum(np.einsum("qm,qr,rm->m", column, information, column), 0.0))
+        limit = math.sqrt(float(limit_of(self.stated.jump_false_alarm / self.looks(between), 1)))
+        return np.asarray(ndtr(limit - _SIZES * seen[:, None]) @ _MEAN_SQUARE)
 
     def _told(self, belief: Belief) -> Jump | None:
         """The likeliest jump, if chance does not explain it."""

@@ -18,7 +18,7 @@ from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Whitened, series_of
 from analysis.monitor.series_smoother import SeriesChanges
 
-__all__ = ["Followed", "Untold", "follow", "smoothed"]
+__all__ = ["Followed", "follow", "smoothed"]
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -66,68 +66,23 @@ def follow(
     order = np.argsort(times, kind="stable")
     belief, filtered = how.start(earliest), _of_nothing(len(times))
     innovations: list[Innovation] = []
-    left = Untold(how)
+    left: list[Array] = []
     ahead = 0
     for k, one in enumerate(observed):
         while ahead < len(order) and times[order[ahead]] < one.time:
             filtered[order[ahead]] = how.parameters(belief, times[order[ahead]])
             ahead += 1
-        before = belief
+        left.append(belief.left)
         belief, found = how.update(belief, one)
-        left.take(before, belief)
         innovations.append(found)
         advance(k + 1)
     for k in order[ahead:]:
         filtered[k] = how.parameters(belief, times[k])
     jumps = tuple(one.jump for one in innovations if one.jump is not None)
     knowing = replace(how, steps=(*how.steps, *map(Step.of, jumps)), window=0)
-    shares = left.shares(belief, observed)
-    late = smoothed(knowing, knowing.start(earliest), observed, times, shares, knowing.parameters_of)
+    late = smoothed(knowing, knowing.start(earliest), observed, times, left, knowing.parameters_of)
     width = how.stated.parameters.shape[0]
     return Followed(series_of(filtered, width), series_of(late, width), tuple(innovations), jumps, belief)
-
-
-class Untold:
-    """What share of the mean square of jumps before each reading cannot be told, once all is known that will be.
-
-    Args:
-        how: the filter.
-    """
-
-    def __init__(self, how: SeriesFilter) -> None:
-        self._how = how
-        self._share: dict[float, Array] = {}
-
-    def take(self, before: Belief, after: Belief) -> None:
-        """Keep it of the oldest step that is looked for, and of all where the search began anew.
-
-        Args:
-            before: what was known before a reading.
-            after: what is known after it.
-        """
-        if len(after.until):
-            self._note(after, 1)
-        else:
-            self._note(before, None)
-
-    def _note(self, belief: Belief, count: int | None) -> None:
-        if len(self._how.walking) and len(belief.until[:count]):
-            shares = self._how.unseen(belief, count)
-            self._share.update(zip(belief.until[:count].tolist(), shares, strict=True))
-
-    def shares(self, belief: Belief, observed: Sequence[Observed]) -> list[Array]:
-        """(m,) before each reading; before one that is not of spots that of the next that is.
-
-        Args:
-            belief: what is known after the last.
-            observed: the readings in the order of time.
-        """
-        self._note(belief, None)
-        out, share = [], belief.left
-        for one in reversed(observed):
-            share = self._share.get(one.time, share) if one.spots else share
-            out.append(share)
-        return out[::-1]
 
 
 def _of_nothing(count: int) -> list[tuple[Array, Array]]:
@@ -149,7 +104,8 @@ def smoothed(
         start: what is known before the first reading.
         observed: N readings in the order of time.
         wanted: (T,) times, seconds, in any order, none before ``start``.
-        left: N times (m,) what share of the mean square of jumps cannot be told, before each reading.
+        left: N times (m,) what share of the mean square of jumps could not be told, as the filter had it before each
+            reading: the process is then the filter's, and a part of a series gives what the whole gives.
         each: (n,) mean and (n, n) covariance of the states at a wanted time, and the time -> what is made of them.
     """
     times = np.asarray(wanted, np.float64)

@@ -1,6 +1,5 @@
 """Records of an instrument whose motions are drawn by the stated laws and move spots as they are computed to."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,9 +70,7 @@ def drawn(law: TimeLaw, times: np.ndarray, rng: np.random.Generator) -> np.ndarr
     return np.linalg.cholesky(covariance) @ rng.standard_normal(len(times)) if not law.jump else np.zeros(len(times))
 
 
-def life_of(
-    stated: Disturbances, days: float, every: float, seed: int, slips: dict[float, dict[int, float]]
-) -> Life:
+def life_of(stated: Disturbances, days: float, every: float, seed: int, slips: dict[float, dict[int, float]]) -> Life:
     """Motions by their laws, and slips: day -> motion -> amount."""
     rng = np.random.default_rng(seed)
     seconds = np.arange(0.0, days, every) * DAY

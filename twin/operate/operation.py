@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_following import Untold, smoothed
+from analysis.monitor.series_following import smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.operation import OperationSetup
@@ -478,12 +478,11 @@ class Operation:
         with one_blas_thread():
             start = self._before_all(int(times.min()))
             standing = taking.start(begin) if start is None else start
-            first, left, observed = standing, Untold(taking.how), []
+            first, left, observed = standing, [], []
             for entries in self._moments(None if start is None else start.time):
-                before = standing.belief
                 standing, used = taking.take(standing, entries)
-                observed += used
-                left.take(before, standing.belief)
+                observed += [one for one, _ in used]
+                left += [share for _, share in used]
             known = replace(
                 taking.how,
                 steps=(*taking.how.steps, *self._steps(last, None if start is None else start.time)),
@@ -491,9 +490,8 @@ class Operation:
             )
             belief = replace(first.belief, search=None, after=np.zeros(0), until=np.zeros(0))
             belief = replace(belief, state=belief.state.alone())
-            shares = left.shares(standing.belief, observed)
             seconds = [taking.seconds(int(time)) for time in times]
-            return smoothed(known, belief, observed, seconds, shares, each)
+            return smoothed(known, belief, observed, seconds, left, each)
 
     def _begin(self) -> int:
         first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)

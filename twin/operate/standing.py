@@ -77,7 +77,7 @@ class Sensor:
             since_us=self.since_us if again else time,
             step=step,
             sigma=sigma,
-            stuck=repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE,
+            stuck=bool(repeats >= 3 and alike**repeats * max(self.readings, 1) < CHANCE),
         )
 
     def judged(self, far: bool) -> Sensor:
@@ -250,7 +250,8 @@ class Standing:
 def _jump(plain: dict[str, Any]) -> Jump:
     lists = ("motions", "labels", "units", "sizes", "sigmas")
     chances = tuple((time, chance) for time, chance in plain["chances"])
-    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, "chances": chances})
+    rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
+    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, "chances": chances, "rivals": rivals})
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,23 +285,27 @@ class Taking:
         spread = np.zeros((4, len(self.model.quantities)))
         return Standing(self.how.start(self.seconds(time)), time, spread=spread, basis=self.how.space.basis)
 
-    def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> tuple[Standing, list[Observed]]:
-        """All entries of one moment; what of them was used.
+    def take(
+        self, standing: Standing, entries: Sequence[Mapping[str, Any]]
+    ) -> tuple[Standing, list[tuple[Observed, Array]]]:
+        """All entries of one moment; what of them was used, with what share of jumps could not be told before it.
 
         Args:
             standing: before.
             entries: of one time, each with its content as plain data.
         """
-        used: list[Observed] = []
+        used: list[tuple[Observed, Array]] = []
         standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
         warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
         for one in warm:
+            left = standing.belief.left
             standing, observed = self._temperature(standing, one)
-            used += [] if observed is None else [observed]
+            used += [] if observed is None else [(observed, left)]
         for one in entries:
             if one["kind"] == "monitor":
+                left = standing.belief.left
                 standing, observed = self._monitor(standing, one)
-                used += [] if observed is None else [observed]
+                used += [] if observed is None else [(observed, left)]
         return standing, used
 
     def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> tuple[Standing, Observed | None]:

@@ -1,0 +1,222 @@
+"""The estimate of a record: it covers drawn lives, does not depend on how and when readings came, and tells what its
+sensors are worth.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from scenes.yaml.errors import Problem
+from tests.twin.operation_records import (
+    DAY,
+    NOISE,
+    START,
+    Life,
+    given,
+    life_of,
+    monitor_entry,
+    plan_of,
+    record_of,
+    temperature_entry,
+)
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate import operation as operation_module
+from twin.operate.entries import MICRO, Entry
+from twin.operate.operation import Operation, beyond
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory, backend):
+    """A plan, its instrument and what is stated to move."""
+    plan = plan_of(tmp_path_factory.mktemp("plan"))
+    experiment = MonitorExperiment(plan.model, backend)
+    return plan, experiment, experiment.disturbances
+
+
+def entries_of(known, life: Life, seed: int, factor: float = 1.0, sensor=lambda body, k, kelvin: kelvin) -> list[Entry]:
+    """All that the instrument sends down.
+
+    Args:
+        known: the fixture.
+        life: its own.
+        seed: of the noise.
+        factor: of what heat really does over the computed: sensors read as much less.
+        sensor: what a sensor says of what it should say; None for nothing.
+    """
+    _, experiment, stated = known
+    rng = np.random.default_rng([seed, 7])
+    out = []
+    for k, time in enumerate(life.times.tolist()):
+        for m, label in enumerate(stated.labels):
+            if label.endswith(" temperature"):
+                body = stated.bodies[m]
+                kelvin = 293.15 + life.motions[k, m] / factor + 0.05 * rng.normal()
+                told = sensor(body, k, kelvin)
+                out += [] if told is None else [temperature_entry(body, time, told)]
+        out.append(monitor_entry(experiment, stated, life, k, seed))
+    return out
+
+
+def followed(known, folder, entries: list[Entry], name: str = "record") -> Operation:
+    history = record_of(folder / name, known[0])
+    taken = history.take(given(name, entries))
+    assert not taken.refused
+    return Operation(history, known[0])
+
+
+def test_the_instrument_is_as_warm_as_the_records_say(known) -> None:
+    assert known[1].resolved.instrument.temperature == 293.15
+
+
+def test_drawn_lives_are_covered(known, tmp_path) -> None:
+    """Eight lives of 40 readings without a slip: the intersection angle, principal distances and turns, now, smoothed
+    and 30 days ahead, counted within one and two sigma; lives are independent, times within one are not, so that the
+    limit is that of one time of each life and quantity.
+    """
+    stated = known[2]
+    inside: dict[str, list[np.ndarray]] = {"now": [], "smoothed": [], "ahead": []}
+    for seed in range(8):
+        life = life_of(stated, 150.0, 3.0, seed, {})
+        until = replace(life, times=life.times[:40], motions=life.motions[:40], changes=life.changes[:40])
+        estimate = followed(known, tmp_path, entries_of(known, until, seed), f"life{seed}")
+        last = int(until.times[-1])
+        for name, course, k in (
+            ("now", estimate.forecast([last]), 39),
+            ("smoothed", estimate.smoothed([int(until.times[20])]), 20),
+            ("ahead", estimate.forecast([int(life.times[49])]), 49),
+        ):
+            rows = estimate.model.rows
+            wrong = (course.values[0] - rows @ life.changes[k]) / course.sigmas[0]
+            inside[name].append(wrong)
+    for name, wrong in inside.items():
+        ratio = np.abs(np.array(wrong))
+        count = len(ratio)
+        for limit, share in ((1.0, 0.683), (2.0, 0.954)):
+            # of any one quantity not fewer than by chance once in ten thousand times
+            assert np.all((ratio < limit).sum(axis=0) >= binom.ppf(1e-4, count, share)), (name, limit)
+        assert np.all(ratio < 6.0), name
+
+
+def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> None:
+    """One by one with the estimate asked for in between, all at once, or some late: the same to the bit."""
+    plan, _, stated = known
+    monkeypatch.setattr(operation_module, "EVERY", 5)
+    life = life_of(stated, 60.0, 3.0, 3, {})
+    entries = entries_of(known, life, 3)
+    whole = followed(known, tmp_path, entries, "whole")
+    result, past = whole.follow().to_dict(), whole.smoothed(life.times).to_dict()
+    history = record_of(tmp_path / "pieces", plan)
+    for k in range(0, len(entries), 7):
+        history.take(given(f"piece{k}", entries[k : k + 7]))
+        if any(one.kind == "monitor" for one in entries[: k + 7]):
+            Operation(history, plan).follow()
+    assert Operation(history, plan).follow().to_dict() == result
+    assert Operation(history, plan).smoothed(life.times).to_dict() == past
+    history = record_of(tmp_path / "late", plan)
+    late = [one for k, one in enumerate(entries) if k % 9 == 4]
+    history.take(given("first", [one for one in entries if one not in late]))
+    Operation(history, plan).follow()
+    history.take(given("late", late), late=True)
+    assert Operation(history, plan).follow().to_dict() == result
+
+
+def test_a_part_of_the_past_is_that_of_the_whole(known, tmp_path, monkeypatch) -> None:
+    """From where the estimate stood before it, and from the beginning, with a slip in between and one before."""
+    stated = known[2]
+    monkeypatch.setattr(operation_module, "EVERY", 5)
+    slip = next(k for k, label in enumerate(stated.labels) if "forward/M2 shift z" in label)
+    life = life_of(stated, 120.0, 3.0, 4, {30.0: {slip: 4.0}, 80.0: {slip: -5.0}})
+    estimate = followed(known, tmp_path, entries_of(known, life, 4))
+    assert len(estimate.follow().jumps) == 2
+    whole = estimate.smoothed(life.times)
+    for k in (5, 12, 25, 35, 39):
+        part = estimate.smoothed(life.times[k : k + 1])
+        assert np.all(np.abs(part.values[0] - whole.values[k]) < 1e-6 * whole.sigmas[k])
+        assert np.allclose(part.sigmas[0], whole.sigmas[k], rtol=1e-6)
+
+
+def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:
+    stated = known[2]
+    slip = next(k for k, label in enumerate(stated.labels) if "backward/M2 shift z" in label)
+    life = life_of(stated, 120.0, 3.0, 5, {60.0: {slip: 4.0}})
+    estimate = followed(known, tmp_path, entries_of(known, life, 5))
+    (jump,) = estimate.follow().jumps
+    assert "base/backward/" in jump.body
+    assert jump.after_us < START + 60 * DAY * MICRO <= jump.until_us
+    course = estimate.smoothed(life.times)
+    wrong = np.abs(course.values - life.changes @ estimate.model.rows.T) / course.sigmas
+    assert np.all(wrong[[18, 19, 20, 21, 22]] < 5.0)
+
+
+def test_an_event_steps_what_the_plan_says(known, tmp_path) -> None:
+    """A slip at a known event is no alarm, and sigma before it is that of a life without."""
+    stated = known[2]
+    slip = next(k for k, label in enumerate(stated.labels) if "forward/M3 shift y" in label)
+    life = life_of(stated, 60.0, 3.0, 6, {31.0: {slip: 1.5}})
+    event = Entry("event", "safe_mode", START + 31 * int(DAY) * MICRO, {}, None)
+    estimate = followed(known, tmp_path, [*entries_of(known, life, 6), event])
+    told = estimate.follow()
+    assert told.jumps == ()
+    assert [(name, causes) for _, name, causes in told.events] == [("safe_mode", ("settling",))]
+    course = estimate.smoothed(life.times)
+    wrong = np.abs(course.values - life.changes @ estimate.model.rows.T) / course.sigmas
+    assert np.all(wrong < 5.0)
+
+
+def test_sensors_that_die_or_repeat_themselves_are_named(known, tmp_path) -> None:
+    """What heat does is 1.3 times the computed, one of two sensors dies, the other sticks: sigma covers."""
+    stated = known[2]
+    life = life_of(stated, 180.0, 3.0, 8, {})
+    stuck: dict[str, float] = {}
+
+    def sensor(body: str, k: int, kelvin: float) -> float | None:
+        if body == "base/forward":
+            return kelvin if k < 20 else None
+        return kelvin if k < 30 else stuck.setdefault(body, kelvin)
+
+    estimate = followed(known, tmp_path, entries_of(known, life, 8, 1.3, sensor))
+    told = estimate.follow()
+    states = {one.body: one for one in told.sensors}
+    assert states["base/forward"].state == "dead"
+    assert states["base/backward"].state == "stuck"
+    assert states["base/backward"].since_us == int(life.times[30])
+    assert states["base/forward"].last_us == int(life.times[19])
+    assert {(kind, subject) for _, kind, subject, _ in told.left_out} == {("temperature", "base/backward")}
+    course = estimate.smoothed(life.times)
+    wrong = np.abs(course.values - life.changes @ estimate.model.rows.T) / course.sigmas
+    assert np.all(wrong < 6.0)
+
+
+def test_a_requirement_that_is_going_to_break(known, tmp_path) -> None:
+    stated = known[2]
+    life = life_of(stated, 60.0, 3.0, 9, {})
+    estimate = followed(known, tmp_path, entries_of(known, life, 9))
+    (found,) = estimate.follow().breaks
+    assert (found.quantity, found.unit, found.limit) == ("intersection_angle change_arcsec", "arcsec", 30.0)
+    now, column = estimate.follow().now, estimate.forecast([]).column("intersection_angle", "change_arcsec")
+    chance = beyond(now.values[0, column], now.sigmas[0, column], 30.0)
+    assert found.chance_now == pytest.approx(float(chance))
+    tight = known[0].operation.requirements[0].model_copy(update={"limit": "1 mas"})
+    plan = known[0].model_copy(update={"operation": known[0].operation.model_copy(update={"requirements": (tight,)})})
+    (found,) = Operation(estimate.history, plan).follow().breaks
+    assert not found.holds_now
+    assert found.breaks_us == int(life.times[-1])
+
+
+def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
+    stated = known[2]
+    estimate = followed(known, tmp_path, entries_of(known, life_of(stated, 12.0, 3.0, 1, {}), 1))
+    with pytest.raises(Problem, match="a time before all readings"):
+        estimate.smoothed([START - MICRO])
+    with pytest.raises(Problem, match="a forecast of what is past"):
+        estimate.forecast([START])
+    history = record_of(tmp_path / "empty", known[0])
+    with pytest.raises(Problem, match="no reading of the monitor"):
+        Operation(history, known[0])
+
+
+def test_noise_is_what_the_records_say() -> None:
+    """So that the counts above can fail."""
+    assert NOISE > 0.0
