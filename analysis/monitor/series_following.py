@@ -129,18 +129,21 @@ def smoothed(
         for number in reversed(range(first, last)):
             before, whitened = steps[number - first]
             now = observed[number].time
-            # across the reading; the short form, in which N's own terms cancel, is not stable
-            kept = np.eye(size) - whitened.gain.T @ whitened.rows
-            known = kept.T @ known @ kept + whitened.rows.T @ whitened.rows
-            carried = kept.T @ carried + whitened.rows.T @ whitened.white
+            # across the reading: (1 - KH)' N (1 - KH) + H' S^-1 H, in the form that stays symmetric to the bit; others
+            # of as little work lose N to rounding
+            away = whitened.gain @ known
+            half = away - 0.5 * (np.eye(len(away)) + away @ whitened.gain.T) @ whitened.rows
+            change = whitened.rows.T @ half
+            known = known - (change + change.T)
+            carried = carried + whitened.rows.T @ (whitened.white - whitened.gain @ carried)
             for k in order[behind == number]:
                 there = how.at(before, times[k])
                 back = moved(carried[:, None], times[k], now, back=True)[:, 0]
-                both = moved(moved(known, times[k], now, back=True).T, times[k], now, back=True)
+                both = how.space.moved_both(known, times[k], now, back=True)
                 gained = there.covariance @ both @ there.covariance
                 out[int(k)] = each(there.mean + there.covariance @ back, there.covariance - gained, float(times[k]))
             carried = moved(carried[:, None], before.time, now, back=True)[:, 0]
-            known = moved(moved(known, before.time, now, back=True).T, before.time, now, back=True)
+            known = how.space.moved_both(known, before.time, now, back=True)
     return [out[k] for k in range(len(times))]
 
 

@@ -30,6 +30,8 @@ from analysis.monitor.disturbances import Disturbances, TimeLaw
 __all__ = ["HeatInputs", "StateSpace"]
 
 Array = NDArray[np.float64]
+_INTERVALS = 200
+"""Between readings, of which the transitions are kept."""
 _NOTHING = 1e-12
 """Of the largest singular value of outputs that are scaled to each other, below which nothing but rounding is left."""
 
@@ -246,13 +248,39 @@ class StateSpace:
             out[..., sine, :] = s * first + c * second
         return out
 
+    def moved_both(self, square: Array, then: float, now: float, back: bool = False) -> Array:
+        """A covariance, or anything that goes on as one, at another time; (n, n), symmetric to the bit if it is now.
+
+        Args:
+            square: (n, n).
+            then: its time, seconds.
+            now: the later one.
+            back: as of `moved`.
+        """
+        if now == then:
+            return square
+        kept, turned = self._transition(now - then)
+        if not turned:
+            return np.asarray(square * (kept[:, None] * kept))
+        out = self.moved(self.moved(square, then, now, back).T, then, now, back)
+        return np.asarray(0.5 * (out + out.T))
+
     def _transition(self, over: float) -> tuple[Array, list[tuple[slice, slice, float]]]:
-        kept, turned = np.ones(self.size), []
-        for block in self._blocks:
-            kept[block.at] = _kept(block.law, over)
-            if block.law.period_s is not None:
-                turned.append((*_halves(block.at), 2.0 * math.pi * over / block.law.period_s))
-        return kept, turned
+        if over not in self._transitions:
+            if len(self._transitions) > _INTERVALS:
+                self._transitions.clear()
+            kept, turned = np.ones(self.size), []
+            for block in self._blocks:
+                kept[block.at] = _kept(block.law, over)
+                if block.law.period_s is not None:
+                    turned.append((*_halves(block.at), 2.0 * math.pi * over / block.law.period_s))
+            self._transitions[over] = kept, turned
+        return self._transitions[over]
+
+    @cached_property
+    def _transitions(self) -> dict[float, tuple[Array, list[tuple[slice, slice, float]]]]:
+        """Those of the last intervals: readings mostly come at the same few."""
+        return {}
 
     def spread(self, covariance: Array, then: float, now: float) -> Array:
         """(n, n) covariance of states at a later time, with what has been added since.
@@ -264,8 +292,7 @@ class StateSpace:
         """
         if now == then:
             return covariance
-        out = self.moved(covariance, then, now)
-        out = self.moved(out.T.copy(), then, now)
+        out = self.moved_both(covariance, then, now).copy()
         for block in self._blocks:
             gained = _variance(block.law, now) - _kept(block.law, now - then) ** 2 * _variance(block.law, then)
             if gained > 0.0:

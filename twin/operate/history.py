@@ -243,12 +243,13 @@ class History:
 
         Args:
             plan: as of `save_checkpoint`.
-            number: the one of this number alone; without it none of a negative number.
+            number: the one of this number alone; without it none of a negative number, and where a time is asked for
+                none of number 0, which is not kept for good.
             before_us: the newest before this time, microseconds of TAI since 2000.
             valid: only one up to whose time no reading has come since it was kept.
         """
         c, e = CHECKPOINT.c, ENTRY.c
-        query = select(CHECKPOINT).where(c.plan == plan, c.number >= 0 if number is None else c.number == number)
+        query = select(CHECKPOINT).where(c.plan == plan, _numbered(number, before_us))
         query = query if before_us is None else query.where(c.time_us < before_us)
         if valid:
             query = query.where(~select(e.id).where(e.id > c.entry_id, e.time_us <= c.time_us).exists())
@@ -356,6 +357,13 @@ class History:
                 raise Problem(text, None, "an alarm is acknowledged once")
             row = {"alarm_id": alarm, "by": by, "note": note, "acknowledged_utc": utc_text(now())}
             connection.execute(insert(ACKNOWLEDGEMENT).values(**row))
+
+
+def _numbered(number: int | None, before_us: int | None) -> Any:
+    c = CHECKPOINT.c
+    if number is not None:
+        return c.number == number
+    return c.number >= 0 if before_us is None else c.number > 0
 
 
 def content_of(row: Mapping[str, Any]) -> Any:

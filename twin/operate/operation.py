@@ -329,6 +329,8 @@ class Operation:
         kept = self.history.checkpoint(self.key, valid=True)
         if kept is not None:
             standing = Standing.from_bytes(kept.content)
+            if kept.number > _HEAD:  # what was used up to then is kept with it
+                standing = standing.anew()
             if not self._fits(standing):
                 self.history.drop_checkpoints(self.key, self.epoch)
                 standing = None
@@ -337,10 +339,11 @@ class Operation:
             if standing is None:
                 standing = taking.start(int(entries[0]["time_us"]))
             before = standing.scores.readings
-            standing, _ = taking.take(standing, entries)
+            standing = taking.take(standing, entries)
             number = standing.scores.readings // EVERY
             if number > before // EVERY:
                 self._keep(standing, number, newest)
+                standing = standing.anew()
             self._advance(count + 1, len(moments))
         assert standing is not None  # there is a reading of the monitor
         if moments:
@@ -477,29 +480,41 @@ class Operation:
             raise Problem("a time before all readings", utc_text(int(times.min())), allowed)
         with one_blas_thread():
             start = self._before_all(int(times.min()))
-            standing = taking.start(begin) if start is None else start
-            first, left, observed = standing, [], []
-            for entries in self._moments(None if start is None else start.time):
-                standing, used = taking.take(standing, entries)
-                observed += [one for one, _ in used]
-                left += [share for _, share in used]
-            known = replace(
-                taking.how,
-                steps=(*taking.how.steps, *self._steps(last, None if start is None else start.time)),
-                window=0,
+            told = None if start is None else start.time
+            steps = (*taking.how.steps, *self._steps(last, told))
+            used, left = self._used(told)
+            entries = {int(one["id"]): one for together in self._moments(told) for one in together}
+            observed = [taking.observed(entries[number]) for number in used.tolist()]
+            belief = (taking.start(begin) if start is None else start).belief
+            belief = replace(
+                belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
             )
-            belief = replace(first.belief, search=None, after=np.zeros(0), until=np.zeros(0))
-            belief = replace(belief, state=belief.state.alone())
             seconds = [taking.seconds(int(time)) for time in times]
-            return smoothed(known, belief, observed, seconds, left, each)
+            return smoothed(replace(taking.how, steps=steps, window=0), belief, observed, seconds, list(left), each)
+
+    def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
+        """Ids of the entries that were used after a time at which the estimate was kept, and what could not be told then."""
+        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
+        spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
+        if after_us is None or self._standing.time > after_us:
+            spans.append(self._standing)
+        if not spans:
+            return np.zeros(0, np.int64), np.zeros((0, len(self._taking.how.walking)))
+        width = len(self._taking.how.walking)
+        left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
+        return np.concatenate([one.used for one in spans]), left
 
     def _begin(self) -> int:
         first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
         return first
 
     def _before_all(self, time: int) -> Standing | None:
-        """The newest that was kept before a time and before all jumps that were told since; None for none."""
+        """The newest that was kept for good before a time and before all jumps that were told since, or what stands now
+        for what is ahead; None for none.
+        """
         last = self._standing
+        if time >= last.time:
+            return last
         while True:
             kept = self.history.checkpoint(self.key, before_us=time, valid=True)
             if kept is None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from analysis.monitor.jump_detection import Jump
-from analysis.monitor.series_filter import Belief, Observed, SeriesFilter, Track
+from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Track
 from twin.operate.entries import MICRO
 from twin.operate.operation_model import OperationModel, packed, unpacked
 
@@ -165,6 +165,8 @@ class Standing:
             of that one's square; see `explained`.
         basis: (D + P, n) what the states do, by which it is seen that they are the states of this computer's linear
             algebra.
+        used: (U,) ids of the entries that were used since it was last kept for good, in their order.
+        left: (U, m) what share of the mean square of jumps could not be told before each of them.
     """
 
     belief: Belief
@@ -176,6 +178,8 @@ class Standing:
     left_out: tuple[tuple[int, str, str, str], ...] = ()
     spread: Array = field(default_factory=lambda: np.zeros((4, 0)))
     basis: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    left: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def explained(self) -> Array:
@@ -196,6 +200,10 @@ class Standing:
             self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
         )
 
+    def anew(self) -> Standing:
+        """The same, counting what is used from now on."""
+        return replace(self, used=self.used[:0], left=self.left[:0])
+
     def to_bytes(self) -> bytes:
         """All of it."""
         own = self.belief
@@ -205,6 +213,8 @@ class Standing:
             "left": own.left,
             "spread": self.spread,
             "basis": self.basis,
+            "used": self.used,
+            "span": self.left,
         }
         for name, track in (("state", own.state), ("search", own.search)):
             if track is not None:
@@ -244,6 +254,8 @@ class Standing:
             tuple((time, kind, subject, reason) for time, kind, subject, reason in plain["left_out"]),
             arrays["spread"],
             arrays["basis"],
+            arrays["used"],
+            arrays["span"],
         )
 
 
@@ -285,73 +297,79 @@ class Taking:
         spread = np.zeros((4, len(self.model.quantities)))
         return Standing(self.how.start(self.seconds(time)), time, spread=spread, basis=self.how.space.basis)
 
-    def take(
-        self, standing: Standing, entries: Sequence[Mapping[str, Any]]
-    ) -> tuple[Standing, list[tuple[Observed, Array]]]:
-        """All entries of one moment; what of them was used, with what share of jumps could not be told before it.
+    def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> Standing:
+        """All entries of one moment.
 
         Args:
             standing: before.
             entries: of one time, each with its content as plain data.
         """
-        used: list[tuple[Observed, Array]] = []
         standing = replace(standing, time=max(standing.time, int(entries[0]["time_us"])))
         warm = sorted((one for one in entries if one["kind"] == "temperature"), key=lambda one: str(one["subject"]))
         for one in warm:
-            left = standing.belief.left
-            standing, observed = self._temperature(standing, one)
-            used += [] if observed is None else [(observed, left)]
+            standing = self._temperature(standing, one)
         for one in entries:
             if one["kind"] == "monitor":
-                left = standing.belief.left
-                standing, observed = self._monitor(standing, one)
-                used += [] if observed is None else [(observed, left)]
-        return standing, used
+                standing = self._monitor(standing, one)
+        return standing
 
-    def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> tuple[Standing, Observed | None]:
+    def observed(self, entry: Mapping[str, Any]) -> Observed:
+        """What an entry that is used says.
+
+        Args:
+            entry: of the monitor, or of a sensor that the filter knows.
+        """
+        time, content = self.seconds(int(entry["time_us"])), entry["content"]
+        if entry["kind"] == "temperature":
+            assert self.how.heat is not None
+            number = self.how.heat.sensors.index(str(entry["subject"]))
+            value, noise = np.array([float(content["values"][0]) - self.temperature]), float(content["sigma"]) ** 2
+            return Observed(time, value, np.array([[noise]]), (number,))
+        spots = content["numbers"]["spots"]
+        found = [spots[camera][channel]["after"] for camera, channel in self.model.spots]
+        place = np.array([(one["row"], one["column"]) for one in found])
+        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in found])
+        return Observed(time, (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
+
+    def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
+        belief, found = self.how.update(standing.belief, observed)
+        used = np.append(standing.used, np.int64(entry["id"]))
+        left = np.concatenate([standing.left.reshape(-1, len(self.how.walking)), standing.belief.left[None]])
+        return replace(standing, belief=belief, used=used, left=left), found
+
+    def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
         time, body, content = int(entry["time_us"]), str(entry["subject"]), entry["content"]
-        value, sigma = float(content["values"][0]), float(content["sigma"])
-        sensor = standing.sensors.get(body, Sensor(body)).came(time, value, sigma)
+        sensor = standing.sensors.get(body, Sensor(body)).came(
+            time, float(content["values"][0]), float(content["sigma"])
+        )
         standing = replace(standing, sensors={**standing.sensors, body: sensor})
-        heat = self.how.heat
-        if heat is None or body not in heat.sensors:
-            return standing.without(time, "temperature", body, "nothing is stated of its temperature"), None
+        if self.how.heat is None or body not in self.how.heat.sensors:
+            return standing.without(time, "temperature", body, "nothing is stated of its temperature")
         if sensor.stuck:
-            return standing.without(time, "temperature", body, "its sensor repeats itself"), None
-        number = heat.sensors.index(body)
-        observed = Observed(self.seconds(time), np.array([value - self.temperature]), np.array([[sigma**2]]), (number,))
+            return standing.without(time, "temperature", body, "its sensor repeats itself")
+        observed = self.observed(entry)
         there = self.how.at(standing.belief, observed.time)
         white = float(self.how.whitened(there.state, observed).white[0])
         far = abs(white) > FAR
         standing = replace(standing, sensors={**standing.sensors, body: sensor.judged(far)})
         if far:
             reason = f"{abs(white):.3g} standard deviations from what was expected"
-            return standing.without(time, "temperature", body, reason), None
-        belief, _ = self.how.update(standing.belief, observed)
-        return replace(standing, belief=belief), observed
+            return standing.without(time, "temperature", body, reason)
+        return self._updated(standing, entry, observed)[0]
 
-    def _monitor(self, standing: Standing, entry: Mapping[str, Any]) -> tuple[Standing, Observed | None]:
-        time, numbers = int(entry["time_us"]), entry["content"]["numbers"]
-        if numbers.get("sigma_holds") is False:
-            return standing.without(time, "monitor", "monitor", "its own sigma does not hold"), None
-        found = [numbers["spots"][camera][channel]["after"] for camera, channel in self.model.spots]
-        place = np.array([(one["row"], one["column"]) for one in found])
-        sigma = np.array([(one["row_sigma"], one["column_sigma"]) for one in found])
-        observed = Observed(self.seconds(time), (place - self.reference).ravel(), np.diag(sigma.ravel() ** 2))
-        belief, found_it = self.how.update(standing.belief, observed)
-        jumps = standing.jumps if found_it.jump is None else (*standing.jumps, Told(time, found_it.jump))
-        seen = (time, found_it.chi_square, len(found_it.white))
-        width = self.how.space.width
-        values = self.model.rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
-        left = values - self.model.rows @ self.how.space.heat_outputs(belief.mean, observed.time)[width:]
-        return (
-            replace(
-                standing,
-                belief=belief,
-                scores=standing.scores.with_one(found_it.white, found_it.log_score),
-                innovations=(*standing.innovations, seen)[-KEPT:],
-                jumps=jumps,
-                spread=standing.spread + np.stack([values, values**2, left, left**2]),
-            ),
-            observed,
+    def _monitor(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:
+        time = int(entry["time_us"])
+        if entry["content"]["numbers"].get("sigma_holds") is False:
+            return standing.without(time, "monitor", "monitor", "its own sigma does not hold")
+        observed = self.observed(entry)
+        standing, found = self._updated(standing, entry, observed)
+        belief, space, rows = standing.belief, self.how.space, self.model.rows
+        values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
+        rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
+        return replace(
+            standing,
+            scores=standing.scores.with_one(found.white, found.log_score),
+            innovations=(*standing.innovations, (time, found.chi_square, len(found.white)))[-KEPT:],
+            jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
+            spread=standing.spread + np.stack([values, values**2, rest, rest**2]),
         )
