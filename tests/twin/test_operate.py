@@ -20,7 +20,7 @@ from scenes.specs.resolved import resolve_with
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.commands import invoke
-from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, table, temperatures
+from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, spots, table, temperatures
 from twin.operate import schema
 from twin.operate.__main__ import app
 from twin.operate.database import FILE, url_of
@@ -339,6 +339,36 @@ def test_readings_of_another_instrument(record: Path, tmp_path: Path) -> None:
     assert "does not say of which instrument" in run("ingest", record, silent, "--time", "2026-01-01T00:00:00Z").stdout
     assert status(record)["entries"] == 0
     assert "not of gf7_pair_two" in run("init", record, "gf7_pair_two").stderr
+
+
+def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) -> None:
+    """Those of the earliest reading count, in a file and after it; the same images with a pixel less are the same."""
+
+    def taken(name: str, hour: int, before: float | None, *words: str) -> tuple[int, str]:
+        folder = run_folder(tmp_path / name, frame=name.encode(), before=before)
+        done = run("ingest", record, folder, "--time", f"2026-03-05T{hour:02d}:00:00Z", *words)
+        return done.exit_code, done.stdout
+
+    assert taken("bare", 1, None)[0] == 0  # without spots there is nothing to compare
+    with History(str(record)) as history:
+        (entry,) = history.entries("monitor")
+    shutil.rmtree(record)
+    made(record).close()
+    assert taken("first", 2, 47.5)[0] == 0
+    assert taken("same", 3, 47.5 + 0.0001)[0] == 0
+    code, said = taken("other", 4, 47.5014)
+    assert code == 2
+    assert "found against other reference images than the reading of 2026-03-05T02:00:00Z" in said
+    assert "1.4 sigma" in said
+    assert taken("earlier", 1, 47.5014, "--late")[0] == 2
+    told = status(record)
+    assert (told["entries"], told["open"]) == (2, 2)
+    numbers = [{**content_of(entry)["numbers"], "spots": spots(place)} for place in (40.0, 41.0)]
+    own = [Entry("monitor", "monitor", START + k * MINUTE, {"numbers": n}) for k, n in enumerate(numbers)]
+    shutil.rmtree(record)
+    with made(record) as history:
+        done = history.take(given("series", own))
+        assert (done.new, len(done.refused)) == (1, 1)
 
 
 def test_a_run_that_was_changed_is_refused(record: Path, tmp_path: Path) -> None:
