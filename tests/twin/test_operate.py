@@ -29,6 +29,7 @@ from twin.operate.history import History, content_of, initialised
 from twin.operate.record_tables import tables
 from twin.operate.run_readings import run_entries
 from twin.operate.schema import NotARecord
+from twin.operate.sources import time_of_name
 from twin.operate.telemetry import read_telemetry
 
 
@@ -227,6 +228,69 @@ def test_watching_takes_what_comes_and_what_grows(
         ("t_2.csv", 2, 2),
     ]
     assert (total["new"], total["refused"]) == (7, 0)
+
+
+def test_watching_takes_run_folders_that_come(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose name says its time; one that a table names before it is finished; one that nobody says the time of."""
+    inbox = tmp_path / "inbox"
+    inbox.mkdir()
+    text = "instrument: gf7_pair\nreadings:\n  - {kind: monitor, files: passes.csv, time: UTC, name: run}\n"
+
+    def aged(path: Path) -> Path:
+        os.utime(path, (time.time() - 60,) * 2)
+        return path
+
+    def come(name: str) -> None:
+        aged(run_folder(inbox / name, frame=name.encode()) / "manifest.json")
+
+    def name_a_run() -> None:
+        written(inbox, text, {"passes.csv": "UTC,run\n2026-03-06T00:00:00Z,late\n"})
+        aged(inbox / "passes.csv")
+
+    steps = [
+        lambda: come("recover-2026-03-05T03-05-00Z"),
+        name_a_run,
+        lambda: come("late"),
+        lambda: come("recover-001"),
+        lambda: None,
+    ]
+
+    def sleep(seconds: float) -> None:
+        if not steps:
+            raise KeyboardInterrupt
+        steps.pop(0)()
+
+    monkeypatch.setattr("twin.operate.__main__.time.sleep", sleep)
+    result = run("ingest", record, inbox, "--watch", "--json")
+    *looks, total = map(json.loads, result.stdout.splitlines())
+    assert [(one["new"], [r["reason"] for r in one["refused"]]) for one in looks] == [
+        (1, []),
+        (0, [looks[1]["refused"][0]["reason"]]),
+        (1, []),
+        (0, [looks[3]["refused"][0]["reason"]]),
+    ]
+    assert "no reading in" in looks[1]["refused"][0]["reason"]
+    assert "put the UTC into its name" in looks[3]["refused"][0]["reason"]
+    assert (total["new"], total["refused"]) == (2, 2)
+    with History(str(record)) as history:
+        assert [row["time_utc"] for row in history.entries("monitor")] == [
+            "2026-03-05T03:05:00Z",
+            "2026-03-06T00:00:00Z",
+        ]
+
+
+@pytest.mark.parametrize(
+    ("name", "utc"),
+    [
+        ("recover-2026-03-05T03-05-00Z", "2026-03-05T03:05:00Z"),
+        ("20260305T030500.25Z-pass", "2026-03-05T03:05:00.25Z"),
+        ("2026-03-05T03:05:00Z", "2026-03-05T03:05:00Z"),
+        ("recover-2026-13-05T03-05-00Z", None),
+        ("recover-2026-03-05", None),
+    ],
+)
+def test_the_time_in_a_folders_name(name: str, utc: str | None) -> None:
+    assert time_of_name(name) == (None if utc is None else micros(utc))
 
 
 def test_an_interruption_says_what_is_kept(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

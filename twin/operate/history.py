@@ -228,9 +228,8 @@ class History:
 
     def subjects(self, kind: str) -> list[str]:
         """Of what there are readings of a kind, in alphabetical order."""
-        query = select(ENTRY.c.subject).where(ENTRY.c.kind == kind).distinct()
         with self.reading() as connection:
-            return sorted(connection.execute(query).scalars())
+            return [subject for of, subject in _streams(connection) if of == kind]
 
     def newest_id(self) -> int:
         """The largest id of an entry; 0 where there is none."""
