@@ -16,8 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from scenes.yaml.errors import Problem, nearest
+from scenes.yaml.errors import InputError, Problem, nearest
 from scenes.yaml.standard_output import FAILURE, print_error
+from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
+from twin.operate.followed import PlanFile
 from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
@@ -152,8 +154,10 @@ def ingest(
     with told() as errors, durable.exit_on_terminate(), History(record) as history:
         sources = Sources(files, _moment(moment), _is_stated(instrument, history), watch)
         totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
+        raised: list[str] = []
         try:
             while True:
+                before = totals["new"]
                 for given in sources.look(history):
                     taken = history.take(given, late)
                     totals.update(new=taken.new, known=taken.known, refused=len(taken.refused))
@@ -162,6 +166,11 @@ def ingest(
                         tell(errors, as_json, quiet, _taken(taken), partial(line, text=_line(taken)))
                     else:
                         files_told.append(_taken(taken))
+                if totals["new"] > before:
+                    new = _new_alarms(errors, history, quiet or as_json)
+                    raised += new
+                    if new and (watch or not as_json):
+                        tell(errors, as_json, quiet, {"alarms": new}, partial(line, text="\n".join(new)))
                 if not watch:
                     break
                 time.sleep(POLL)
@@ -170,11 +179,29 @@ def ingest(
                 print_error(errors, "interrupted: the files that were told are in the record, the others are not")
                 raise typer.Exit(INTERRUPTED) from None
         text = f"{totals['new']} taken, {totals['known']} known already, {totals['refused']} refused"
-        tell(errors, as_json, quiet, {**totals, "files": files_told}, partial(print_verdict, verdict=text))
+        tell(
+            errors,
+            as_json,
+            quiet,
+            {**totals, "files": files_told, "alarms": raised},
+            partial(print_verdict, verdict=text),
+        )
         if totals["refused"]:
             if quiet or as_json:
                 print_error(errors, f"{totals['refused']} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
+
+
+def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
+    """Alarms that the estimate under the record's plan raises with what was taken; what keeps it from being worked out
+    is told, and is no fault of what was taken.
+    """
+    try:
+        found = estimate_of(errors, history, None, quiet)
+    except (InputErrorText, InputError) as error:
+        print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
+        return []
+    return [] if found is None else [f"alarm: {one.text}" for one in found[1]]
 
 
 def _moment(text: str | None) -> int | None:
@@ -215,18 +242,31 @@ def _taken(one: Taken) -> dict[str, Any]:
 
 
 @app.command("status")
-def status(record: Place, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Tell what a record holds: readings by sort and body with their first and last time, and what was refused and why.
+def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
+    instrument stands: every quantity with its sigma, requirements, jumps, sensors, whether predictions came true.
 
-    Example: `python -m twin.operate status record`
+    What is new and has to be known is raised as an alarm (python -m twin.operate alarms).
 
-    Exit codes: 0 success, 2 bad input, 1 anything else.
+    Example: `python -m twin.operate status record scenes/examples/operation.yaml`
+
+    Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
     from twin.operate.history import History
 
     with told() as errors, History(record) as history:
-        data = history.status()
-        tell(errors, as_json, quiet, data, lambda console: _show(data, console))
+        found = estimate_of(errors, history, plan, quiet or as_json)
+        rows = history.alarms()
+        opened = sum(one["acknowledged"] is None for one in rows)
+        estimate = None if found is None else found[0].to_dict()
+        data = {**history.status(), "estimate": estimate, "open_alarms": opened}
+
+        def show(console: Console) -> None:
+            _show(data, console)
+            if found is not None:
+                show_estimate(found[0], rows, console)
+
+        tell(errors, as_json, quiet, data, show)
 
 
 def _show(data: dict[str, Any], console: Console) -> None:
@@ -288,6 +328,9 @@ def export(
         text = "\n".join(f"{out / name}: {rows} rows" for name, _, rows in made)
         tell(errors, as_json, quiet, data, lambda console: line(console, text or "the record is empty"))
 
+
+app.command("forecast")(forecast)
+app.command("alarms")(alarms)
 
 if __name__ == "__main__":
     app()
