@@ -176,9 +176,7 @@ def test_no_jump_is_told_where_none_is() -> None:
     """40 series of 30 readings at a chance of one in a thousand each."""
     for seed in range(40):
         told, times, shifts = jumped(0.0, seed)
-        assert not follow(
-            SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []
-        ).jumps
+        assert not follow(SeriesFilter(told, life_s=30.0), of_shifts(times, shifts, NOISE**2 * np.eye(SPOTS)), []).jumps
 
 
 def test_more_readings_never_hurt() -> None:

@@ -28,10 +28,11 @@ def reading(k: int) -> Entry:
     value = 1.0 / (k + 3.0)
     one = {f"{name}{end}": value for name in NUMBERS for end in ("", "_sigma", "_sigma_noise")}
     spots = {"row": value, "column": value, "row_sigma": value, "column_sigma": value}
+    first = dict.fromkeys(spots, 1.0)  # of the same reference images
     numbers = {
         "cameras": {camera: dict.fromkeys(ESTIMATORS, one) for camera in CAMERAS},
         "spots": {
-            camera: {side: {"before": spots, "after": spots} for side in ("left", "right")} for camera in CAMERAS
+            camera: {side: {"before": first, "after": spots} for side in ("left", "right")} for camera in CAMERAS
         },
         "sigma_holds": True,
     }

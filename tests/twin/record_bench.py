@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from scenes.specs.resolved import ResolvedJob, resolve_with
 from twin.operate.entries import Entry, Given, digest_of_data, micros
@@ -68,13 +69,23 @@ readings:
 """
 
 
-def run_folder(folder: Path, angle: float = 1.0, config: str | None = None, frame: bytes = b"frame") -> Path:
+def spots(before: float) -> dict[str, Any]:
+    """Spots of one camera; those in the reference images stand at the same place along row and column."""
+    place = {"row": before, "column": before, "row_sigma": 0.001, "column_sigma": 0.001}
+    return {"forward": {side: {"before": place, "after": {**place, "row": 50.0}} for side in ("left", "right")}}
+
+
+def run_folder(
+    folder: Path, angle: float = 1.0, config: str | None = None, frame: bytes = b"frame", before: float | None = None
+) -> Path:
     """What a run of the main job leaves, as far as a record reads it; the angle makes one differ from the other."""
     (folder / "images").mkdir(parents=True)
     reading = {"d_alpha_arcsec": angle, "d_alpha_arcsec_sigma": 0.1, "d_alpha_arcsec_sigma_noise": 0.01}
     angles = {"change_arcsec": angle, "change_arcsec_sigma": 0.1, "change_arcsec_sigma_noise": 0.01}
     results = {"schema": "recovered 2", "cameras": {"forward": {"posterior": reading}}, "sigma_holds": True}
     results |= {"intersection_angle": {"posterior": angles}, "frames": 2}
+    if before is not None:
+        results["spots"] = spots(before)
     (folder / "recovered.json").write_text(json.dumps(results), "utf-8")
     (folder / "config.yaml").write_text(pair().to_yaml() if config is None else config, "utf-8")
     (folder / "images/forward_left_after.tiff").write_bytes(frame)

@@ -20,7 +20,7 @@ from scenes.specs.resolved import resolve_with
 from scenes.yaml.errors import InputError
 from scenes.yaml.yaml_file import dump_yaml
 from tests.twin.commands import invoke
-from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, table, temperatures
+from tests.twin.record_bench import MINUTE, START, TELEMETRY, given, made, pair, run_folder, spots, table, temperatures
 from twin.operate import schema
 from twin.operate.__main__ import app
 from twin.operate.database import FILE, url_of
@@ -29,6 +29,7 @@ from twin.operate.history import History, content_of, initialised
 from twin.operate.record_tables import tables
 from twin.operate.run_readings import run_entries
 from twin.operate.schema import NotARecord
+from twin.operate.sources import time_of_name
 from twin.operate.telemetry import read_telemetry
 
 
@@ -229,6 +230,69 @@ def test_watching_takes_what_comes_and_what_grows(
     assert (total["new"], total["refused"]) == (7, 0)
 
 
+def test_watching_takes_run_folders_that_come(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose name says its time; one that a table names before it is finished; one that nobody says the time of."""
+    inbox = tmp_path / "inbox"
+    inbox.mkdir()
+    text = "instrument: gf7_pair\nreadings:\n  - {kind: monitor, files: passes.csv, time: UTC, name: run}\n"
+
+    def aged(path: Path) -> Path:
+        os.utime(path, (time.time() - 60,) * 2)
+        return path
+
+    def come(name: str) -> None:
+        aged(run_folder(inbox / name, frame=name.encode()) / "manifest.json")
+
+    def name_a_run() -> None:
+        written(inbox, text, {"passes.csv": "UTC,run\n2026-03-06T00:00:00Z,late\n"})
+        aged(inbox / "passes.csv")
+
+    steps = [
+        lambda: come("recover-2026-03-05T03-05-00Z"),
+        name_a_run,
+        lambda: come("late"),
+        lambda: come("recover-001"),
+        lambda: None,
+    ]
+
+    def sleep(seconds: float) -> None:
+        if not steps:
+            raise KeyboardInterrupt
+        steps.pop(0)()
+
+    monkeypatch.setattr("twin.operate.__main__.time.sleep", sleep)
+    result = run("ingest", record, inbox, "--watch", "--json")
+    *looks, total = map(json.loads, result.stdout.splitlines())
+    assert [(one["new"], [r["reason"] for r in one["refused"]]) for one in looks] == [
+        (1, []),
+        (0, [looks[1]["refused"][0]["reason"]]),
+        (1, []),
+        (0, [looks[3]["refused"][0]["reason"]]),
+    ]
+    assert "no reading in" in looks[1]["refused"][0]["reason"]
+    assert "put the UTC into its name" in looks[3]["refused"][0]["reason"]
+    assert (total["new"], total["refused"]) == (2, 2)
+    with History(str(record)) as history:
+        assert [row["time_utc"] for row in history.entries("monitor")] == [
+            "2026-03-05T03:05:00Z",
+            "2026-03-06T00:00:00Z",
+        ]
+
+
+@pytest.mark.parametrize(
+    ("name", "utc"),
+    [
+        ("recover-2026-03-05T03-05-00Z", "2026-03-05T03:05:00Z"),
+        ("20260305T030500.25Z-pass", "2026-03-05T03:05:00.25Z"),
+        ("2026-03-05T03:05:00Z", "2026-03-05T03:05:00Z"),
+        ("recover-2026-13-05T03-05-00Z", None),
+        ("recover-2026-03-05", None),
+    ],
+)
+def test_the_time_in_a_folders_name(name: str, utc: str | None) -> None:
+    assert time_of_name(name) == (None if utc is None else micros(utc))
+
+
 def test_an_interruption_says_what_is_kept(record: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = written(tmp_path, TELEMETRY, {"t_1.csv": table(0, 3), "t_2.csv": table(3, 2)})
     take = History.take
@@ -339,6 +403,36 @@ def test_readings_of_another_instrument(record: Path, tmp_path: Path) -> None:
     assert "does not say of which instrument" in run("ingest", record, silent, "--time", "2026-01-01T00:00:00Z").stdout
     assert status(record)["entries"] == 0
     assert "not of gf7_pair_two" in run("init", record, "gf7_pair_two").stderr
+
+
+def test_a_reading_against_other_reference_images(record: Path, tmp_path: Path) -> None:
+    """Those of the earliest reading count, in a file and after it; the same images with a pixel less are the same."""
+
+    def taken(name: str, hour: int, before: float | None, *words: str) -> tuple[int, str]:
+        folder = run_folder(tmp_path / name, frame=name.encode(), before=before)
+        done = run("ingest", record, folder, "--time", f"2026-03-05T{hour:02d}:00:00Z", *words)
+        return done.exit_code, done.stdout
+
+    assert taken("bare", 1, None)[0] == 0  # without spots there is nothing to compare
+    with History(str(record)) as history:
+        (entry,) = history.entries("monitor")
+    shutil.rmtree(record)
+    made(record).close()
+    assert taken("first", 2, 47.5)[0] == 0
+    assert taken("same", 3, 47.5 + 0.0001)[0] == 0
+    code, said = taken("other", 4, 47.5014)
+    assert code == 2
+    assert "found against other reference images than the reading of 2026-03-05T02:00:00Z" in said
+    assert "1.4 sigma" in said
+    assert taken("earlier", 1, 47.5014, "--late")[0] == 2
+    told = status(record)
+    assert (told["entries"], told["open"]) == (2, 2)
+    numbers = [{**content_of(entry)["numbers"], "spots": spots(place)} for place in (40.0, 41.0)]
+    own = [Entry("monitor", "monitor", START + k * MINUTE, {"numbers": n}) for k, n in enumerate(numbers)]
+    shutil.rmtree(record)
+    with made(record) as history:
+        done = history.take(given("series", own))
+        assert (done.new, len(done.refused)) == (1, 1)
 
 
 def test_a_run_that_was_changed_is_refused(record: Path, tmp_path: Path) -> None:

@@ -9,8 +9,6 @@ if __name__ == "__main__":
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,8 +16,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from scenes.yaml.errors import Problem, nearest
-from scenes.yaml.standard_output import FAILURE, Terminal, print_error, print_json, to_stdout
+from scenes.yaml.errors import InputError, Problem, nearest
+from scenes.yaml.standard_output import FAILURE, print_error
+from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
+from twin.operate.followed import PlanFile
+from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
     BAD_INPUT,
@@ -27,31 +28,21 @@ from twin.run.cli import (
     AsJson,
     InputErrorText,
     Quiet,
-    explained,
     print_verdict,
     print_whole,
     result_table,
 )
 
 if TYPE_CHECKING:
-    from twin.operate.entries import Given
     from twin.operate.history import History
     from twin.operate.taking import Taken
 
 POLL = 10.0
 """Seconds between two looks at what is watched."""
-SETTLED = 2.0
-"""Seconds for which a file has not changed before a watching command reads it: it may still be written."""
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode="markdown", pretty_exceptions_enable=False, no_args_is_help=True
 )
-Place = Annotated[
-    str,
-    typer.Argument(
-        metavar="DIR_OR_URL", help="Folder of the record, or address of a database: postgresql://host/name."
-    ),
-]
 
 
 @app.callback()
@@ -67,35 +58,6 @@ def main() -> None:
 
     Exit codes: 0 success, 2 bad input or readings that were refused, 1 anything else.
     """
-
-
-@contextmanager
-def _told() -> Iterator[Console]:
-    """Errors as one sentence and an exit code."""
-    from twin.operate.database import RecordFailed
-    from twin.operate.schema import NotARecord
-
-    errors = Console(stderr=True)
-    with explained(errors):
-        try:
-            yield errors
-        except NotARecord as error:
-            raise InputErrorText(str(error)) from None
-        except RecordFailed as error:
-            print_error(errors, f"the database cannot do it: {error}; what was not told as taken is not in the record")
-            raise typer.Exit(FAILURE) from None
-
-
-def _tell(errors: Console, as_json: bool, quiet: bool, data: Any, show: Callable[[Console], None]) -> None:
-    with to_stdout(errors, "the record is as it was told"):
-        if as_json:
-            print_json(data)
-        elif not quiet:
-            show(Terminal())
-
-
-def _plain(console: Console, text: str) -> None:
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command("init")
@@ -129,7 +91,7 @@ def init(
     from twin.operate.history import History, initialised
     from twin.operate.plans import keep_plan, read_plan
 
-    with _told() as errors:
+    with told() as errors:
         if plan is not None:  # a mistake in it is told before anything is made
             read_operation(plan)
         passed = initialised(record, resolve_with(instrument), simulated)
@@ -141,7 +103,7 @@ def init(
             data: dict[str, Any] = {"record": history.url, "instrument": history.name}
             data["instrument_sha256"] = history.sha256
         data |= {"versions": list(passed), "plan": None if plan is None else str(plan.absolute()), "new_plan": kept}
-        _tell(errors, as_json, quiet, data, lambda console: _plain(console, text))
+        tell(errors, as_json, quiet, data, lambda console: line(console, text))
 
 
 @app.command("ingest")
@@ -151,11 +113,14 @@ def ingest(
         list[Path],
         typer.Argument(
             readable=False,
-            help="YAML files that say what tables hold, folders with such files, or run folders (with --time).",
+            help="YAML files that say what tables hold, run folders, or folders with some of these.",
         ),
     ],
     moment: Annotated[
-        str | None, typer.Option("--time", help="UTC of a run folder's reading, or of 0 s of its series.")
+        str | None,
+        typer.Option(
+            "--time", help="UTC of a run folder's reading, or of 0 s of its series, where its name does not say it."
+        ),
     ] = None,
     instrument: Annotated[
         str | None, typer.Option(help="Instrument of run folders that do not say it, such as those of twin.orbit.")
@@ -163,7 +128,9 @@ def ingest(
     late: Annotated[
         bool, typer.Option("--late", help="Take readings that are older than the newest of their sort.")
     ] = False,
-    watch: Annotated[bool, typer.Option("--watch", help="Go on looking for new tables, until Ctrl-C.")] = False,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Go on looking for new tables and run folders, until Ctrl-C.")
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -182,22 +149,28 @@ def ingest(
     Exit codes: 0 success, 2 bad input or something was refused (all else is taken), 1 anything else.
     """
     from twin.operate.history import History
+    from twin.operate.sources import Sources
 
-    with _told() as errors, durable.exit_on_terminate(), History(record) as history:
-        start = _moment(moment)
-        stated = _is_stated(instrument, history)
-        seen: dict[str, tuple[int, int]] = {}
-        totals, told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
+    with told() as errors, durable.exit_on_terminate(), History(record) as history:
+        sources = Sources(files, _moment(moment), _is_stated(instrument, history), watch)
+        totals, files_told, first = Counter({"new": 0, "known": 0, "refused": 0}), [], ""
+        raised: list[str] = []
         try:
             while True:
-                for given in _given(files, start, stated, history, seen if watch else None):
+                before = totals["new"]
+                for given in sources.look(history):
                     taken = history.take(given, late)
                     totals.update(new=taken.new, known=taken.known, refused=len(taken.refused))
                     first = first or (f"{taken.file}: {taken.refused[0][1]}" if taken.refused else "")
                     if watch or not as_json:
-                        _tell(errors, as_json, quiet, _taken(taken), partial(_plain, text=_line(taken)))
+                        tell(errors, as_json, quiet, _taken(taken), partial(line, text=_line(taken)))
                     else:
-                        told.append(_taken(taken))
+                        files_told.append(_taken(taken))
+                if totals["new"] > before:
+                    new = _new_alarms(errors, history, quiet or as_json)
+                    raised += new
+                    if new and (watch or not as_json):
+                        tell(errors, as_json, quiet, {"alarms": new}, partial(line, text="\n".join(new)))
                 if not watch:
                     break
                 time.sleep(POLL)
@@ -206,11 +179,29 @@ def ingest(
                 print_error(errors, "interrupted: the files that were told are in the record, the others are not")
                 raise typer.Exit(INTERRUPTED) from None
         text = f"{totals['new']} taken, {totals['known']} known already, {totals['refused']} refused"
-        _tell(errors, as_json, quiet, {**totals, "files": told}, partial(print_verdict, verdict=text))
+        tell(
+            errors,
+            as_json,
+            quiet,
+            {**totals, "files": files_told, "alarms": raised},
+            partial(print_verdict, verdict=text),
+        )
         if totals["refused"]:
             if quiet or as_json:
                 print_error(errors, f"{totals['refused']} refused, the first in {first}")
             raise typer.Exit(BAD_INPUT)
+
+
+def _new_alarms(errors: Console, history: History, quiet: bool) -> list[str]:
+    """Alarms that the estimate under the record's plan raises with what was taken; what keeps it from being worked out
+    is told, and is no fault of what was taken.
+    """
+    try:
+        found = estimate_of(errors, history, None, quiet)
+    except (InputErrorText, InputError) as error:
+        print_error(errors, f"what was taken is in the record, and the estimate cannot be worked out: {error}")
+        return []
+    return [] if found is None else [f"alarm: {one.text}" for one in found[1]]
 
 
 def _moment(text: str | None) -> int | None:
@@ -238,42 +229,6 @@ def _is_stated(instrument: str | None, history: History) -> bool:
     return True
 
 
-def _given(
-    files: list[Path], moment: int | None, stated: bool, history: History, seen: dict[str, tuple[int, int]] | None
-) -> Iterator[Given]:
-    """What the files that were named hold now; of what is watched only what has changed since it was seen."""
-    from twin.operate.run_readings import run_entries
-    from twin.operate.telemetry import read_table_file, read_telemetry, tables_of
-    from twin.run.run_folder import is_run_folder
-
-    for place in files:
-        if is_run_folder(place if place.is_dir() else place.parent) and place.suffix not in (".yaml", ".yml"):
-            if moment is None:
-                raise InputErrorText(f"{place}: a run folder does not say when it was read; --time UTC does")
-            if seen is None or not _is_seen(place, seen):
-                yield run_entries(place, "", moment, history, stated)
-            continue
-        described = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
-        if not described:
-            raise InputErrorText(f"{place}: neither a run folder nor one with a YAML file that says what tables hold")
-        for file in described:
-            spec = read_telemetry(file, history)
-            for table in spec.readings:
-                for path in tables_of(spec, table):
-                    if seen is None or not _is_seen(path, seen):
-                        yield read_table_file(table, path, history)
-
-
-def _is_seen(path: Path, seen: dict[str, tuple[int, int]]) -> bool:
-    """Whether a file is as it was when it was read, or may still be written."""
-    state = path.stat()
-    now = (state.st_mtime_ns, state.st_size)
-    if seen.get(str(path)) == now or time.time() - state.st_mtime < SETTLED:
-        return True
-    seen[str(path)] = now
-    return False
-
-
 def _line(taken: Taken) -> str:
     lines = [f"{taken.file}: {taken.new} taken, {taken.known} known already, {len(taken.refused)} refused"]
     shown = [f"  refused{'' if line is None else f', line {line}'}: {reason}" for line, reason in taken.refused[:10]]
@@ -287,18 +242,31 @@ def _taken(one: Taken) -> dict[str, Any]:
 
 
 @app.command("status")
-def status(record: Place, as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Tell what a record holds: readings by sort and body with their first and last time, and what was refused and why.
+def status(record: Place, plan: PlanFile = None, as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Tell what a record holds, what was refused and why; and, under its plan of operation or another one, how the
+    instrument stands: every quantity with its sigma, requirements, jumps, sensors, whether predictions came true.
 
-    Example: `python -m twin.operate status record`
+    What is new and has to be known is raised as an alarm (python -m twin.operate alarms).
 
-    Exit codes: 0 success, 2 bad input, 1 anything else.
+    Example: `python -m twin.operate status record scenes/examples/operation.yaml`
+
+    Exit codes: 0 success, whether alarms are open or not, 2 bad input, 1 anything else.
     """
     from twin.operate.history import History
 
-    with _told() as errors, History(record) as history:
-        data = history.status()
-        _tell(errors, as_json, quiet, data, lambda console: _show(data, console))
+    with told() as errors, History(record) as history:
+        found = estimate_of(errors, history, plan, quiet or as_json)
+        rows = history.alarms()
+        opened = sum(one["acknowledged"] is None for one in rows)
+        estimate = None if found is None else found[0].to_dict()
+        data = {**history.status(), "estimate": estimate, "open_alarms": opened}
+
+        def show(console: Console) -> None:
+            _show(data, console)
+            if found is not None:
+                show_estimate(found[0], rows, console)
+
+        tell(errors, as_json, quiet, data, show)
 
 
 def _show(data: dict[str, Any], console: Console) -> None:
@@ -307,7 +275,7 @@ def _show(data: dict[str, Any], console: Console) -> None:
         console, f"{name}: {entries} readings and events of {data['files']} files; {opened} refused and not taken"
     )
     if not data["guarded"]:
-        _plain(console, "warning: this kind of database does not itself refuse to alter rows; only the program does")
+        line(console, "warning: this kind of database does not itself refuse to alter rows; only the program does")
     table = result_table()
     for head in ("kind", "of", "entries", "first [UTC]", "last [UTC]"):
         table.add_column(head, justify="right" if head == "entries" else "left")
@@ -315,9 +283,9 @@ def _show(data: dict[str, Any], console: Console) -> None:
         table.add_row(one["kind"], one["subject"], str(one["entries"]), one["first_utc"], one["last_utc"])
     print_whole(console, table)
     for one in data["refused"]:
-        line = "" if one["line"] is None else f":{one['line']}"
+        at = "" if one["line"] is None else f":{one['line']}"
         since = " (taken since)" if one["taken_since"] else ""
-        _plain(console, f"refused{since}: {one['file']}{line}: {one['reason']}")
+        line(console, f"refused{since}: {one['file']}{at}: {one['reason']}")
 
 
 @app.command("export")
@@ -340,7 +308,7 @@ def export(
     from twin.operate.record_tables import tables as all_tables
     from twin.run.data_files import TABLE_FORMATS, MissingPackage
 
-    with _told() as errors, History(record) as history:
+    with told() as errors, History(record) as history:
         if tables not in TABLE_FORMATS:
             near = nearest(tables, TABLE_FORMATS)
             meant = f"; did you mean {near!r}?" if near else ";"
@@ -358,8 +326,11 @@ def export(
             raise typer.Exit(FAILURE) from None
         data = {"out": str(out), "tables": [{"file": name, "rows": rows} for name, _, rows in made]}
         text = "\n".join(f"{out / name}: {rows} rows" for name, _, rows in made)
-        _tell(errors, as_json, quiet, data, lambda console: _plain(console, text or "the record is empty"))
+        tell(errors, as_json, quiet, data, lambda console: line(console, text or "the record is empty"))
 
+
+app.command("forecast")(forecast)
+app.command("alarms")(alarms)
 
 if __name__ == "__main__":
     app()

@@ -145,7 +145,10 @@ class History:
         elif after_id is not None:
             query = query.where(c.id > after_id)
         query = query if until_us is None else query.where(c.time_us <= until_us)
+        limited = not (after_us is None and until_us is None)
         with self.reading() as connection:
+            if kind and not subject and limited:  # a look into the index for each subject, and no walk through all
+                query = query.where(c.subject.in_([own for of, own in _streams(connection) if of == kind]))
             yield from map(dict, connection.execute(query.order_by(c.time_us, c.id)).mappings())
 
     def refusals(self) -> list[dict[str, Any]]:
@@ -159,10 +162,8 @@ class History:
 
     def status(self) -> dict[str, Any]:
         """What the record holds, as plain data."""
-        c = ENTRY.c
-        counted = select(c.kind, c.subject, func.count(c.id), func.min(c.time_us), func.max(c.time_us))
         with self.reading() as connection:
-            streams = connection.execute(counted.group_by(c.kind, c.subject).order_by(c.kind, c.subject)).all()
+            streams = [(kind, subject, *_extent(connection, kind, subject)) for kind, subject in _streams(connection)]
             sources = int(connection.execute(select(func.count()).select_from(SOURCE)).scalar_one())
             guarded = schema.guarded(connection)
         refused = [
@@ -227,9 +228,8 @@ class History:
 
     def subjects(self, kind: str) -> list[str]:
         """Of what there are readings of a kind, in alphabetical order."""
-        query = select(ENTRY.c.subject).where(ENTRY.c.kind == kind).distinct()
         with self.reading() as connection:
-            return sorted(connection.execute(query).scalars())
+            return [subject for own, subject in _streams(connection) if own == kind]
 
     def newest_id(self) -> int:
         """The largest id of an entry; 0 where there is none."""
@@ -364,6 +364,26 @@ def _numbered(number: int | None, before_us: int | None) -> Any:
     if number is not None:
         return c.number == number
     return c.number >= 0 if before_us is None else c.number > 0
+
+
+def _streams(connection: Connection) -> Iterator[tuple[str, str]]:
+    """Sort and subject of all that was read, in order: found by looks into the index, not by a walk through it."""
+    c = ENTRY.c
+    in_order = select(c.kind, c.subject).order_by(c.kind, c.subject).limit(1)
+    found = connection.execute(in_order).first()
+    while found is not None:
+        yield found.kind, found.subject
+        same, next_kind = in_order.where(c.kind == found.kind, c.subject > found.subject), c.kind > found.kind
+        found = connection.execute(same).first() or connection.execute(in_order.where(next_kind)).first()
+
+
+def _extent(connection: Connection, kind: str, subject: str) -> tuple[int, int, int]:
+    """How many readings a stream has, the first time and the last one; one query each, which the index answers."""
+    c = ENTRY.c
+    asked = (func.count(), func.min(c.time_us), func.max(c.time_us))
+    own = [select(one).select_from(ENTRY).where(c.kind == kind, c.subject == subject) for one in asked]
+    count, first, last = (int(connection.execute(query).scalar_one()) for query in own)
+    return count, first, last
 
 
 def content_of(row: Mapping[str, Any]) -> Any:

@@ -493,7 +493,7 @@ class Operation:
             return smoothed(replace(taking.how, steps=steps, window=0), belief, observed, seconds, list(left), each)
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
-        """Ids of the entries that were used after a time at which the estimate was kept, and what could not be told then."""
+        """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
         kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
         spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
         if after_us is None or self._standing.time > after_us:

@@ -8,6 +8,8 @@ from analysis.monitor.parameters import ANGLE, ANGLE_GROUP, CAMERA_PARAMETERS, G
 from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.operation import OperationSetup, read_operation
 from scenes.yaml.errors import Problem, names_text, nearest, shown
+from scenes.yaml.spec import validate
+from scenes.yaml.yaml_file import YamlFile
 from twin.operate.entries import digest_of_data, digest_of_job
 from twin.operate.history import History
 
@@ -52,10 +54,10 @@ def kept_plan(history: History) -> OperationSetup | None:
     """The plan that the record keeps and that counts; None for none.
 
     Raises:
-        ValidationError: it is of a program that wrote it otherwise.
+        InputError: it is of a program that wrote it otherwise.
     """
     row = history.plan()
-    return None if row is None else OperationSetup.model_validate(row["content"])
+    return None if row is None else validate(OperationSetup, YamlFile("the record's plan", row["content"], {}))
 
 
 def plan_digest(setup: OperationSetup) -> str:

@@ -66,7 +66,7 @@ class Sensor:
         step = self.step if again or not self.readings else min(self.step, abs(value - self.value))
         repeats = self.repeats + 1 if again else 0
         # two readings of a working sensor agree in its last digit with this chance
-        alike = erf(0.5 * step / (2.0 * sigma)) if math.isfinite(step) else 0.0
+        alike = float(erf(0.5 * step / (2.0 * sigma))) if math.isfinite(step) else 0.0
         return replace(
             self,
             readings=self.readings + 1,

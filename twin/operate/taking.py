@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select
 
+from scenes.yaml.json_file import parse_json
 from twin.operate.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, now, utc_text
 from twin.operate.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
+SAME_IMAGES = 0.2
+"""Root mean square of the differences of spots of the same images, over their sigmas, at most. Those of other images of
+the same state differ by 1.4, and of eight coordinates by less than this once in a million; those of the same images
+differ where other pixels are left out.
+"""
 _TOGETHER = 500
 """Rows asked for or written at once."""
 AHEAD = 24 * 3600 * MICRO
 """A reading later than this after the computer's clock comes of a clock that is wrong."""
+
+
+Before = Mapping[tuple[str, str, str], tuple[float, float]]
+"""Camera, channel and ``row`` or ``column`` of a spot before -> place and sigma, px."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +60,7 @@ class Taking:
         self.connection, self.simulated, self.late = connection, simulated, late
         self.newest: dict[tuple[str, str], int | None] = {}
         self.seen: dict[tuple[str, str], int] = {}
+        self.first: tuple[str, Before] | None = None
 
     def take(self, given: Given) -> Taken:
         """Compare what the file holds with the record and add what is new."""
@@ -71,6 +84,8 @@ class Taking:
             else:
                 kept.append((one, digest))
                 known.add(digest)
+                if one.kind == "monitor" and self.first is None:
+                    self.first = (utc_text(one.time), _before(one.content))
             self.seen[stream] = max(one.time, self.seen.get(stream, one.time))
         before = source is not None
         if kept or refused or not before:
@@ -97,6 +112,8 @@ class Taking:
             query = select(c.time_utc).where(c.origin == one.origin, c.time_us != one.time).limit(1)
             if (other := self.connection.execute(query).scalar()) is not None:
                 return f"found from the same frames as the reading of {other}; give it that time, or its own frames"
+        if one.kind == "monitor" and (reason := self._other_reference(one)):
+            return reason
         if stream not in self.newest:
             query = select(func.max(c.time_us)).where(c.kind == one.kind, c.subject == one.subject)
             self.newest[stream] = self.connection.execute(query).scalar()
@@ -114,6 +131,28 @@ class Taking:
                 text = f"{utc_text(one.time)} is before the newest reading of {one.subject}, {utc_text(newest)}"
                 return f"{text}: a clock that was set back, or a reading that comes late; --late takes it"
         return ""
+
+    def _other_reference(self, one: Entry) -> str:
+        """Why a reading of the monitor cannot be compared with those of the record; empty where it can."""
+        own = _before(one.content)
+        if self.first is None:
+            c = ENTRY.c
+            query = select(c.time_utc, c.content).where(c.kind == "monitor").order_by(c.time_us, c.id).limit(1)
+            row = self.connection.execute(query).first()
+            if row is None:
+                return ""
+            self.first = (str(row.time_utc), _before(parse_json(row.content, "the record")))
+        when, first = self.first
+        ratios = [
+            (own[key][0] - place) / max(sigma, own[key][1]) for key, (place, sigma) in first.items() if key in own
+        ]
+        apart = math.sqrt(sum(ratio * ratio for ratio in ratios) / len(ratios)) if ratios else 0.0
+        if apart <= SAME_IMAGES:
+            return ""
+        return (
+            f"found against other reference images than the reading of {when}, whose spots before are {apart:.2g} "
+            "sigma from these; recover the frames against its images before, or begin another record"
+        )
 
     def _write(
         self,
@@ -164,3 +203,15 @@ class Taking:
     def _insert(self, table: Any, rows: list[dict[str, Any]]) -> None:
         for k in range(0, len(rows), _TOGETHER):
             self.connection.execute(insert(table), rows[k : k + _TOGETHER])
+
+
+def _before(content: Mapping[str, Any]) -> Before:
+    """The spots in the reference images of a reading of the monitor, those that have a sigma."""
+    out = {}
+    for camera, channels in (content["numbers"].get("spots") or {}).items():
+        for channel, spot in channels.items():
+            for axis in ("row", "column"):
+                place, sigma = (spot.get("before", {}).get(key) for key in (axis, f"{axis}_sigma"))
+                if place is not None and sigma:
+                    out[camera, channel, axis] = (float(place), float(sigma))
+    return out

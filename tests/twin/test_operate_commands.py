@@ -1,0 +1,327 @@
+"""What commands tell of an estimate, and the alarms that they raise: once each."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from optics.numerics.backend import load_backend
+from scenes.specs.operation import OperationSpec, RequirementSpec
+from tests.twin.commands import invoke
+from tests.twin.operation_records import (
+    START,
+    given,
+    life_of,
+    monitor_entry,
+    plan_of,
+    record_of,
+    temperature_entry,
+)
+from twin.monitor.monitor_experiment import MonitorExperiment
+from twin.operate.__main__ import app
+from twin.operate.alarms import AGAIN, alarms_of, raise_alarms
+from twin.operate.entries import MICRO, Alarm, Entry, utc_text
+from twin.operate.followed import known_of
+from twin.operate.history import History
+from twin.operate.operation import Break, Following, FoundJump, Operation, SensorState
+from twin.operate.plans import keep_plan, kept_plan
+
+DAY = 86_400 * MICRO
+EVERY, DAYS = 4, 120
+SLIPPED = 62
+"""Day of a slip that is far larger than what the mounts drift by from reading to reading."""
+BODY = "base/backward/M2"
+TABLE = """instrument: monitor_pair
+readings:
+  - {kind: temperature, files: t.csv, time: UTC, columns: {base/forward: {column: T, unit: K, sigma: 0.05 K}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def life(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a plan, and a record in which a mount slips and a sensor gets stuck; it keeps no plan."""
+    folder = tmp_path_factory.mktemp("life")
+    plan = plan_of(folder)
+    experiment = MonitorExperiment(plan.model, load_backend())
+    stated = experiment.disturbances
+    assert stated is not None
+    slip = stated.labels.index(f"{BODY} shift x")
+    drawn = life_of(stated, DAYS, EVERY, 3, {SLIPPED: {slip: 60.0}})
+    entries = [monitor_entry(experiment, stated, drawn, k, 3) for k in range(len(drawn.times))]
+    rng = np.random.default_rng(1)
+    with record_of(folder / "record", plan) as history:
+        for k, label in enumerate(stated.labels):
+            if not label.endswith("temperature"):
+                continue
+            own = stated.sigmas[k] * drawn.motions[:, k] + 0.05 * rng.standard_normal(len(drawn.times))
+            for n, (time, value) in enumerate(zip(drawn.times.tolist(), own.tolist(), strict=True)):
+                kelvin = 292.0 if n > 15 and stated.bodies[k] == "base/backward" else history.temperature + value
+                entries.append(temperature_entry(stated.bodies[k], time - 600 * MICRO, round(kelvin, 2)))
+        entries.append(Entry("event", "safe_mode", START + 30 * DAY + DAY // 2, {}))
+        entries.sort(key=lambda one: one.time)
+        assert not history.take(given("all", entries)).refused
+    return folder
+
+
+@pytest.fixture
+def record(life: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(life / "record", tmp_path / "record"))
+
+
+def run(*words: object) -> Any:
+    return invoke(app, *words)
+
+
+def said(*words: object) -> Any:
+    done = run(*words, "--json")
+    assert done.exit_code == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture(scope="module")
+def following(life: Path, tmp_path_factory: pytest.TempPathFactory) -> Following:
+    place = Path(shutil.copytree(life / "record", tmp_path_factory.mktemp("followed") / "record"))
+    with History(str(place)) as history:
+        return Operation(history, plan_of(life)).follow()
+
+
+# --- without a plan, and with one ------------------------------------------------------------------------
+
+
+def test_without_a_plan_there_is_no_estimate(record: Path, life: Path) -> None:
+    assert said("status", record)["estimate"] is None
+    done = run("forecast", record)
+    assert done.exit_code == 2
+    assert "keeps no plan of operation" in done.stderr
+    # one that is named counts for this command alone
+    told = said("status", record, life / "plan.yaml")
+    assert told["estimate"]["readings"] == DAYS // EVERY
+    assert said("status", record)["estimate"] is None
+
+
+def test_a_record_without_a_reading_of_the_monitor(life: Path, tmp_path: Path) -> None:
+    plan = plan_of(life)
+    with record_of(tmp_path / "record", plan) as history:
+        keep_plan(plan, life / "plan.yaml", history)
+    assert said("status", tmp_path / "record")["estimate"] is None
+    done = run("forecast", tmp_path / "record")
+    assert done.exit_code == 2
+    assert "no reading of the monitor is in the record" in done.stderr
+
+
+def test_status_tells_how_the_instrument_stands(record: Path, life: Path) -> None:
+    assert run("init", record, "monitor_pair", "--plan", life / "plan.yaml").exit_code == 0
+    done = run("status", record)
+    assert done.exit_code == 0, done.stderr
+    text = " ".join(done.stdout.split())
+    assert f"estimate at {utc_text(START + (DAYS - EVERY) * DAY)} from 30 readings of the monitor" in text
+    assert f"jump of {BODY} between {utc_text(START + 60 * DAY)} and {utc_text(START + 64 * DAY)}: shift x" in text
+    assert "sensors: 1 of 2 are as they should be" in text
+    assert "base/backward: stuck since" in text
+    assert "Δθ between the cameras 30 arcsec" in text
+    assert "% within one sigma (68.3 % expected)" in text
+    assert "2 alarms are open" in text
+    told = said("status", record)
+    assert told["open_alarms"] == 2
+    (size, *_) = told["estimate"]["jumps"][0]["sizes"]
+    # 120 micrometres, and a jump is found with its size within 4 of its sigmas
+    assert abs(size["size"] - 120.0) < 4.0 * size["sigma"]
+
+
+def test_the_digits_are_those_that_sigma_deserves(record: Path, life: Path) -> None:
+    """Two of sigma, and the value to the same place."""
+    rows = [line for line in run("status", record, life / "plan.yaml").stdout.splitlines() if " ± " in line]
+    table = [line.split(" ± ") for line in rows if not line.startswith(("jump", "alarm"))]
+    assert len(table) == 12
+    for left, right in table:
+        value, sigma = left.split()[-1], right.split()[0]
+        assert len(sigma.replace(".", "").lstrip("0")) == 2
+        assert len(value.partition(".")[2]) == len(sigma.partition(".")[2])
+
+
+# --- forecast --------------------------------------------------------------------------------------------
+
+
+def test_a_forecast_begins_now_and_its_sigma_grows(record: Path, life: Path) -> None:
+    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
+    told, now = said("forecast", record), said("status", record)["estimate"]["now"]
+    assert len(told["times_utc"]) == 5
+    assert told["times_utc"][0] == now["times_utc"][0]
+    assert told["times_utc"][-1] == utc_text(START + (DAYS - EVERY + 30) * DAY)
+    key = "d_alpha_arcsec"
+    assert told["forward"][key][0] == now["forward"][key][0]
+    assert told["forward"][f"{key}_sigma"] == sorted(told["forward"][f"{key}_sigma"])
+    (requirement,) = told["requirements"]
+    assert (requirement["quantity"], requirement["limit"]) == ("intersection_angle change_arcsec", 30.0)
+    until = said("forecast", record, "--until", "2026-07-01T00:00:00Z", "--steps", 2)
+    assert until["times_utc"][2] == "2026-07-01T00:00:00Z"
+    done = run("forecast", record)
+    assert "forecast from 2026-06-25T00:00:00Z to 2026-07-25T00:00:00Z" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("until", "text"),
+    [
+        ("2026-04-01T00:00:00Z", "is not after the newest reading, 2026-06-25T00:00:00Z"),
+        ("April", "--until: not a date and time"),
+    ],
+)
+def test_a_forecast_of_what_is_past(until: str, text: str, record: Path, life: Path) -> None:
+    done = run("forecast", record, life / "plan.yaml", "--until", until)
+    assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
+
+
+# --- alarms ----------------------------------------------------------------------------------------------
+
+
+def test_ingest_raises_alarms_once(record: Path, life: Path, tmp_path: Path) -> None:
+    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
+    (tmp_path / "tm.yaml").write_text(TABLE)
+    (tmp_path / "t.csv").write_text("time,T\n2026-06-25T06:00:00Z,293.1\n".replace("time", "UTC"))
+    first = said("ingest", record, tmp_path / "tm.yaml")
+    assert first["new"] == 1
+    assert len(first["alarms"]) == 2
+    assert any(f"{BODY} jumped between" in one for one in first["alarms"])
+    (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T12:00:00Z,293.1\n")
+    done = run("ingest", record, tmp_path / "tm.yaml")
+    assert "alarm: " not in done.stdout
+    assert len(said("alarms", record)["alarms"]) == 2
+    assert said("ingest", record, tmp_path / "tm.yaml")["alarms"] == []
+
+
+def test_an_estimate_that_fails_does_not_hide_what_was_taken(record: Path, life: Path, tmp_path: Path) -> None:
+    with History(str(record)) as history:
+        content = plan_of(life).plain()
+        content["operation"]["window"] = -1  # as of another program
+        history.keep_plan("plan.yaml", content)
+    (tmp_path / "tm.yaml").write_text(TABLE)
+    (tmp_path / "t.csv").write_text("UTC,T\n2026-06-25T06:00:00Z,293.1\n")
+    done = run("ingest", record, tmp_path / "tm.yaml")
+    assert done.exit_code == 0
+    assert "1 taken" in done.stdout
+    said_so = " ".join(done.stderr.split())
+    assert "what was taken is in the record, and the estimate cannot be worked out: the record's plan" in said_so
+
+
+def test_alarms_are_listed_and_acknowledged(record: Path, life: Path) -> None:
+    run("status", record, life / "plan.yaml")
+    assert "2 alarms are open, 2 in all" in run("alarms", record).stdout
+    done = run("alarms", record, "--acknowledge", 2, "--by", "Ann", "--note", "after safe mode")
+    assert done.exit_code == 0, done.stderr
+    *_, last = done.stdout.splitlines()
+    assert last.startswith("alarm 2")
+    assert "(seen by Ann: after safe mode)" in last
+    told = said("alarms", record)
+    assert told["open"] == 1
+    assert told["alarms"][1]["acknowledged"]["note"] == "after safe mode"
+    assert "1 alarm is open" in run("status", record, life / "plan.yaml").stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--acknowledge", 1), "who has seen the alarm? --by NAME"),
+        (("--acknowledge", 1, "--by", " "), "who has seen the alarm? --by NAME"),
+        (("--acknowledge", 9, "--by", "Ann"), "no such alarm; found 9, allowed: none: no alarm was raised"),
+        (("--by", "Ann"), "which alarm? --acknowledge ID"),
+    ],
+)
+def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: Path) -> None:
+    done = run("alarms", record, *words)
+    assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
+
+
+PLAN = OperationSpec(
+    instrument="monitor_pair",
+    disturbances="own",
+    mission="87600 h",
+    requirements=(RequirementSpec(quantity="forward d_f_um", limit="20 um"),),
+)
+
+
+def told_of(following: Following) -> Iterator[tuple[str, str]]:
+    return ((one.kind, one.text) for one in alarms_of(PLAN, following))
+
+
+def clean(following: Following) -> Following:
+    """With nothing to be told of."""
+    return replace(following, breaks=(), jumps=(), sensors=(), innovations=())
+
+
+def test_what_is_told_of_requirements(following: Following) -> None:
+    one = Break("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, following.time)
+    soon = replace(one, chance_now=0.01, holds_now=True, breaks_us=following.time + 3 * DAY)
+    never = replace(soon, breaks_us=None)
+    assert list(told_of(replace(clean(following), breaks=(one, soon, never)))) == [
+        ("broken", "Δf of forward is beyond 20 µm with a chance of 12 %; 5.0 % is allowed"),
+        (
+            "breaks",
+            "Δf of forward is expected to be beyond 20 µm with a chance above 5.0 % from "
+            f"{utc_text(following.time + 3 * DAY)} on",
+        ),
+    ]
+
+
+def test_a_reading_that_contradicts_what_is_stated(following: Following) -> None:
+    """The newest of several; the chance of a false alarm is spent by time, and a jump explains what came with it."""
+    times = [following.time - k * DAY for k in (4, 3, 2, 1)]
+    own = clean(following)
+    # of eight coordinates 50 is exceeded with a chance of 4e-8; a day's share of 1e-3 in ten years is 2.7e-7
+    seen = tuple((time, square, 8) for time, square in zip(times, (90.0, 50.0, 50.0, 8.0), strict=True))
+    (found,) = alarms_of(PLAN, replace(own, innovations=seen))
+    assert (found.kind, found.time) == ("contradiction", times[2])
+    assert "chi-square 50 of 8 coordinates, at most 45.7" in found.text
+    assert list(alarms_of(PLAN, replace(own, innovations=tuple((t, 45.0, 8) for t in times)))) == []
+    jump = FoundJump("base/forward/M1", times[1], times[2], times[3], (), 30.0, 1e-9, {})
+    kinds = [kind for kind, _ in told_of(replace(own, innovations=seen[1:], jumps=(jump,)))]
+    assert kinds == ["jump"]
+
+
+def test_what_goes_on_is_told_again_a_month_after_somebody_has_seen_it(record: Path, following: Following) -> None:
+    def raised(history: History, days: float) -> list[str]:
+        time = following.time + round(days * DAY)
+        one = Break("forward d_f_um", "µm", 20.0, 0.95, 0.12, False, time)
+        seen = ((time - DAY, 5.0, 8), (time, 80.0, 8))
+        sensor = SensorState("base/forward", "doubtful", time, time, "3 of the last 10 readings")
+        now = replace(clean(following), time=time, breaks=(one,), innovations=seen, sensors=(sensor,))
+        return [alarm.kind for alarm in raise_alarms(history, PLAN, now)]
+
+    assert AGAIN == 30 * DAY
+    with History(str(record)) as history:
+        assert raised(history, 0) == ["broken", "sensor", "contradiction"]
+        assert raised(history, 0) == raised(history, 40) == []
+        for k in (1, 2, 3):
+            history.acknowledge(k, "Ann", "")
+        assert raised(history, 0) == []
+        assert raised(history, 29) == ["contradiction"]  # every reading is one of its own
+        history.acknowledge(4, "Ann", "")
+        assert raised(history, 31) == ["broken", "sensor", "contradiction"]
+
+
+def test_a_jump_whose_time_is_known_better_is_the_same(record: Path, following: Following) -> None:
+    (jump,) = following.jumps
+    with History(str(record)) as history:
+        assert [one.subject for one in raise_alarms(history, PLAN, replace(clean(following), jumps=(jump,)))] == [BODY]
+        better = replace(jump, after_us=jump.after_us + DAY, until_us=jump.until_us - DAY)
+        assert raise_alarms(history, PLAN, replace(clean(following), jumps=(better,))) == []
+        other = replace(jump, after_us=jump.until_us, until_us=jump.until_us + DAY)
+        assert len(raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other)))) == 1
+        history.acknowledge(1, "Ann", "")
+        assert raise_alarms(history, PLAN, replace(clean(following), jumps=(jump, other))) == []
+
+
+def test_an_estimate_is_used_from_python(record: Path, life: Path) -> None:
+    """As the documentation shows it."""
+    with History(str(record)) as history:
+        keep_plan(plan_of(life), life / "plan.yaml", history)
+        plan = kept_plan(history)
+        assert plan is not None
+        operation = Operation(history, plan)
+        found, new = known_of(operation)
+        assert {type(one) for one in new} == {Alarm}
+        assert operation.forecast([found.time + DAY]).values.shape == (1, len(operation.quantities))
