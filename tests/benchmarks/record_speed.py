@@ -1,4 +1,6 @@
-"""The record of an instrument in operation: one reading more after one year and after ten."""
+"""An instrument in operation: one reading more after one year and after ten, in the record and in the estimate, and the
+whole past smoothed.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,16 @@ import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+
+from scenes.specs.operation import read_operation
 from tests.benchmarks.number import Limit, Number, Speed
 from tests.benchmarks.workbench import Workbench
 from tests.twin.record_bench import A_DAY, START, given, made
 from twin.operate.database import FILE
 from twin.operate.entries import Entry
 from twin.operate.history import History
+from twin.operate.operation import Operation
 
 MS = 50.0
 GROWS = 1.5
@@ -21,18 +27,30 @@ DAYS = 365
 REPEATS = 41
 CAMERAS, ESTIMATORS = ("forward", "backward"), ("paper_single", "paper_joint", "derived", "model", "posterior")
 NUMBERS = ("d_alpha_arcsec", "d_beta_arcsec", "d_gamma_arcsec", "d_f_um")
+NOISE = 8e-4
+"""Px of a spot's coordinate."""
+PLAN = "scenes/examples/operation.yaml"
+SMOOTHED = 60.0
+"""Seconds that the whole past of ten years may take."""
 
 
 def reading(k: int) -> Entry:
-    """A reading of the monitor with as many numbers as `twin.recover` gives of two cameras."""
+    """A reading of the monitor with as many numbers as `twin.recover` gives of two cameras that do not move."""
     value = 1.0 / (k + 3.0)
     one = {f"{name}{end}": value for name in NUMBERS for end in ("", "_sigma", "_sigma_noise")}
-    spots = {"row": value, "column": value, "row_sigma": value, "column_sigma": value}
-    first = dict.fromkeys(spots, 1.0)  # of the same reference images
+    places = iter((47.5 + NOISE * np.random.default_rng(k).standard_normal(8)).tolist())
+    sigma = {"row_sigma": NOISE, "column_sigma": NOISE}
     numbers = {
         "cameras": {camera: dict.fromkeys(ESTIMATORS, one) for camera in CAMERAS},
         "spots": {
-            camera: {side: {"before": first, "after": spots} for side in ("left", "right")} for camera in CAMERAS
+            camera: {
+                side: {
+                    "before": {"row": 47.5, "column": 47.5, **sigma},
+                    "after": {"row": next(places), "column": next(places), **sigma},
+                }
+                for side in ("left", "right")
+            }
+            for camera in CAMERAS
         },
         "sigma_holds": True,
     }
@@ -43,23 +61,41 @@ def reading(k: int) -> Entry:
 def measure(bench: Workbench, quick: bool) -> Speed:
     """Milliseconds by wall clock, the disk included, median; and the size of the record."""
     years = (1,) if quick else (1, 5, 10)
-    numbers, medians, done = [], [], 0
+    numbers, medians, followed, done = [], [], [], 0
+    plan = read_operation(PLAN)
     with tempfile.TemporaryDirectory() as name:
         with made(Path(name) / "record") as history:
             for year in years:
                 done = _filled(history, done, DAYS * A_DAY * year)
-                spent = []
+                estimate = Operation(history, plan)
+                estimate.standing()
+                spent, more = [], []
                 for _ in range(REPEATS):
                     start = time.perf_counter()
                     assert history.take(given(f"one{done}", [reading(done)])).new == 1
-                    spent.append(time.perf_counter() - start)
+                    taken = time.perf_counter()
+                    estimate = estimate.again()
+                    estimate.standing()
+                    spent.append(taken - start)
+                    more.append(time.perf_counter() - taken)
                     done += 1
                 medians.append(1e3 * sorted(spent)[REPEATS // 2])
+                followed.append(1e3 * sorted(more)[REPEATS // 2])
                 text = f"one reading after {year} year{'s' if year > 1 else ''} of {A_DAY} a day"
                 numbers.append(Number(f"reading_{year}_ms", medians[-1], text, "ms", Limit(MS)))
+                numbers.append(
+                    Number(f"estimate_{year}_ms", followed[-1], "  and the estimate after it", "ms", Limit(MS))
+                )
+            start = time.perf_counter()
+            estimate.smoothed(START + 86_400_000_000 * np.arange(DAYS * years[-1], dtype=np.int64))
+            spent_s = time.perf_counter() - start
+            text = f"the state of every day of {years[-1]} years by all {done} readings"
+            numbers.append(Number("smoothed_s", spent_s, text, "s", Limit(SMOOTHED)))
         size = (Path(name) / "record" / FILE).stat().st_size
     if not quick:
         numbers.append(Number("grows", medians[-1] / medians[0], "  after ten years over after one", "", Limit(GROWS)))
+        ratio = followed[-1] / followed[0]
+        numbers.append(Number("estimate_grows", ratio, "  of the estimate", "", Limit(GROWS)))
     per = len(json.dumps(reading(0).content))
     numbers.append(Number("size_MB", 1e-6 * size, f"  size of the record then, {per} letters a reading", "MB"))
     return Speed(tuple(numbers))

@@ -114,12 +114,23 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
             Operation(history, plan).follow()
     assert Operation(history, plan).follow().to_dict() == result
     assert Operation(history, plan).smoothed(life.times).to_dict() == past
+    history, estimate = record_of(tmp_path / "again", plan), None
+    for k in range(0, len(entries), 7):
+        history.take(given(f"piece{k}", entries[k : k + 7]))
+        estimate = Operation(history, plan) if estimate is None else estimate.again()
+        estimate.standing()
+    assert estimate is not None
+    assert estimate.follow().to_dict() == result
+    assert estimate.smoothed(life.times).to_dict() == past
     history = record_of(tmp_path / "late", plan)
     late = [one for k, one in enumerate(entries) if k % 9 == 4]
     history.take(given("first", [one for one in entries if one not in late]))
     Operation(history, plan).follow()
+    estimate = Operation(history, plan)
+    estimate.standing()
     history.take(given("late", late), late=True)
     assert Operation(history, plan).follow().to_dict() == result
+    assert estimate.again().follow().to_dict() == result
 
 
 def test_a_part_of_the_past_is_that_of_the_whole(known, tmp_path, monkeypatch) -> None:

@@ -236,6 +236,17 @@ class History:
         with self.reading() as connection:
             return int(connection.execute(select(func.max(ENTRY.c.id))).scalar_one() or 0)
 
+    def came_late(self, after_id: int, until_us: int) -> bool:
+        """Whether an entry up to a time was taken after another one.
+
+        Args:
+            after_id: the id of that.
+            until_us: the time, microseconds of TAI since 2000.
+        """
+        query = select(ENTRY.c.id).where(ENTRY.c.id > after_id, ENTRY.c.time_us <= until_us).limit(1)
+        with self.reading() as connection:
+            return connection.execute(query).first() is not None
+
     def checkpoint(
         self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
     ) -> Checkpoint | None:

@@ -40,6 +40,8 @@ EVERY = 1000
 """Readings after which it is kept for good where the estimate stands."""
 _USED = ("monitor", "temperature")
 """Sorts of entries that change the estimate; events do by what they step."""
+HEAD = 16
+"""Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
 _MODEL, _HEAD = -1, 0
 """Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
 
@@ -243,6 +245,7 @@ class Operation:
         history: the record.
         plan: with its instrument, that of the record.
         advance: called with the number of readings that were taken, of how many.
+        before_it: the same before some readings came; None for none. See `again`.
 
     Raises:
         Problem: the record has no reading of the monitor.
@@ -254,8 +257,11 @@ class Operation:
         history: History,
         plan: OperationSetup,
         advance: Callable[[int, int], None] = lambda done, of: None,
+        before_it: Operation | None = None,
     ) -> None:
         self.history, self.plan, self._advance = history, plan, advance
+        self._stood: tuple[Standing | None, int] = None, 0
+        self._newest = self._saved = 0
         first = history.first("monitor")
         if first is None:
             allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
@@ -268,10 +274,21 @@ class Operation:
         ]
         self._before = {(camera, channel): one for camera, channel, one in before}
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
+        self._plan_digest: str = plan_digest(plan) if before_it is None else before_it._plan_digest
         self.key = digest_of_data(
-            [source_digest(), plan_digest(plan), self.epoch, list(self._sensors), [list(one) for one in before]]
+            [source_digest(), self._plan_digest, self.epoch, list(self._sensors), [list(one) for one in before]]
         )
         """By which it is recognised what an estimate rests on beside the readings."""
+        if before_it is not None and before_it.key == self.key:
+            known = vars(before_it)
+            vars(self).update({name: known[name] for name in ("experiment", "model") if name in known})
+            if "_taking" in known and before_it.events == self.events:
+                vars(self)["_taking"] = known["_taking"]
+                self._stood, self._saved = (known.get("_standing"), before_it._newest), before_it._saved
+
+    def again(self) -> Operation:
+        """The estimate of the same record under the same plan with what has come since; quicker than a new one."""
+        return Operation(self.history, self.plan, self._advance, self)
 
     @cached_property
     def experiment(self) -> MonitorExperiment:
@@ -318,6 +335,10 @@ class Operation:
         for _, together in groupby(own, key=lambda one: int(one["time_us"])):
             yield [{**one, "content": content_of(one)} for one in together]
 
+    def standing(self) -> Standing:
+        """Take all readings that are new; where the estimate stands then."""
+        return self._standing
+
     @cached_property
     def _standing(self) -> Standing:
         """After all readings."""
@@ -325,15 +346,9 @@ class Operation:
             return self._followed()
 
     def _followed(self) -> Standing:
-        taking, newest, standing = self._taking, self.history.newest_id(), None
-        kept = self.history.checkpoint(self.key, valid=True)
-        if kept is not None:
-            standing = Standing.from_bytes(kept.content)
-            if kept.number > _HEAD:  # what was used up to then is kept with it
-                standing = standing.anew()
-            if not self._fits(standing):
-                self.history.drop_checkpoints(self.key, self.epoch)
-                standing = None
+        taking, newest = self._taking, self.history.newest_id()
+        self._newest = newest
+        standing = self._kept()
         moments = list(self._moments(None if standing is None else standing.time))
         for count, entries in enumerate(moments):
             if standing is None:
@@ -346,9 +361,27 @@ class Operation:
                 standing = standing.anew()
             self._advance(count + 1, len(moments))
         assert standing is not None  # there is a reading of the monitor
-        if moments:
+        if standing.scores.readings >= self._saved + HEAD:
             self._keep(standing, _HEAD, newest)
+            self._saved = standing.scores.readings
         return standing
+
+    def _kept(self) -> Standing | None:
+        """Where the estimate stood before what is new; None for nowhere."""
+        standing, newest = self._stood
+        if standing is not None and not self.history.came_late(newest, standing.time):
+            return standing
+        kept = self.history.checkpoint(self.key, valid=True)
+        if kept is None:
+            return None
+        standing = Standing.from_bytes(kept.content)
+        self._saved = standing.scores.readings
+        if not self._fits(standing):
+            self.history.drop_checkpoints(self.key, self.epoch)
+            self._saved = 0
+            return None
+        # what was used up to one that is kept for good is kept with it
+        return standing.anew() if kept.number > _HEAD else standing
 
     def _fits(self, standing: Standing) -> bool:
         """Whether states that were kept are those of this computer's linear algebra."""
