@@ -98,11 +98,14 @@ def run_folder(
 
 def ingesting(record: Path | str, *words: object) -> subprocess.Popen[str]:
     """A process that takes files into a record."""
-    command = [sys.executable, "-m", "twin.operate", "ingest", str(record), *map(str, words)]
+    return operating("ingest", record, *words)
+
+
+def operating(command: str, record: Path | str, *words: object) -> subprocess.Popen[str]:
+    """A process that runs a command of twin.operate."""
+    line = [sys.executable, "-m", "twin.operate", command, str(record), *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return subprocess.Popen(line, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def postgres_programs() -> Path | None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from tests.twin.operation_records import (
     record_of,
     temperature_entry,
 )
+from tests.twin.record_bench import operating
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.__main__ import app
 from twin.operate.alarms import AGAIN, alarms_of, raise_alarms
@@ -234,6 +236,26 @@ def test_alarms_are_listed_and_acknowledged(record: Path, life: Path) -> None:
 def test_who_has_seen_which_alarm(words: tuple[object, ...], text: str, record: Path) -> None:
     done = run("alarms", record, *words)
     assert (done.exit_code, text in done.stderr) == (2, True), done.stderr
+
+
+@pytest.mark.second
+def test_kills_while_a_record_is_followed(record: Path, life: Path, tmp_path: Path) -> None:
+    """What the estimate is, and which alarms there are, does not depend on where it was killed before."""
+    run("init", record, "monitor_pair", "--plan", life / "plan.yaml")
+    shutil.copytree(record, tmp_path / "whole")
+    start = time.monotonic()
+    process = operating("status", tmp_path / "whole", "--json")
+    whole = json.loads(process.communicate(timeout=120)[0])
+    seconds = time.monotonic() - start
+    for k in range(4):
+        place = shutil.copytree(record, tmp_path / f"killed{k}")
+        process = operating("status", place)
+        time.sleep(seconds * (0.4 + 0.17 * k))
+        process.kill()
+        process.communicate()
+        told = json.loads(operating("status", place, "--json").communicate(timeout=120)[0])
+        assert told["estimate"] == whole["estimate"]
+        assert told["open_alarms"] == whole["open_alarms"] == 2
 
 
 PLAN = OperationSpec(
