@@ -231,3 +231,26 @@ def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
 def test_noise_is_what_the_records_say() -> None:
     """So that the counts above can fail."""
     assert NOISE > 0.0
+
+
+def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> None:
+    """Mounts that move four times as far as stated, and sigmas as wide as the readings ask for, said so."""
+    stated = known[2]
+    life = life_of(stated, 60.0, 3.0, 11, {})
+    far = np.where([label.endswith("temperature") for label in stated.labels], 1.0, 8.0)
+    life = Life(life.times, life.motions * far, (life.motions * far) @ stated.parameters.T)
+    estimate = followed(known, tmp_path, entries_of(known, life, 11))
+    told = estimate.follow()
+    assert told.widened > 2.0
+    squares = np.array([(square, degrees) for _, square, degrees in told.innovations])
+    for span in (1, 3, 10):
+        ratio = np.sqrt(squares[-span:, 0].sum() / squares[-span:, 1].sum())
+        assert told.widened >= ratio - 1e-12 or ratio < 2.0
+    plain = estimate.standing().belief
+    _, covariance = estimate.model.how.parameters_of(plain.mean, plain.covariance, plain.time)
+    assert np.allclose(told.now.covariance[0], told.widened**2 * covariance, rtol=1e-9)
+    course = estimate.smoothed(life.times)
+    wrong = np.abs(course.values - life.changes @ estimate.model.rows.T) / course.sigmas
+    assert np.all(wrong < 6.0)
+    calm = life_of(stated, 60.0, 3.0, 12, {})
+    assert followed(known, tmp_path, entries_of(known, calm, 12), "calm").follow().widened == 1.0

@@ -8,7 +8,6 @@ alarm that somebody has seen.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
 from typing import Any
 
 from analysis.chi_square import chance_beyond, limit_of
@@ -127,10 +126,16 @@ def _contradictions(plan: OperationSpec, following: Following) -> Iterator[Alarm
     Of the chance of a false alarm in the whole life each reading has the share of the time since the one before it.
     """
     spans = [(one.after_us, one.told_us) for one in following.jumps]
-    for (before, _, _), (time, chi_square, degrees) in pairwise(following.innovations):
+    told = following.innovations
+    # the first of all has no other before it, and a chance of a false alarm of its own
+    befores = (
+        [told[0][0] - round(plan.mission * MICRO) if following.readings == len(told) else told[0][0]] if told else []
+    )
+    befores += [time for time, _, _ in told[:-1]]
+    for before, (time, chi_square, degrees) in zip(befores, told, strict=True):
         share = min((time - before) / (plan.mission * MICRO), 1.0)
         chance = float(chance_beyond(chi_square, degrees))
-        if chance >= FALSE_ALARM * share or any(after < time <= told for after, told in spans):
+        if share <= 0.0 or chance >= FALSE_ALARM * share or any(after < time <= told for after, told in spans):
             continue
         limit = float(limit_of(FALSE_ALARM * share, degrees))
         text = (

@@ -168,6 +168,9 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         one, two = (100.0 * part / scores.components for part in (scores.within_one, scores.within_two))
         text = f"{one:.1f} % within one sigma (68.3 % expected), {two:.1f} % within two (95.4 %)"
         line(console, f"predictions before the readings came: {text}; mean log score {scores.log_score:.2f}")
+    if following.widened > 1.0:
+        text = f"all sigmas are {following.widened:.3g} times as wide as it would make them"
+        line(console, f"warning: the last readings contradict what is stated; {text}")
     for jump in following.jumps:
         between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
         sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)

@@ -7,15 +7,14 @@ kept before it. The result is the same to the bit whenever it is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
@@ -26,13 +25,14 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.operate.entries import MICRO, digest_of_data, utc_text
+from twin.operate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
 from twin.operate.history import History, content_of
 from twin.operate.operation_model import OperationModel, traced_model
 from twin.operate.plans import plan_digest
-from twin.operate.standing import Scores, Standing, Taking
+from twin.operate.standing import Standing, Taking
 from twin.run.provenance import source_digest
 
-__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState"]
+__all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]
 
 Array = NDArray[np.float64]
 DAY = 86_400 * MICRO
@@ -44,198 +44,6 @@ HEAD = 16
 """Readings since it was kept after which it is kept at all: to follow as many again is as quick as to write it down."""
 _MODEL, _HEAD = -1, 0
 """Numbers under which a record keeps what was traced, and where the estimate stands after all readings."""
-
-
-@dataclass(frozen=True, eq=False)
-class Course:
-    """Estimate at T times.
-
-    Attributes:
-        times: (T,) microseconds of TAI since 2000.
-        quantities: Q that are read.
-        values: (T, Q) in each one's unit, changes since the calibration.
-        sigmas: (T, Q) their total standard deviations.
-        changes: (T, 4 K) d_alpha, d_beta, d_gamma (rad), d_f (m) of one camera after the other.
-        covariance: (T, 4 K, 4 K) of their errors.
-    """
-
-    times: NDArray[np.int64]
-    quantities: tuple[Quantity, ...]
-    values: Array
-    sigmas: Array
-    changes: Array
-    covariance: Array
-
-    @property
-    def utc(self) -> tuple[str, ...]:
-        """The times."""
-        return tuple(utc_text(int(time)) for time in self.times)
-
-    def column(self, group: str, key: str) -> int:
-        """Number of a quantity. Raises ValueError."""
-        return [(one.group, one.key) for one in self.quantities].index((group, key))
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data: group -> key -> values at all times, with sigmas beside them."""
-        out: dict[str, Any] = {"times_utc": list(self.utc)}
-        for k, one in enumerate(self.quantities):
-            own = out.setdefault(one.group, {})
-            own |= {one.key: self.values[:, k].tolist(), f"{one.key}_sigma": self.sigmas[:, k].tolist()}
-        return out
-
-
-@dataclass(frozen=True)
-class FoundJump:
-    """A jump that was told.
-
-    Attributes:
-        body: that explains it best; rivals: others -> their log likelihood ratio.
-        after_us, until_us: between which readings it came; told_us: at which it was told.
-        sizes: (motion, unit, size, sigma).
-        log_ratio: of the likelihoods with it and without it, when it was told.
-        false_alarm: chance of as large a ratio anywhere in the whole life without a jump, at most.
-    """
-
-    body: str
-    after_us: int
-    until_us: int
-    told_us: int
-    sizes: tuple[tuple[str, str, float, float], ...]
-    log_ratio: float
-    false_alarm: float
-    rivals: Mapping[str, float]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        return {
-            "body": self.body,
-            "after_utc": utc_text(self.after_us),
-            "until_utc": utc_text(self.until_us),
-            "told_utc": utc_text(self.told_us),
-            "sizes": [{"name": n, "unit": u, "size": z, "sigma": s} for n, u, z, s in self.sizes],
-            "log_ratio": self.log_ratio,
-            "false_alarm": self.false_alarm,
-            "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
-        }
-
-
-@dataclass(frozen=True)
-class SensorState:
-    """What a sensor of temperature is worth.
-
-    Attributes:
-        body: where it is.
-        state: ``ok``, ``dead``, ``stuck`` or ``doubtful``.
-        since_us: since when; last_us: its newest reading.
-        reason: why, empty where it is ok.
-    """
-
-    body: str
-    state: str
-    since_us: int
-    last_us: int
-    reason: str
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        times = {"since_utc": utc_text(self.since_us), "last_utc": utc_text(self.last_us)}
-        return {"body": self.body, "state": self.state, "reason": self.reason, **times}
-
-
-@dataclass(frozen=True)
-class Break:
-    """A requirement.
-
-    Attributes:
-        quantity: group and key; unit: of its limit.
-        limit: that the size of its change must not exceed; probability: with which.
-        chance_now: that it does now.
-        holds_now: whether that is rare enough.
-        breaks_us: time from which on it is not, within the horizon; None if it does not come.
-    """
-
-    quantity: str
-    unit: str
-    limit: float
-    probability: float
-    chance_now: float
-    holds_now: bool
-    breaks_us: int | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        own = {key: value for key, value in vars(self).items() if key != "breaks_us"}
-        return {**own, "breaks_utc": None if self.breaks_us is None else utc_text(self.breaks_us)}
-
-
-@dataclass(frozen=True, eq=False)
-class Motions:
-    """Every stated motion at one time.
-
-    Attributes:
-        time: microseconds.
-        labels: M names; units: theirs.
-        mean: (M,) in these units. covariance: (M, M) of their errors.
-    """
-
-    time: int
-    labels: tuple[str, ...]
-    units: tuple[str, ...]
-    mean: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Following:
-    """What is known after all readings of a record.
-
-    Attributes:
-        time: of the newest, microseconds.
-        readings: of the monitor that were used.
-        now: the state.
-        scores: of predictions made before each reading came.
-        innovations: (time_us, chi-square, degrees of freedom) of the last readings.
-        jumps: that were told.
-        events: (time_us, name, causes that stepped).
-        sensors: what those of temperature are worth.
-        left_out: (time_us, kind, subject, reason) of the last entries that were not used.
-        explained: quantity -> share of its scatter that temperatures explain.
-        breaks: the requirements.
-    """
-
-    time: int
-    readings: int
-    now: Course
-    scores: Scores
-    innovations: tuple[tuple[int, float, int], ...]
-    jumps: tuple[FoundJump, ...]
-    events: tuple[tuple[int, str, tuple[str, ...]], ...]
-    sensors: tuple[SensorState, ...]
-    left_out: tuple[tuple[int, str, str, str], ...]
-    explained: Mapping[str, float]
-    breaks: tuple[Break, ...]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain data."""
-        return {
-            "time_utc": utc_text(self.time),
-            "readings": self.readings,
-            "now": self.now.to_dict(),
-            "scores": vars(self.scores),
-            "innovations": [
-                {"time_utc": utc_text(t), "chi_square": square, "degrees_of_freedom": degrees}
-                for t, square, degrees in self.innovations
-            ],
-            "jumps": [one.to_dict() for one in self.jumps],
-            "events": [{"time_utc": utc_text(t), "name": name, "causes": list(c)} for t, name, c in self.events],
-            "sensors": [one.to_dict() for one in self.sensors],
-            "left_out": [
-                {"time_utc": utc_text(t), "kind": kind, "subject": subject, "reason": reason}
-                for t, kind, subject, reason in self.left_out
-            ],
-            "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
-            "requirements": [one.to_dict() for one in self.breaks],
-        }
 
 
 class Operation:
@@ -414,6 +222,7 @@ class Operation:
             tuple(sorted(sensors, key=lambda one: one.body)),
             standing.left_out,
             dict(zip(names, standing.explained.tolist(), strict=True)),
+            self._widened,
             self._breaks(),
         )
 
@@ -454,12 +263,29 @@ class Operation:
             raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
         how, belief = self._taking.how, self._standing.belief
         with one_blas_thread():
-            return self._course(times, [how.parameters(belief, self._taking.seconds(int(time))) for time in times])
+            found = [how.parameters(belief, self._taking.seconds(int(time))) for time in times]
+        return self._course(times, found, np.full(len(times), self._widened))
 
-    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]]) -> Course:
+    @cached_property
+    def _widened(self) -> float:
+        """Of sigmas now, where the last readings contradict what is stated."""
+        squares = self._unexplained(self._standing.innovations)
+        return float(widening(squares, [len(squares)], False)[0])
+
+    def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
+        """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told."""
+        jumps = [self._found(one.time, one.jump) for one in self._standing.jumps]
+        out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
+        times = np.array([time for time, _, _ in innovations], np.int64)
+        for one in jumps:
+            out[(times > one.after_us) & (times <= one.told_us)] = 0.0
+        return out
+
+    def _course(self, times: NDArray[np.int64], found: Sequence[tuple[Array, Array]], widened: Array) -> Course:
         rows = self.model.rows
         changes = np.array([one for one, _ in found]).reshape(len(times), rows.shape[1])
         covariance = np.array([one for _, one in found]).reshape(len(times), rows.shape[1], rows.shape[1])
+        covariance = covariance * widened[:, None, None] ** 2
         variance = np.einsum("qi,tij,qj->tq", rows, covariance, rows)
         sigmas = np.sqrt(np.maximum(variance, 0.0))
         return Course(times, self.quantities, changes @ rows.T, sigmas, changes, covariance)
@@ -474,7 +300,17 @@ class Operation:
             Problem: a time before it.
         """
         times = np.asarray(times_us, np.int64)
-        return self._course(times, self._past(times, self._taking.how.parameters_of))
+        found = self._past(times, self._taking.how.parameters_of)
+        return self._course(times, found, self._widened_at(times))
+
+    def _widened_at(self, times: NDArray[np.int64]) -> Array:
+        """(T,) of sigmas of times past; of those after the newest reading as it is now."""
+        told = [one for span in self._spans(None) for one in span.told]
+        squares = self._unexplained(told)
+        number = np.searchsorted([time for time, _, _ in told], times, side="right")
+        out = widening(squares, number, True)
+        out[times >= self._standing.time] = self._widened
+        return out
 
     def motions(self, time_us: int) -> Motions:
         """Every stated motion at one time, by all readings.
@@ -493,6 +329,7 @@ class Operation:
             lambda mean, covariance, time: how.motions_of(mean, covariance, time, since),
         )
         (mean, spread), size = found[0], stated.sigmas
+        spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2
         return Motions(int(time_us), stated.labels, stated.units, size * mean, size[:, None] * spread * size)
 
     @staticmethod
@@ -527,15 +364,20 @@ class Operation:
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
-        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
-        spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
-        if after_us is None or self._standing.time > after_us:
-            spans.append(self._standing)
+        spans = self._spans(after_us)
         if not spans:
             return np.zeros(0, np.int64), np.zeros((0, len(self._taking.how.walking)))
         width = len(self._taking.how.walking)
         left = np.concatenate([one.left.reshape(len(one.used), width) for one in spans])
         return np.concatenate([one.used for one in spans]), left
+
+    def _spans(self, after_us: int | None) -> list[Standing]:
+        """Where the estimate was kept for good after a time, and stands now; each knows what was used since the last."""
+        kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
+        spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
+        if after_us is None or self._standing.time > after_us:
+            spans.append(self._standing)
+        return spans
 
     def _begin(self) -> int:
         first = min(int(one["time_us"]) for kind in _USED if (one := self.history.first(kind)) is not None)
@@ -556,15 +398,3 @@ class Operation:
             if not earlier or min(earlier) >= kept.time:
                 return Standing.from_bytes(kept.content)
             time = min(earlier)
-
-
-def beyond(value: Array, sigma: Array, limit: float) -> Array:
-    """Chance that the size of something is larger than a limit.
-
-    Args:
-        value: what is expected of it.
-        sigma: its standard deviation, likewise.
-        limit: in the same unit.
-    """
-    scale = np.where(sigma > 0.0, sigma, 1e-300)
-    return np.asarray(ndtr((value - limit) / scale) + ndtr((-value - limit) / scale))

@@ -167,6 +167,7 @@ class Standing:
             algebra.
         used: (U,) ids of the entries that were used since it was last kept for good, in their order.
         left: (U, m) what share of the mean square of jumps could not be told before each of them.
+        told: innovations since then.
     """
 
     belief: Belief
@@ -180,6 +181,7 @@ class Standing:
     basis: Array = field(default_factory=lambda: np.zeros((0, 0)))
     used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     left: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    told: tuple[tuple[int, float, int], ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -202,7 +204,7 @@ class Standing:
 
     def anew(self) -> Standing:
         """The same, counting what is used from now on."""
-        return replace(self, used=self.used[:0], left=self.left[:0])
+        return replace(self, used=self.used[:0], left=self.left[:0], told=())
 
     def to_bytes(self) -> bytes:
         """All of it."""
@@ -224,6 +226,7 @@ class Standing:
             "time": self.time,
             "scores": asdict(self.scores),
             "innovations": self.innovations,
+            "told": self.told,
             "jumps": [{"time": one.time, "jump": asdict(one.jump)} for one in self.jumps],
             "sensors": [asdict(one) for one in self.sensors.values()],
             "left_out": self.left_out,
@@ -256,6 +259,7 @@ class Standing:
             arrays["basis"],
             arrays["used"],
             arrays["span"],
+            tuple((time, square, degrees) for time, square, degrees in plain["told"]),
         )
 
 
@@ -366,10 +370,12 @@ class Taking:
         belief, space, rows = standing.belief, self.how.space, self.model.rows
         values = rows @ self.how.parameters_of(belief.mean, belief.covariance, observed.time)[0]
         rest = values - rows @ space.heat_outputs(belief.mean, observed.time)[space.width :]
+        came = (time, found.chi_square, len(found.white))
         return replace(
             standing,
             scores=standing.scores.with_one(found.white, found.log_score),
-            innovations=(*standing.innovations, (time, found.chi_square, len(found.white)))[-KEPT:],
+            innovations=(*standing.innovations, came)[-KEPT:],
+            told=(*standing.told, came),
             jumps=standing.jumps if found.jump is None else (*standing.jumps, Told(time, found.jump)),
             spread=standing.spread + np.stack([values, values**2, rest, rest**2]),
         )
