@@ -11,7 +11,6 @@ from scipy.stats import binom
 from scenes.yaml.errors import Problem
 from tests.twin.operation_records import (
     DAY,
-    NOISE,
     START,
     Life,
     given,
@@ -228,11 +227,6 @@ def test_times_that_nobody_knows_anything_of(known, tmp_path) -> None:
         Operation(history, known[0])
 
 
-def test_noise_is_what_the_records_say() -> None:
-    """So that the counts above can fail."""
-    assert NOISE > 0.0
-
-
 def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> None:
     """Mounts that move four times as far as stated, and sigmas as wide as the readings ask for, said so."""
     stated = known[2]
@@ -242,10 +236,6 @@ def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> 
     estimate = followed(known, tmp_path, entries_of(known, life, 11))
     told = estimate.follow()
     assert told.widened > 2.0
-    squares = np.array([(square, degrees) for _, square, degrees in told.innovations])
-    for span in (1, 3, 10):
-        ratio = np.sqrt(squares[-span:, 0].sum() / squares[-span:, 1].sum())
-        assert told.widened >= ratio - 1e-12 or ratio < 2.0
     plain = estimate.standing().belief
     _, covariance = estimate.model.how.parameters_of(plain.mean, plain.covariance, plain.time)
     assert np.allclose(told.now.covariance[0], told.widened**2 * covariance, rtol=1e-9)

@@ -372,7 +372,7 @@ class Operation:
         return np.concatenate([one.used for one in spans]), left
 
     def _spans(self, after_us: int | None) -> list[Standing]:
-        """Where the estimate was kept for good after a time, and stands now; each knows what was used since the last."""
+        """Where the estimate was kept for good after a time and stands now; each knows what was used since the last."""
         kept = [one for one in self.history.checkpoints(self.key) if one.number > _HEAD]
         spans = [Standing.from_bytes(one.content) for one in kept if after_us is None or one.time > after_us]
         if after_us is None or self._standing.time > after_us:
