@@ -236,6 +236,7 @@ def test_readings_that_contradict_the_statement_widen_sigma(known, tmp_path) -> 
     estimate = followed(known, tmp_path, entries_of(known, life, 11))
     told = estimate.follow()
     assert told.widened > 2.0
+    assert told.too_many_jumps
     plain = estimate.standing().belief
     _, covariance = estimate.model.how.parameters_of(plain.mean, plain.covariance, plain.time)
     assert np.allclose(told.now.covariance[0], told.widened**2 * covariance, rtol=1e-9)

@@ -178,6 +178,7 @@ class Following:
         left_out: (time_us, kind, subject, reason) of the last entries that were not used.
         explained: quantity -> share of its scatter that temperatures explain.
         widened: by how much sigmas now are wider since the last readings contradict what is stated; 1 if they do not.
+        too_many_jumps: whether more jumps were told than is stated.
         breaks: the requirements.
     """
 
@@ -192,6 +193,7 @@ class Following:
     left_out: tuple[tuple[int, str, str, str], ...]
     explained: Mapping[str, float]
     widened: float
+    too_many_jumps: bool
     breaks: tuple[Break, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -214,6 +216,7 @@ class Following:
             ],
             "explained": {name: share if np.isfinite(share) else None for name, share in self.explained.items()},
             "widened": self.widened,
+            "too_many_jumps": self.too_many_jumps,
             "requirements": [one.to_dict() for one in self.breaks],
         }
 

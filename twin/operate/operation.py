@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import pdtrc
 
+from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
 from analysis.monitor.series_following import smoothed
@@ -223,6 +225,7 @@ class Operation:
             standing.left_out,
             dict(zip(names, standing.explained.tolist(), strict=True)),
             self._widened,
+            self.too_many_jumps,
             self._breaks(),
         )
 
@@ -272,9 +275,22 @@ class Operation:
         squares = self._unexplained(self._standing.innovations)
         return float(widening(squares, [len(squares)], False)[0])
 
+    @cached_property
+    def too_many_jumps(self) -> bool:
+        """Whether more jumps were told than is stated, one in a thousand times by chance; a body of which nothing is
+        stated of how often it jumps does so once.
+        """
+        stated, lasted = self.model.how.stated, (self._standing.time - self.epoch) / MICRO
+        every = {body: law.every_s for body, law in zip(stated.bodies, stated.laws, strict=True) if law.jump}
+        mean = sum(1.0 if rate is None else lasted / rate for rate in every.values())
+        count = len(self._standing.jumps)
+        return bool(count > 1 and pdtrc(count - 1, mean) < FALSE_ALARM)
+
     def _unexplained(self, innovations: Sequence[tuple[int, float, int]]) -> Array:
-        """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told."""
-        jumps = [self._found(one.time, one.jump) for one in self._standing.jumps]
+        """(N, 2) chi-square and degrees of freedom of readings; none of those that jumps explain which were told, but
+        where there are more of these than is stated: then it is not jumps that the readings ask for.
+        """
+        jumps = [] if self.too_many_jumps else [self._found(one.time, one.jump) for one in self._standing.jumps]
         out = np.array([(square, degrees) for _, square, degrees in innovations], np.float64).reshape(-1, 2)
         times = np.array([time for time, _, _ in innovations], np.int64)
         for one in jumps:
