@@ -172,7 +172,8 @@ def show_estimate(following: Following, rows: Sequence[Mapping[str, Any]], conso
         text = f"all sigmas are {following.widened:.3g} times as wide as it would make them"
         line(console, f"warning: the last readings contradict what is stated; {text}")
     if following.too_many_jumps:
-        line(console, f"warning: {len(following.jumps)} jumps are more than is stated: something else moves, or more of it")
+        text = f"{len(following.jumps)} jumps are more than is stated: something else moves, or more of it"
+        line(console, f"warning: {text}")
     for jump in following.jumps:
         between = f"between {utc_text(jump.after_us)} and {utc_text(jump.until_us)}"
         sizes = ", ".join(f"{name.removeprefix(f'{jump.body} ')} {sized(z, s, u)}" for name, u, z, s in jump.sizes)
