@@ -51,6 +51,8 @@ from scipy.stats import binom
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.jump_detection import Jump
+from analysis.monitor.series_filter import SeriesFilter, of_shifts
+from analysis.monitor.series_following import follow
 from optics.numerics.threads import one_blas_thread
 from tests.oracles.missions import DAY, NEAR, YEAR, Law, Mission, mission
 
@@ -157,9 +159,8 @@ Follower = Callable[[Disturbances, np.ndarray, np.ndarray, np.ndarray, np.ndarra
 
 def by_filter(told: Disturbances, times: np.ndarray, shifts: np.ndarray, noise: np.ndarray, wanted: np.ndarray) -> Life:
     """The filter of the product."""
-    from analysis.monitor.series_filter import SeriesFilter, follow
-
-    done = follow(SeriesFilter(told), times, shifts, noise, wanted)
+    how = SeriesFilter(told, life_s=float(times[-1] - times[0]))
+    done = follow(how, of_shifts(times, shifts, noise), wanted)
     late, now = (State(one.values, np.diagonal(one.total, 0, 1, 2).copy()) for one in (done.smoothed, done.filtered))
     return Life(
         late,
@@ -167,7 +168,7 @@ def by_filter(told: Disturbances, times: np.ndarray, shifts: np.ndarray, noise: 
         done.jumps,
         tuple((k, one.jump) for k, one in enumerate(done.innovations) if one.jump is not None),
         float(sum(one.chi_square for one in done.innovations)),
-        int(sum(one.degrees for one in done.innovations)),
+        int(sum(len(one.white) for one in done.innovations)),
         float(sum(one.log_score for one in done.innovations)),
     )
 
