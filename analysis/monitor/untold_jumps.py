@@ -113,7 +113,7 @@ class Hint:
 
 
 def _chances(hints: Sequence[Hint], window: int | None = None) -> list[Array]:
-    """(L,) chance p of a jump of each body at each place, one at most among so many places on either side, or in all."""
+    """(L,) chance p of a jump of each body at each place, one at most among so many places on either side, or all."""
     every = np.logaddexp.reduce([one.log_weight for one in hints], axis=0)
     if window is None:
         total = np.logaddexp(0.0, np.logaddexp.reduce(every))
