@@ -73,11 +73,13 @@ class Candidate:
         body: whose they are.
         motions: their numbers among the disturbances.
         spots: (D, r) px, for independent amounts of unit variance that make the stated motions.
+        root: (r, r) the motions by these amounts.
     """
 
     body: str
     motions: tuple[int, ...]
     spots: Array
+    root: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,8 @@ class Jump:
         chance: of as large a ratio anywhere in the series if nothing jumps, at most.
         rivals: other bodies -> their best log ratio at the same time, best first.
         times: standard deviations of the jump over those stated, which the smoother takes it to have.
+        together: numbers of all motions of the body that may have jumped with those that explain it; empty for these
+            alone.
     """
 
     body: str
@@ -125,6 +129,7 @@ class Jump:
     chance: float
     rivals: Mapping[str, float]
     times: float
+    together: tuple[int, ...] = ()
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -162,8 +167,8 @@ class Step:
 
     @classmethod
     def of(cls, jump: Jump) -> Step:
-        """Of a jump."""
-        return cls(jump.motions, jump.chances, jump.times)
+        """Of a jump, of all motions that may have taken part."""
+        return cls(jump.together or jump.motions, jump.chances, jump.times)
 
     def come(self, time: float) -> float:
         """Chance that it has come by a time, seconds."""
@@ -215,7 +220,7 @@ def candidates(stated: Disturbances) -> tuple[Candidate, ...]:
     for own in groups:
         values, vectors = np.linalg.eigh(stated.correlation[np.ix_(own, own)])
         root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root))
+        out.append(Candidate(stated.bodies[own[0]], own, stated.spots[:, own] @ root, root))
     return tuple(out)
 
 

@@ -10,9 +10,12 @@ Automat. Contr. 21, 1976, 108). With the response X of its own estimate to a ste
 are what `jump_detection.likeliest` needs, without going through a reading twice. The chance of a false alarm counts
 every look of the whole life: readings, places of the step and candidates (Boole's inequality, a bound). A jump that is
 told changes the estimate as if it had been known all along, (G - X) times its amounts, G what steps do to the states,
-as a mixture over the readings between which it can have come; so sigma is wide where that is not known.
+as a mixture over the readings between which it can have come; so sigma is wide where that is not known. All motions of
+the body that may jump are then free to have done so: what the readings did not tell yet of the others cannot be found
+later, since the places of the jump are given up.
 
-Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`.
+Jumps too small to be told are taken for a walk of their mean square, as in `jump_detection.with_unfound`, and what is
+known now and of the future counts those that the last readings hint at by their chances (`untold_jumps`).
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Steps, candidates, knots, likeliest
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
+from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
 __all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitened", "of_shifts", "series_of"]
 
@@ -451,38 +455,58 @@ class SeriesFilter:
 
     def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
         """What is known once a jump is told, and the jump with its sizes."""
-        own = list(jump.motions)
-        values, vectors = np.linalg.eigh(self.stated.correlation[np.ix_(own, own)])
-        root = vectors * np.sqrt(np.clip(values, 0.0, None))
-        outputs, level = self._stacked.spots[:, own] @ root, self.space.level_of(own) @ root
-        looked = Amounts.of(belief.looking.score, belief.looking.information, outputs, jump.times)
+        alone = next(one for one in self._may if one.motions == jump.motions)
+        whole = max((one for one in self._may if one.body == jump.body), key=lambda one: len(one.motions))
+        tracks = belief.looking, belief.state
+        looked, amounts = (Amounts.of(t.score, t.information, whole.spots, jump.times) for t in tracks)
         weight = np.exp(looked.log_weight - looked.log_weight.max()) * (belief.until - belief.after)
         weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
         weight /= weight.sum()
-        state = _compensated(
-            belief.state,
-            Amounts.of(belief.state.score, belief.state.information, outputs, jump.times),
-            weight,
-            level,
-            outputs,
-        )
+        level = self.space.level_of(whole.motions) @ whole.root
+        state = _compensated(belief.state, amounts, weight, level, whole.spots)
         search = None
         if belief.search is not None:
-            search = _compensated(belief.search, looked, weight, level, outputs)
-        amounts = Amounts.of(belief.state.score, belief.state.information, outputs, jump.times)
-        mean = weight @ amounts.mean
-        away = amounts.mean - mean
-        spread = np.einsum("k,kij->ij", weight, amounts.covariance + away[:, :, None] * away[:, None, :])
-        sigma = self.stated.sigmas[own]
-        sizes, sigmas = sigma * (root @ mean), sigma * np.sqrt(np.diag(root @ spread @ root.T))
+            search = _compensated(belief.search, looked, weight, level, whole.spots)
+        named = Amounts.of(belief.state.score, belief.state.information, alone.spots, jump.times)
+        mean = weight @ named.mean
+        away = named.mean - mean
+        spread = np.einsum("k,kij->ij", weight, named.covariance + away[:, :, None] * away[:, None, :])
+        sigma, root = self.stated.sigmas[list(alone.motions)], alone.root
         told = replace(
             jump,
-            sizes=tuple(sizes.tolist()),
-            sigmas=tuple(sigmas.tolist()),
+            sizes=tuple((sigma * (root @ mean)).tolist()),
+            sigmas=tuple((sigma * np.sqrt(np.diag(root @ spread @ root.T))).tolist()),
             chances=knots(belief.after, belief.until, weight),
+            together=whole.motions,
         )
         empty = np.zeros(0)
         return replace(belief, state=state, search=search, after=empty, until=empty), told
+
+    @cached_property
+    def jumpers(self) -> tuple[Jumper, ...]:
+        """Bodies that jump at a stated rate."""
+        return jumpers(self.stated, self._may) if self.unfound else ()
+
+    def blended(self, belief: Belief) -> Belief:
+        """What is known where jumps that are not told count by their chances, of the state now and of forecasts; later
+        readings go on from the belief that is given.
+
+        Args:
+            belief: so far.
+        """
+        if not self.jumpers or not len(belief.until):
+            return belief
+        track, looking, hints, moved = belief.state, belief.looking, [], []
+        for one in self.jumpers:
+            expected = (belief.until - belief.after) / one.every_s
+            looked, own = ((t.score, t.information) for t in (looking, track))
+            hints.append(Hint.of(looked, own, one.spots, expected))
+            moved.append(self.space.level_of(one.motions) @ one.root - track.response @ one.spots)
+        mean, covariance = blended(track.mean, track.covariance, hints, moved)
+        none = belief.until[:0]
+        return replace(
+            belief, after=none, until=none, state=replace(track.alone(), mean=mean, covariance=covariance), search=None
+        )
 
     def changes(self, belief: Belief, times: ArrayLike) -> SeriesChanges:
         """Forecast from what is known: parameters at times that are not before the newest reading.
@@ -491,14 +515,15 @@ class SeriesFilter:
             belief: so far.
             times: (T,) seconds.
         """
-        found = [self.parameters(belief, time) for time in np.asarray(times, np.float64).tolist()]
+        now = self.blended(belief)
+        found = [self.parameters(now, time) for time in np.asarray(times, np.float64).tolist()]
         return series_of(found, self.stated.parameters.shape[0])
 
     def parameters(self, belief: Belief, time: float) -> tuple[Array, Array]:
         """Parameters (P,) and their covariance (P, P).
 
         Args:
-            belief: so far.
+            belief: so far, as `blended` gives it where jumps count that are not told.
             time: not before its own, seconds.
         """
         state = self._moved(belief.state, belief.time, time, belief.left)
@@ -542,9 +567,7 @@ def _compensated(track: Track, amounts: Amounts, weight: Array, level: Array, ou
     spread = np.einsum("k,knr,krs,kms->nm", weight, moved, amounts.covariance, moved, optimize=True)
     away = (each - mean) * np.sqrt(weight)[:, None]
     covariance = track.covariance + spread + away.T @ away
-    q = track.score.shape[1]
-    none = np.zeros((0, len(mean), q)), np.zeros((0, q)), np.zeros((0, q, q))
-    return Track(track.mean + mean, 0.5 * (covariance + covariance.T), *none)
+    return replace(track.alone(), mean=track.mean + mean, covariance=0.5 * (covariance + covariance.T))
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

@@ -264,7 +264,7 @@ class Standing:
 
 
 def _jump(plain: dict[str, Any]) -> Jump:
-    lists = ("motions", "labels", "units", "sizes", "sigmas")
+    lists = ("motions", "labels", "units", "sizes", "sigmas", "together")
     chances = tuple((time, chance) for time, chance in plain["chances"])
     rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
     return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, "chances": chances, "rivals": rivals})
