@@ -44,6 +44,7 @@ __all__ = [
     "Steps",
     "candidates",
     "knots",
+    "larger",
     "likeliest",
     "sized",
     "steps",
@@ -112,8 +113,10 @@ class Jump:
         chance: of as large a ratio anywhere in the series if nothing jumps, at most.
         rivals: other bodies -> their best log ratio at the same time, best first.
         times: standard deviations of the jump over those stated, which the smoother takes it to have.
-        together: numbers of all motions of the body that may have jumped with those that explain it; empty for these
-            alone.
+        parts: (motions, variance) of each body that may have jumped, over that stated and times the chance that it was
+            this body; empty for the motions above alone.
+        change: of the parameters by the jump, whichever body it was; spread: covariance of its error. Empty where it is
+            not worked out, as is shift, of the spots, px.
     """
 
     body: str
@@ -129,7 +132,10 @@ class Jump:
     chance: float
     rivals: Mapping[str, float]
     times: float
-    together: tuple[int, ...] = ()
+    parts: tuple[tuple[tuple[int, ...], float], ...] = ()
+    change: tuple[float, ...] = ()
+    spread: tuple[tuple[float, ...], ...] = ()
+    shift: tuple[float, ...] = ()
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -155,20 +161,18 @@ class Step:
     """Motions that step once, by amounts that nobody knows: at an event, or a jump that was told.
 
     Attributes:
-        motions: numbers of the disturbances.
+        parts: (motions, variance over that stated) of what steps, independent of each other.
         chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
             known moment, seconds.
-        times: standard deviations of the step over those that are stated.
     """
 
-    motions: tuple[int, ...]
+    parts: tuple[tuple[tuple[int, ...], float], ...]
     chances: tuple[tuple[float, float], ...]
-    times: float = 1.0
 
     @classmethod
     def of(cls, jump: Jump) -> Step:
         """Of a jump, of all motions that may have taken part."""
-        return cls(jump.together or jump.motions, jump.chances, jump.times)
+        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances)
 
     def come(self, time: float) -> float:
         """Chance that it has come by a time, seconds."""
@@ -288,7 +292,7 @@ def likeliest(found: Sequence[Steps], may: Sequence[Candidate], stated: Disturba
         log_ratio=0.5 * float(squares[which, k]),
         chance=float(np.exp(min(0.0, logs[which, k] + np.log(logs.size)))),
         rivals=dict(sorted(rivals.items(), key=lambda item: -item[1])),
-        times=_larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
+        times=larger(best.spots.T @ information[k] @ best.spots, score[k] @ best.spots),
     )
 
 
@@ -323,8 +327,13 @@ def knots(after: Array, until: Array, weight: Array) -> tuple[tuple[float, float
     return tuple(sorted(out.items()))
 
 
-def _larger(information: Array, score: Array) -> float:
-    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1."""
+def larger(information: Array, score: Array) -> float:
+    """Standard deviation over that stated that makes a jump most likely, not less than the jump itself, nor than 1.
+
+    Args:
+        information: (r, r) of its amounts.
+        score: (r,) of them.
+    """
     values, vectors = np.linalg.eigh(information)
     values, along = np.maximum(values, 0.0), vectors.T @ score
     added = _INFLATIONS[:, None] * values

@@ -36,13 +36,12 @@ from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.jump_detection import Amounts, Candidate, Jump, Step, Steps, candidates, knots, likeliest
 from analysis.monitor.series_smoother import SeriesChanges
 from analysis.monitor.state_space import HeatInputs, StateSpace
+from analysis.monitor.told_jumps import Bodies, mixed
 from analysis.monitor.untold_jumps import Hint, Jumper, blended, jumpers
 
 __all__ = ["Belief", "Innovation", "Observed", "SeriesFilter", "Track", "Whitened", "of_shifts", "series_of"]
 
 Array = NDArray[np.float64]
-_UNLIKELY = 1e-4
-"""Of the weight of the likeliest time of a jump, below which it did not come at a time."""
 _NEARLY = 1e-11
 """Of the sum of its eigenvalues, by which information is made regular."""
 _SIZES = np.linspace(0.0, 8.0, 201)
@@ -229,9 +228,12 @@ class SeriesFilter:
         """(n, n) covariance of the states by each step."""
         out = []
         for one in self.steps:
-            own = list(one.motions)
-            level = self.space.level_of(own)
-            out.append(one.times**2 * level @ self.stated.correlation[np.ix_(own, own)] @ level.T)
+            together = np.zeros((self.space.size, self.space.size))
+            for motions, variance in one.parts:
+                own = list(motions)
+                level = self.space.level_of(own)
+                together += variance * level @ self.stated.correlation[np.ix_(own, own)] @ level.T
+            out.append(together)
         return out
 
     @cached_property
@@ -455,31 +457,31 @@ class SeriesFilter:
 
     def _jumped(self, belief: Belief, jump: Jump) -> tuple[Belief, Jump]:
         """What is known once a jump is told, and the jump with its sizes."""
-        alone = next(one for one in self._may if one.motions == jump.motions)
-        whole = max((one for one in self._may if one.body == jump.body), key=lambda one: len(one.motions))
-        tracks = belief.looking, belief.state
-        looked, amounts = (Amounts.of(t.score, t.information, whole.spots, jump.times) for t in tracks)
-        weight = np.exp(looked.log_weight - looked.log_weight.max()) * (belief.until - belief.after)
-        weight = np.where(weight > _UNLIKELY * weight.max(), weight, 0.0)
-        weight /= weight.sum()
-        level = self.space.level_of(whole.motions) @ whole.root
-        state = _compensated(belief.state, amounts, weight, level, whole.spots)
+        looking, own = ((track.score, track.information) for track in (belief.looking, belief.state))
+        gap = belief.until - belief.after
+        bodies = Bodies.of(self._may, jump, belief.until, gap, looking, own)
+        levels = [self.space.level_of(one.motions) @ one.root for one in bodies.own]
+        state = _compensated(belief.state, bodies.amounts, bodies.weight, levels, bodies.spots)
         search = None
         if belief.search is not None:
-            search = _compensated(belief.search, looked, weight, level, whole.spots)
-        named = Amounts.of(belief.state.score, belief.state.information, alone.spots, jump.times)
-        mean = weight @ named.mean
-        away = named.mean - mean
-        spread = np.einsum("k,kij->ij", weight, named.covariance + away[:, :, None] * away[:, None, :])
-        sigma, root = self.stated.sigmas[list(alone.motions)], alone.root
+            search = _compensated(belief.search, bodies.judged, bodies.weight, levels, bodies.spots)
+        # sizes are those of the motions that explain it best, had they jumped alone
+        alone, weight = next(one for one in self._may if one.motions == jump.motions), bodies.weight.sum(axis=0)
+        named = Amounts.of(*own, alone.spots, jump.times)
+        size, size_spread = mixed([named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None])
+        does = [self.space.outputs_of(one.motions) @ one.root for one in bodies.own]
+        change, spread = mixed(bodies.amounts, does, bodies.weight)
+        width, empty = self.space.width, np.zeros(0)
         told = replace(
             jump,
-            sizes=tuple((sigma * (root @ mean)).tolist()),
-            sigmas=tuple((sigma * np.sqrt(np.diag(root @ spread @ root.T))).tolist()),
+            sizes=tuple(size.tolist()),
+            sigmas=tuple(np.sqrt(np.diag(size_spread)).tolist()),
             chances=knots(belief.after, belief.until, weight),
-            together=whole.motions,
+            parts=bodies.parts,
+            change=tuple(change[width:].tolist()),
+            spread=tuple(tuple(row) for row in spread[width:, width:].tolist()),
+            shift=tuple(change[:width].tolist()),
         )
-        empty = np.zeros(0)
         return replace(belief, state=state, search=search, after=empty, until=empty), told
 
     @cached_property
@@ -551,7 +553,7 @@ class SeriesFilter:
             time: of them, seconds.
             since: from when on jumps have come that were not told, seconds.
         """
-        more = [(one.motions, one.times**2 * one.come(time)) for one in self.steps]
+        more = [(motions, variance * one.come(time)) for one in self.steps for motions, variance in one.parts]
         for motion in self.walking.tolist():
             every = float(self.stated.laws[motion].every_s or math.inf)
             more.append(((motion,), max(time - since, 0.0) / every))
@@ -559,15 +561,21 @@ class SeriesFilter:
         return rows @ mean, rows @ covariance @ rows.T + left
 
 
-def _compensated(track: Track, amounts: Amounts, weight: Array, level: Array, outputs: Array) -> Track:
-    """The filter as if it had known of the jump, averaged over its places; nothing is looked for beside it."""
-    moved = level - track.response @ outputs
-    each = np.einsum("knr,kr->kn", moved, amounts.mean)
-    mean = weight @ each
-    spread = np.einsum("k,knr,krs,kms->nm", weight, moved, amounts.covariance, moved, optimize=True)
-    away = (each - mean) * np.sqrt(weight)[:, None]
-    covariance = track.covariance + spread + away.T @ away
-    return replace(track.alone(), mean=track.mean + mean, covariance=0.5 * (covariance + covariance.T))
+def _compensated(
+    track: Track, amounts: Sequence[Amounts], weight: Array, levels: Sequence[Array], outputs: Sequence[Array]
+) -> Track:
+    """The filter as if it had known of the jump, averaged over bodies and places; nothing is looked for beside it."""
+    n = len(track.mean)
+    shift, spread = np.zeros(n), np.zeros((n, n))
+    for one, share, level, does in zip(amounts, weight, levels, outputs, strict=True):
+        moved = level - track.response @ does
+        each = np.einsum("knr,kr->kn", moved, one.mean)
+        shift += share @ each
+        spread += (share[:, None] * each).T @ each
+        inner = np.matmul(share[:, None, None] * moved, one.covariance)
+        spread += np.tensordot(inner, moved, axes=([0, 2], [0, 2]))
+    covariance = track.covariance + spread - np.outer(shift, shift)
+    return replace(track.alone(), mean=track.mean + shift, covariance=0.5 * (covariance + covariance.T))
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

@@ -134,7 +134,7 @@ class Operation:
         steps = []
         for time, _, own in self.events:
             motions = tuple(k for k, cause in enumerate(causes) if cause in own)
-            steps.append(Step(motions, (((time - self.epoch) / MICRO, 1.0),)))
+            steps.append(Step(((motions, 1.0),), (((time - self.epoch) / MICRO, 1.0),)))
         how = replace(self.model.how, steps=tuple(steps))
         reference = np.array([(self._before[spot]["row"], self._before[spot]["column"]) for spot in self.model.spots])
         return Taking(self.model, how, self.epoch, reference, self.history.temperature)

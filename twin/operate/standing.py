@@ -264,10 +264,12 @@ class Standing:
 
 
 def _jump(plain: dict[str, Any]) -> Jump:
-    lists = ("motions", "labels", "units", "sizes", "sigmas", "together")
+    lists = ("motions", "labels", "units", "sizes", "sigmas", "change", "shift")
     chances = tuple((time, chance) for time, chance in plain["chances"])
     rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
-    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, "chances": chances, "rivals": rivals})
+    more = {"chances": chances, "rivals": rivals, "spread": tuple(map(tuple, plain["spread"]))}
+    more["parts"] = tuple((tuple(motions), variance) for motions, variance in plain["parts"])
+    return Jump(**{**plain, **{name: tuple(plain[name]) for name in lists}, **more})
 
 
 @dataclass(frozen=True, eq=False)
