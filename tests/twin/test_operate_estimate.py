@@ -132,7 +132,7 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     assert estimate.again().follow().to_dict() == result
 
 
-@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 1e-6, 1e-6), (True, 0.3, 0.6)])
+@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 1e-6, 1e-6), (True, 0.3, 2.0)])
 def test_a_part_of_the_past_is_that_of_the_whole(
     known, tmp_path, monkeypatch, slips: bool, apart: float, wider: float
 ) -> None:
@@ -164,6 +164,30 @@ def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:
     course = estimate.smoothed(life.times)
     wrong = np.abs(course.values - life.changes @ estimate.model.rows.T) / course.sigmas
     assert np.all(wrong[[18, 19, 20, 21, 22]] < 5.0)
+
+
+def test_what_a_slip_does_to_the_line_is_said_with_its_sigma(known, tmp_path) -> None:
+    """Of two spots a mirror's slip is read as another turn and another principal distance than the line has of it."""
+    _, experiment, stated = known
+    slip = next(k for k, label in enumerate(stated.labels) if "forward/M2 shift z" in label)
+    life = life_of(stated, 60.0, 3.0, 13, {30.0: {slip: 4.0}})
+    estimate = followed(known, tmp_path, entries_of(known, life, 13))
+    (jump,) = estimate.follow().jumps
+    step = estimate.model.rows @ (4.0 * stated.parameters[:, slip])
+    names = [f"{one.group} {one.key}" for one in estimate.quantities]
+    for name, true in zip(names, step.tolist(), strict=True):
+        _, changed, sigma = jump.carried[name]
+        assert abs(changed - true) < 5.0 * sigma + 1e-9, name
+    # three mirrors can have moved the spots so, and they do not turn the line alike
+    read, _, sigma = jump.carried["forward d_alpha_arcsec"]
+    true = float(step[names.index("forward d_alpha_arcsec")])
+    assert abs(read - true) > 0.1
+    assert sigma > 0.05
+    camera = experiment.cameras["forward"]
+    shift = 4.0 * stated.spots[: len(camera.spot_jacobian), slip]
+    alone = camera.parameter_jacobian @ np.linalg.lstsq(camera.spot_jacobian, shift, rcond=None)[0]
+    read, _, _ = jump.carried["forward d_f_um"]
+    assert read == pytest.approx(1e6 * alone[3], rel=0.05)
 
 
 def test_an_event_steps_what_the_plan_says(known, tmp_path) -> None:

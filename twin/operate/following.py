@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,9 @@ class FoundJump:
         sizes: (motion, unit, size, sigma).
         log_ratio: of the likelihoods with it and without it, when it was told.
         false_alarm: chance of as large a ratio anywhere in the whole life without a jump, at most.
+        carried: quantity -> (read, changed, sigma): what the spots alone say of it if the camera moved as a whole, what
+            it did to the line by the bodies that can have made it, and the sigma of that. A part that moves spots need
+            not move the line as much.
     """
 
     body: str
@@ -81,6 +84,7 @@ class FoundJump:
     log_ratio: float
     false_alarm: float
     rivals: Mapping[str, float]
+    carried: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data."""
@@ -93,6 +97,18 @@ class FoundJump:
             "log_ratio": self.log_ratio,
             "false_alarm": self.false_alarm,
             "rivals": [{"body": body, "log_ratio": ratio} for body, ratio in self.rivals.items()],
+            "carried": [
+                {
+                    "quantity": name,
+                    "read": read,
+                    "changed": changed,
+                    "sigma": sigma,
+                    "share": shown,
+                    "share_sigma": wide,
+                }
+                for name, (read, changed, sigma) in self.carried.items()
+                for shown, wide in [(changed / read, sigma / abs(read)) if read else (None, None)]
+            ],
         }
 
 

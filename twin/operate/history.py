@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -208,7 +209,9 @@ class History:
             newest = select(PLAN.c.sha256).order_by(PLAN.c.id.desc()).limit(1)
             if connection.execute(newest).scalar() == digest:
                 return False
-            row = {"sha256": digest, "file": file, "content": canonical(content), "kept_utc": utc_text(now())}
+            # cameras and causes keep their order, which is that of all results
+            text = json.dumps(content, allow_nan=False, ensure_ascii=False)
+            row = {"sha256": digest, "file": file, "content": text, "kept_utc": utc_text(now())}
             connection.execute(insert(PLAN).values(**row))
         return True
 

@@ -85,9 +85,9 @@ class Operation:
         self._before = {(camera, channel): one for camera, channel, one in before}
         self._sensors = tuple(body for body in history.subjects("temperature") if body in history.bodies["warm"])
         self._plan_digest: str = plan_digest(plan) if before_it is None else before_it._plan_digest
-        self.key = digest_of_data(
-            [source_digest(), self._plan_digest, self.epoch, list(self._sensors), [list(one) for one in before]]
-        )
+        order = [list(plan.model.instrument.cameras), list(plan.disturbances.causes)]
+        own = [self._plan_digest, order, self.epoch, list(self._sensors), [list(one) for one in before]]
+        self.key = digest_of_data([source_digest(), *own])
         """By which it is recognised what an estimate rests on beside the readings."""
         if before_it is not None and before_it.key == self.key:
             known = vars(before_it)
@@ -232,7 +232,12 @@ class Operation:
     def _found(self, told: int, jump: Jump) -> FoundJump:
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
-        return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals)
+        change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
+        read, changed = rows @ (self.model.reading @ np.array(jump.shift)), rows @ change
+        sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread, rows))
+        names = [f"{one.group} {one.key}" for one in self.quantities]
+        carried = dict(zip(names, zip(read.tolist(), changed.tolist(), sigma.tolist(), strict=True), strict=True))
+        return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)
 
     def _breaks(self) -> tuple[Break, ...]:
         operation, start = self.plan.operation, self._standing.time

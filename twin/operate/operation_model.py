@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from analysis.monitor.disturbances import Disturbances, TimeLaw
 from analysis.monitor.limits import Quantity, quantities
@@ -37,11 +38,13 @@ class OperationModel:
         how: the filter, which knows of no events yet.
         spots: (camera, channel) of each spot, in the order of shifts.
         quantities: Q of them that are read.
+        reading: (4 K, D) parameters per px by the estimator `model`, by which every camera moves as a whole.
     """
 
     how: SeriesFilter
     spots: tuple[tuple[str, str], ...]
     quantities: tuple[Quantity, ...]
+    reading: Array
 
     @cached_property
     def rows(self) -> Array:
@@ -67,7 +70,7 @@ class OperationModel:
             "heat": None if heat is None else {"sensors": heat.sensors, "names": heat.names, "sigma": heat.sigma},
         }
         arrays: dict[str, np.ndarray] = {"sigmas": stated.sigmas, "see": stated.spots, "parameters": stated.parameters}
-        arrays |= {"correlation": stated.correlation, "rows": self.rows}
+        arrays |= {"correlation": stated.correlation, "rows": self.rows, "reading": self.reading}
         if self.how.reference_noise is not None:
             arrays["reference"] = self.how.reference_noise
         if heat is not None:
@@ -108,7 +111,8 @@ class OperationModel:
         spots = tuple((camera, channel) for camera, channel in plain["spots"])
         known = {one.key: one for one in (*CAMERA_PARAMETERS, ANGLE, *GROUND)}
         own = zip(plain["quantities"], arrays["rows"], strict=True)
-        return cls(how, spots, tuple(Quantity(group, known[key], row) for (group, key), row in own))
+        read = tuple(Quantity(group, known[key], row) for (group, key), row in own)
+        return cls(how, spots, read, arrays["reading"])
 
 
 def _law(text: str) -> TimeLaw:
@@ -160,7 +164,10 @@ def traced_model(
         stepping=tuple(k for k, cause in enumerate(stated.causes) if cause in stepping),
     )
     spots = [(name, channel) for name, one in experiment.cameras.items() for channel in one.channels]
-    return OperationModel(how, tuple(spots), quantities(experiment.cameras, experiment.ground))
+    alone = [one.parameter_jacobian @ np.linalg.pinv(one.spot_jacobian) for one in experiment.cameras.values()]
+    return OperationModel(
+        how, tuple(spots), quantities(experiment.cameras, experiment.ground), np.asarray(block_diag(*alone))
+    )
 
 
 def heat_inputs(
