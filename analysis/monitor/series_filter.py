@@ -544,7 +544,9 @@ class SeriesFilter:
         own = rows[width:]
         return values[width:], own @ covariance @ own.T + left[width:, width:]
 
-    def motions_of(self, mean: Array, covariance: Array, time: float, since: float) -> tuple[Array, Array]:
+    def motions_of(
+        self, mean: Array, covariance: Array, time: float, since: float, acting: bool = False
+    ) -> tuple[Array, Array]:
         """Motions (M,) and their covariance (M, M), in the standard deviations that are stated.
 
         Args:
@@ -552,13 +554,18 @@ class SeriesFilter:
             covariance: (n, n) of them.
             time: of them, seconds.
             since: from when on jumps have come that were not told, seconds.
+            acting: temperatures of bodies with sensors as they act on light: times the factor by which heat does more
+                than computed, so that what is computed of the motions is what is estimated.
         """
         more = [(motions, variance * one.come(time)) for one in self.steps for motions, variance in one.parts]
         for motion in self.walking.tolist():
             every = float(self.stated.laws[motion].every_s or math.inf)
             more.append(((motion,), max(time - since, 0.0) / every))
         rows, left = self.space.motion_gain(time, more)
-        return rows @ mean, rows @ covariance @ rows.T + left
+        if not acting:
+            return rows @ mean, rows @ covariance @ rows.T + left
+        values, rows, beside = self.space.acting(rows, mean, covariance)
+        return values, rows @ covariance @ rows.T + left + beside
 
 
 def _compensated(

@@ -310,7 +310,17 @@ class StateSpace:
             covariance: (n, n) of them.
             time: seconds.
         """
-        rows = self._rows(time)
+        return self.acting(self._rows(time), mean, covariance)
+
+    def acting(self, rows: Array, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """What rows on the states make of them where heat does more or less to light than computed: values (R,), rows
+        (R, n) and covariance of what these leave out, as `outputs`.
+
+        Args:
+            rows: (R, n), of temperatures as if heat did what was computed.
+            mean: (n,) of the states.
+            covariance: (n, n) of them.
+        """
         left = np.zeros((len(rows), len(rows)))
         if self.heat is None:
             return rows @ mean, rows, left

@@ -333,11 +333,13 @@ class Operation:
         out[times >= self._standing.time] = self._widened
         return out
 
-    def motions(self, time_us: int) -> Motions:
+    def motions(self, time_us: int, acting: bool = False) -> Motions:
         """Every stated motion at one time, by all readings.
 
         Args:
             time_us: microseconds of TAI since 2000, from the first reading on.
+            acting: temperatures of bodies with sensors times the factor by which heat does more to light than was
+                computed, so that what is computed of the motions is what `smoothed` says.
 
         Raises:
             Problem: a time before it.
@@ -347,7 +349,7 @@ class Operation:
         since = self._taking.seconds(self.epoch)
         found = self._past(
             np.array([time_us], np.int64),
-            lambda mean, covariance, time: how.motions_of(mean, covariance, time, since),
+            lambda mean, covariance, time: how.motions_of(mean, covariance, time, since, acting),
         )
         (mean, spread), size = found[0], stated.sigmas
         spread = spread * self._widened_at(np.array([time_us], np.int64))[0] ** 2

@@ -170,6 +170,13 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
             "models/*_RPC.TXT, models/*.tif": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
         },
+        "products": {
+            **_CHANGES,
+            "changes, covariance": _CAMERA,
+            "bias_east_m, bias_north_m": "local horizon of each point, located minus true",
+            "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
+            "models/*_RPC.TXT": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
+        },
         "simulate-truth": {
             "itrs_m": _ITRS,
             "camera, trajectory": "each states its own",

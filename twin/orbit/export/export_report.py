@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+from twin.orbit.export.estimated_change import GroundSigma
 from twin.orbit.export.export_run import Export, ExportedLine
 from twin.orbit.export.line_scanner import ModelError
 from twin.orbit.export.rational_polynomial import RationalPolynomial
@@ -39,6 +40,16 @@ RPC_ERROR: Record[RationalPolynomial] = Record(
     Quantity("rms_line_px", lambda model: model.rms_px[0], "root mean square along the track"),
     Quantity("rms_sample_px", lambda model: model.rms_px[1], "root mean square along the line"),
 )
+GROUND: Record[GroundSigma] = Record(
+    "What the error of the camera's estimated change is on the ground, root mean square over the image.",
+    Quantity("height_m", lambda one: one.height_m, "of the ground above the ellipsoid"),
+    Quantity("err_bias_m", lambda one: one.bias_m, "ERR_BIAS: horizontal, in common with other images"),
+    Quantity("err_rand_m", lambda one: one.random_m, "ERR_RAND: horizontal, another in every image"),
+    Quantity("bias_east_m", lambda one: one.bias_east_m, "part of ERR_BIAS to the east"),
+    Quantity("bias_north_m", lambda one: one.bias_north_m, "part of ERR_BIAS to the north"),
+    Quantity("random_east_m", lambda one: one.random_east_m, "part of ERR_RAND to the east"),
+    Quantity("random_north_m", lambda one: one.random_north_m, "part of ERR_RAND to the north"),
+)
 LINE: Record[ExportedLine] = Record(
     "One line's image and its models; files are paths in the run folder, None for those that were not written.",
     Quantity("lines", lambda line: line.window.sensor.lines, "how many"),
@@ -53,6 +64,13 @@ LINE: Record[ExportedLine] = Record(
     Quantity("isd_errors", lambda line: line.scanner.errors, "at every height", record=ISD_ERROR),
     Quantity("rpc_errors", lambda line: line.polynomial, "over all heights", record=RPC_ERROR),
     Quantity("rpc_refused", lambda line: line.refused or None, "why there are no polynomials"),
+    Quantity(
+        "ground",
+        lambda line: line.ground,
+        "what is uncertain of the camera's estimated change, where one was estimated",
+        record=GROUND,
+        where_known=True,
+    ),
 )
 EXPORT: Record[Export] = Record(
     "export.json. Line cameras for other software.",

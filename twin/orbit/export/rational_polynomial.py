@@ -46,6 +46,9 @@ class RationalPolynomial:
         line_numerator, line_denominator, sample_numerator, sample_denominator: (20,) each.
         error_px: largest difference from the rigorous sensor at places that were not fitted, lines and samples.
         rms_px: root mean square of them.
+        bias_m: ERR_BIAS, horizontal error on the ground that does not go with time, 68 %, so that images have it in
+            common; None where nobody states it.
+        random_m: ERR_RAND, likewise of what goes with time and is another in every image.
     """
 
     offset: Array
@@ -56,6 +59,8 @@ class RationalPolynomial:
     sample_denominator: Array
     error_px: tuple[float, float]
     rms_px: tuple[float, float]
+    bias_m: float | None = None
+    random_m: float | None = None
 
     @classmethod
     def fit(cls, sensor: Sensor, first_pixel: int, pixels: int, heights: tuple[float, float]) -> RationalPolynomial:
@@ -93,7 +98,9 @@ class RationalPolynomial:
     def text(self) -> str:
         """Contents of NAME_RPC.TXT, as GDAL reads it beside NAME.tif."""
         names = (("LINE", "pixels"), ("SAMP", "pixels"), ("LAT", "degrees"), ("LONG", "degrees"), ("HEIGHT", "meters"))
-        rows = [
+        errors = (("ERR_BIAS", self.bias_m), ("ERR_RAND", self.random_m))
+        rows = [f"{name}: {value!r} meters" for name, value in errors if value is not None]
+        rows += [
             f"{name}_{what}: {value!r} {unit}"
             for what, values in (("OFF", self.offset), ("SCALE", self.scale))
             for (name, unit), value in zip(names, values.tolist(), strict=True)
@@ -108,17 +115,18 @@ class RationalPolynomial:
         return "\n".join(rows) + "\n"
 
     def tags(self) -> list[tuple[Any, ...]]:
-        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors that nobody states, offsets, scales and
-        coefficients, in the order of RPC00B.
+        """The tag of a GeoTIFF that holds them (RPCCoefficientTag): errors, -1 where nobody states them, offsets,
+        scales and coefficients, in the order of RPC00B.
         """
         parts = (self.line_numerator, self.line_denominator, self.sample_numerator, self.sample_denominator)
-        values = (*_UNSTATED, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
+        errors = (_UNSTATED if error is None else error for error in (self.bias_m, self.random_m))
+        values = (*errors, *self.offset.tolist(), *self.scale.tolist(), *np.concatenate(parts).tolist())
         return [(_COEFFICIENTS, "d", len(values), values, True)]
 
 
 _COEFFICIENTS = 50844
-_UNSTATED = (-1.0, -1.0)
-"""Error bias and random error, metres."""
+_UNSTATED = -1.0
+"""Of an error, metres."""
 _WIDEST = 90.0
 """Degrees of longitude."""
 
