@@ -113,20 +113,21 @@ def hinted(
     """
     if not how.jumpers or not observed:
         return list(left)
-    size = how.space.size
-    score, information = np.empty((len(observed), size)), np.empty((len(observed), size, size))
+    levels = [how.space.level_of(one.motions) @ one.root for one in how.jumpers]
+    score = [np.empty((len(observed), level.shape[1])) for level in levels]
+    information = [np.empty((len(observed), level.shape[1], level.shape[1])) for level in levels]
 
     def note(number: int, carried: Array, known: Array) -> None:
-        score[number], information[number] = carried, known
+        for level, own_score, own_information in zip(levels, score, information, strict=True):
+            own_score[number], own_information[number] = carried @ level, level.T @ known @ level
 
     plain = replace(knowing, unfound=False)
     none = np.zeros(0)
     smoothed(plain, replace(start, left=none), observed, none, [none] * len(observed), knowing.parameters_of, note)
     gap = np.diff([one.time for one in observed], prepend=observed[0].time)
-    levels = [how.space.level_of(one.motions) @ one.root for one in how.jumpers]
     place = {k: i for i, k in enumerate(how.walking.tolist())}
     out = np.array(left)
-    for one, more in zip(how.jumpers, added(score, information, levels, gap, how.jumpers, how.window), strict=True):
+    for one, more in zip(how.jumpers, added(score, information, gap, how.jumpers, how.window), strict=True):
         out[:, [place[k] for k in one.motions]] += more
     return list(out)
 

@@ -144,23 +144,24 @@ def blended(mean: Array, covariance: Array, hints: Sequence[Hint], moved: Sequen
 
 
 def added(
-    score: Array, information: Array, levels: Sequence[Array], gap: Array, bodies: Sequence[Jumper], window: int
+    score: Sequence[Array], information: Sequence[Array], gap: Array, bodies: Sequence[Jumper], window: int
 ) -> list[Array]:
     """(N, r) of each body, what a smoother takes jumps to add that were not told, over the mean square that the motions
     are stated to have at their rate.
 
     Args:
-        score: (N, n) of a change of the states before each of N readings, by all readings.
-        information: (N, n, n) of it.
-        levels: (n, r) of each body, what unit amounts do to the states.
+        score: (N, r) of each body, of unit amounts before each of N readings, by all readings.
+        information: (N, r, r) of each, likewise.
         gap: (N,) seconds from the reading before, 0 where none is.
         bodies: that jump.
         window: readings among which one jump is looked for.
     """
     if not bodies:
         return []
-    own = score, information
-    hints = [Hint.of(own, own, level, gap / one.every_s) for level, one in zip(levels, bodies, strict=True)]
+    hints = []
+    for one, b, j in zip(bodies, score, information, strict=True):
+        own = b, j
+        hints.append(Hint.of(own, own, np.eye(len(one.motions)), gap / one.every_s))
     out = []
     for one, hint, chance in zip(bodies, hints, _chances(hints, window // 2), strict=True):
         square = (hint.mean @ one.root.T) ** 2 + np.einsum("ij,kjl,il->ki", one.root, hint.covariance, one.root)

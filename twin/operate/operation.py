@@ -20,7 +20,7 @@ from scipy.special import pdtrc
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.jump_detection import Jump, Step
 from analysis.monitor.limits import Quantity
-from analysis.monitor.series_following import smoothed
+from analysis.monitor.series_following import hinted, smoothed
 from optics.numerics.backend import load_backend
 from optics.numerics.threads import one_blas_thread
 from scenes.specs.operation import OperationSetup
@@ -269,8 +269,9 @@ class Operation:
         if len(times) and times.min() < self._standing.time:
             allowed = f"times from {utc_text(self._standing.time)} on, that of the newest reading"
             raise Problem("a forecast of what is past", utc_text(int(times.min())), allowed)
-        how, belief = self._taking.how, self._standing.belief
+        how = self._taking.how
         with one_blas_thread():
+            belief = how.blended(self._standing.belief)
             found = [how.parameters(belief, self._taking.seconds(int(time))) for time in times]
         return self._course(times, found, np.full(len(times), self._widened))
 
@@ -383,7 +384,9 @@ class Operation:
                 belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
             )
             seconds = [taking.seconds(int(time)) for time in times]
-            return smoothed(replace(taking.how, steps=steps, window=0), belief, observed, seconds, list(left), each)
+            knowing = replace(taking.how, steps=steps, window=0)
+            shares = hinted(taking.how, knowing, belief, observed, list(left))
+            return smoothed(knowing, belief, observed, seconds, shares, each)
 
     def _used(self, after_us: int | None) -> tuple[NDArray[np.int64], Array]:
         """Ids of the entries that were used after a time at which it was kept, and what could not be told then."""
