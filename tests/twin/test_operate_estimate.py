@@ -132,13 +132,13 @@ def test_it_does_not_matter_how_readings_come(known, tmp_path, monkeypatch) -> N
     assert estimate.again().follow().to_dict() == result
 
 
-@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 0.02, 0.02), (True, 0.3, 2.0)])
+@pytest.mark.parametrize(("slips", "apart", "wider"), [(False, 0.2, 0.2), (True, 0.3, 2.0)])
 def test_a_part_of_the_past_is_that_of_the_whole(
     known, tmp_path, monkeypatch, slips: bool, apart: float, wider: float
 ) -> None:
-    """From where the estimate stood before it, and from the beginning: but for what jumps add that were not told, which
-    is found anew, two in a hundred. Where jumps were told before it, one body of several made them by what is kept; for
-    the whole, which is one normal, each may have had its share: sigma is wider.
+    """From where the estimate stood before it, and from the beginning: but for what jumps add that were not told, whose
+    chances are found from the readings of the part, a fifth of sigma. Where jumps were told before it, one body of
+    several made them by what is kept; for the whole, which is one normal, each may have had its share: sigma is wider.
     """
     stated = known[2]
     monkeypatch.setattr(operation_module, "EVERY", 5)
@@ -151,7 +151,7 @@ def test_a_part_of_the_past_is_that_of_the_whole(
         part = estimate.smoothed(life.times[k : k + 1])
         assert np.all(np.abs(part.values[0] - whole.values[k]) < apart * whole.sigmas[k])
         ratio = whole.sigmas[k] / part.sigmas[0]
-        assert np.all((ratio > 0.98) & (ratio < 1.0 + wider))
+        assert np.all((ratio > 0.8) & (ratio < 1.0 + wider))
 
 
 def test_a_slip_is_told_with_its_body(known, tmp_path) -> None:

@@ -380,6 +380,7 @@ class Operation:
             entries = {int(one["id"]): one for together in self._moments(told) for one in together}
             observed = [taking.observed(entries[number]) for number in used.tolist()]
             belief = (taking.start(begin) if start is None else start).belief
+            belief = taking.how.blended(belief) if start is last else belief
             belief = replace(
                 belief, state=belief.state.alone(), search=None, after=belief.after[:0], until=belief.until[:0]
             )
