@@ -396,7 +396,6 @@ NOT_RUN = {
     "python -m twin.validate --out": "the full run makes docs/validation; .ci/run has the fast one",
     "python -m twin.validate --seed": "the same",
     "bash setup.sh": "installs; .ci/run begins with it",
-    "python -m twin.operate": "lines go on with one record, as tests/twin/test_operate*.py do",
     "python -m docs.supply": "needs the package index; tests/test_supply.py holds what can be held without",
     "dask ": "needs machines and certificates of the user's",
     "export ": "is for such a cluster",

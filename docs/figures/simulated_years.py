@@ -16,6 +16,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 SEED = 1
 PICTURE = ROOT / "docs/operation.svg"
+_LONG = 2000
+"""Letters of a line from which on it is one of the data's."""
 _YEARS = ("--from", "2027-01-01T00:00:00Z", "--days", "1096", "--every", "6d", "--coefficient-error", "30%")
 SENSORS = (
     "base",
@@ -53,6 +55,19 @@ _DIGITS = {
 """Lives whose errors the page tells -> decimals of each."""
 
 
+def short(drawn: str) -> str:
+    """A drawing whose long lines are told to a hundredth of a pixel: half of the bytes.
+
+    Args:
+        drawn: an SVG; letters and scales keep their digits.
+    """
+
+    def rounded(line: re.Match[str]) -> str:
+        return re.sub(r"(\d+\.\d\d)\d+", r"\1", line[0])
+
+    return re.sub(rf'd="[^"]{{{_LONG},}}"', rounded, drawn)
+
+
 def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]:
     """Simulate a life and judge it.
 
@@ -69,9 +84,7 @@ def judged(words: tuple[str, ...], place: Path, picture: bool) -> dict[str, Any]
     ):
         subprocess.run([sys.executable, "-m", "twin.operate", *command, "--quiet"], cwd=ROOT, check=True)
     if picture:
-        drawn = (out / "artefacts/with_and_without.svg").read_text("utf-8")
-        # a hundredth of a pixel is enough for a page, and half of the bytes
-        PICTURE.write_text(re.sub(r"(\d+\.\d\d)\d+", r"\1", drawn), "utf-8")
+        PICTURE.write_text(short((out / "artefacts/with_and_without.svg").read_text("utf-8")), "utf-8")
     found: dict[str, Any] = json.loads((out / "judged.json").read_text("utf-8"))
     return found
 
