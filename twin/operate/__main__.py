@@ -20,6 +20,7 @@ from scenes.yaml.errors import InputError, Problem, nearest
 from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
 from twin.operate.followed import PlanFile
+from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
 from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
@@ -333,7 +334,8 @@ def export(
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
 app.command("products")(products)
-
+app.command("simulate")(simulate)
+app.command("judge")(judge)
 
 if __name__ == "__main__":
     app()

@@ -82,7 +82,7 @@ class Sensor:
 
     def judged(self, far: bool) -> Sensor:
         """With what is thought of its newest reading."""
-        return replace(self, far=(*self.far, far)[-RECENT:])
+        return replace(self, far=(*self.far, bool(far))[-RECENT:])
 
     def state(self, now: int) -> tuple[str, int, str]:
         """``ok``, ``dead``, ``stuck`` or ``doubtful``; since when, microseconds; and why.
@@ -340,7 +340,9 @@ class Taking:
     def _updated(self, standing: Standing, entry: Mapping[str, Any], observed: Observed) -> tuple[Standing, Innovation]:
         belief, found = self.how.update(standing.belief, observed)
         used = np.append(standing.used, np.int64(entry["id"]))
-        left = np.concatenate([standing.left.reshape(-1, len(self.how.walking)), standing.belief.left[None]])
+        # of no motion that may jump there is nothing to count rows by
+        before = standing.left.reshape(len(standing.used), len(self.how.walking))
+        left = np.concatenate([before, standing.belief.left[None]])
         return replace(standing, belief=belief, used=used, left=left), found
 
     def _temperature(self, standing: Standing, entry: Mapping[str, Any]) -> Standing:

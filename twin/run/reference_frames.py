@@ -52,6 +52,12 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "times_s": "seconds from the beginning of the course",
             "motions": "in the moved body's own nominal axes, about its pivot",
         },
+        "life": {
+            **_CHANGES,
+            "times_us": "microseconds of TAI since 2000-01-01T00:00:00 TAI",
+            "steps": "in the moved body's own nominal axes, about its pivot",
+        },
+        "judged": {"quantities": f"{_CAMERA}; {_ANGLE}; ground: {_GROUND}"},
         "uncertainty": {
             **_CHANGES,
             "motion": "in the moved body's own nominal axes",
