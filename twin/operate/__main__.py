@@ -21,6 +21,7 @@ from scenes.yaml.standard_output import FAILURE, print_error
 from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_estimate
 from twin.operate.followed import PlanFile
 from twin.operate.products_command import products
+from twin.operate.shown_commands import report, serve
 from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
@@ -333,6 +334,8 @@ def export(
 app.command("forecast")(forecast)
 app.command("alarms")(alarms)
 app.command("products")(products)
+app.command("report")(report)
+app.command("serve")(serve)
 
 
 if __name__ == "__main__":
