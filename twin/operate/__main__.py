@@ -22,6 +22,7 @@ from twin.operate.estimate_commands import alarms, estimate_of, forecast, show_e
 from twin.operate.followed import PlanFile
 from twin.operate.life_commands import judge, simulate
 from twin.operate.products_command import products
+from twin.operate.shown_commands import report, serve
 from twin.operate.terminal import Place, line, tell, told
 from twin.run import durable
 from twin.run.cli import (
@@ -336,6 +337,9 @@ app.command("alarms")(alarms)
 app.command("products")(products)
 app.command("simulate")(simulate)
 app.command("judge")(judge)
+app.command("report")(report)
+app.command("serve")(serve)
+
 
 if __name__ == "__main__":
     app()

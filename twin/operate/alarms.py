@@ -18,10 +18,12 @@ from scenes.specs.operation import OperationSpec
 from twin.operate.entries import MICRO, Alarm, utc_text
 from twin.operate.history import History
 from twin.operate.operation import Break, Following, FoundJump
-from twin.run.artefact import decimals_for, fixed, plain, significant
+from twin.run.artefact import decimals_for, fixed, plain
 
 AGAIN = 30 * 86_400 * MICRO
 """After which an alarm that somebody has seen is raised again, if what it tells of goes on."""
+LEAST = 1e-6
+"""Chance below which no number is told."""
 _CLOSE = 3.0
 """Difference of log likelihood ratios, below which another body explains a jump nearly as well: 20 to 1."""
 BROKEN, BREAKS, JUMP, SENSOR, CONTRADICTION = "broken", "breaks", "jump", "sensor", "contradiction"
@@ -90,8 +92,11 @@ def name_of(quantity: str, quantities: Sequence[Quantity]) -> str:
 
 
 def percent(chance: float) -> str:
-    """A chance for a sentence."""
-    return f"{significant(100.0 * chance, 2)} %"
+    """A chance for a sentence, with as many decimals as tell it from certainty."""
+    rest = min(chance, 1.0 - chance)
+    if rest < LEAST:
+        return "less than 0.0001 %" if chance < 0.5 else "more than 99.9999 %"
+    return f"{fixed(100.0 * chance, decimals_for(100.0 * rest))} %"
 
 
 def _of_requirement(one: Break, time: int, quantities: Sequence[Quantity]) -> Alarm:

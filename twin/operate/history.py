@@ -1,4 +1,4 @@
-"""The record of one instrument: opened, added to, and read; what is in it is never altered."""
+"""The record of one instrument: opened, added to, and read, also as it was; what is in it is never altered."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from sqlalchemy import Connection, delete, func, insert, or_, select
 from sqlalchemy.exc import IntegrityError
@@ -371,6 +371,63 @@ class History:
                 raise Problem(text, None, "an alarm is acknowledged once")
             row = {"alarm_id": alarm, "by": by, "note": note, "acknowledged_utc": utc_text(now())}
             connection.execute(insert(ACKNOWLEDGEMENT).values(**row))
+
+
+class PastHistory(History):
+    """A record without what came later, by the times of the readings. What was traced of the instrument is kept in it
+    as in any.
+
+    Args:
+        place: folder or address of the record.
+        until: microseconds of TAI since 2000; what is of this time is in it.
+    """
+
+    def __init__(self, place: str, until: int) -> None:
+        super().__init__(place)
+        self.until = until
+
+    def entries(
+        self,
+        kind: str = "",
+        subject: str = "",
+        after_us: int | None = None,
+        after_id: int | None = None,
+        until_us: int | None = None,
+    ) -> Iterator[dict[str, Any]]:
+        """Readings and events as `History.entries` yields them, without what came later."""
+        until = self.until if until_us is None else min(until_us, self.until)
+        yield from super().entries(kind, subject, after_us, after_id, until)
+
+    def checkpoint(
+        self, plan: str, number: int | None = None, before_us: int | None = None, valid: bool = False
+    ) -> Checkpoint | None:
+        """The newest of what was kept of an estimate then; None for none."""
+        before = self.until + 1 if before_us is None else min(before_us, self.until + 1)
+        return super().checkpoint(plan, number, before, valid)
+
+    def checkpoints(self, plan: str) -> list[Checkpoint]:
+        """Where the estimate stood then and before."""
+        return [one for one in super().checkpoints(plan) if one.time <= self.until]
+
+    def alarms(self) -> list[dict[str, Any]]:
+        """Alarms that belong to that time or before; who has acknowledged them since is told."""
+        return [one for one in super().alarms() if one["time_us"] <= self.until]
+
+    def save_checkpoint(self, plan: str, number: int, time_us: int, entry_id: int, content: bytes) -> bool:
+        """Keep nothing but what has no time: the newest estimate stays where it is."""
+        return number < 0 and super().save_checkpoint(plan, number, time_us, entry_id, content)
+
+    def drop_checkpoints(self, plan: str, from_time_us: int) -> int:
+        """Remove nothing."""
+        return 0
+
+    def raise_alarm(self, alarm: Alarm) -> bool:
+        """Raise nothing: what was to be told then was told then."""
+        return False
+
+    def take(self, *given: Any, **how: Any) -> NoReturn:
+        """Refuse to take readings into the past. Raises TypeError."""
+        raise TypeError("nothing is taken into a record as it was")
 
 
 def _numbered(number: int | None, before_us: int | None) -> Any:

@@ -1,9 +1,12 @@
-"""Who may speak to the live twin, how many at once, and how long each may take.
+"""Who may speak to a server of pages, how many at once, and how long each may take.
 
 The address that the command prints carries a random token. The first request with it gets the token as a cookie, which
 no script can read and no other site can send, and is led to the page without it. Every other request, and the WebSocket
 before it is accepted, needs the cookie, a Host that is the server's own (a page elsewhere may have its name resolve to
 127.0.0.1) and, where the browser tells it, an Origin that is the page's own.
+
+A server whose pages may also change something has a second token for that. It comes in the same way, as a cookie of its
+own, or from a program as ``Authorization: Bearer``; who has only the first one can read.
 
 uvicorn's own limits turn against the user here: ``limit_concurrency`` counts connections that say nothing, so that
 whoever opens enough of them locks everybody out, and ``timeout_keep_alive`` begins with the first answer. So a
@@ -28,10 +31,8 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-TOKEN = "TWIN_LIVE_TOKEN"
-"""Environment variable with a token that stays the same when the server is started again."""
 SHORTEST = 22
-"""Characters of such a token."""
+"""Characters of a token that the environment sets."""
 COOKIE = "space_camera_twin_{port}"
 """Name of the cookie. Browsers keep one jar for a host, whatever the port: two servers on one host, two names."""
 LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
@@ -56,17 +57,20 @@ class BadToken(ValueError):
     """A token that somebody could guess."""
 
 
-def new_token() -> str:
+def new_token(variable: str) -> str:
     """The token of a server: random, or the environment's.
+
+    Args:
+        variable: of the environment, with a token that stays the same when the server is started again.
 
     Raises:
         BadToken: the environment's is too short, or has characters that a cookie cannot have.
     """
-    named = os.environ.get(TOKEN, "")
+    named = os.environ.get(variable, "")
     if not named:
         return secrets.token_urlsafe(24)
     if len(named) < SHORTEST or not all(c.isascii() and (c.isalnum() or c in "-_") for c in named):
-        raise BadToken(f"{TOKEN} needs {SHORTEST} or more characters of A-Z, a-z, 0-9, - and _")
+        raise BadToken(f"{variable} needs {SHORTEST} or more characters of A-Z, a-z, 0-9, - and _")
     return named
 
 
@@ -78,20 +82,22 @@ class Guard:
         token: the secret.
         hosts: names under which the server is called, with their port.
         port: it listens on.
+        write: the second secret, with which something may be changed; empty where nothing may.
     """
 
     token: str
     hosts: tuple[str, ...]
     port: int
+    write: str = ""
 
     @classmethod
-    def of(cls, token: str, host: str, port: int) -> Guard:
+    def of(cls, token: str, host: str, port: int, write: str = "") -> Guard:
         """The guard of a server that listens on a host and a port."""
         named = f"[{host}]" if ":" in host else host.lower()
         names = LOOPBACK if host in ("127.0.0.1", "localhost", "::1") else (named, *LOOPBACK)
         if host in EVERYWHERE:
             names = (*names, *(name.lower() for name in names_of_this_machine()))
-        return cls(token, tuple(_called(name, port) for name in names), port)
+        return cls(token, tuple(_called(name, port) for name in names), port, write)
 
     @property
     def cookie_name(self) -> str:
@@ -103,9 +109,29 @@ class Guard:
         """What sets the cookie; the token is renewed with every server, so that it needs no date."""
         return f"{self.cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
 
+    @property
+    def write_cookie(self) -> str:
+        """What sets the cookie with the second token."""
+        return f"{self.cookie_name}_write={self.write}; HttpOnly; SameSite=Strict; Path=/"
+
     def knows(self, token: str) -> bool:
         """Whether it is the token; takes as long whatever is wrong with it."""
         return secrets.compare_digest(token.encode(), self.token.encode())
+
+    def knows_write(self, token: str) -> bool:
+        """Whether it is the second token; where there is none, nothing is."""
+        return bool(self.write) and secrets.compare_digest(token.encode(), self.write.encode())
+
+    def may_write(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request brings the second token, as its cookie or as ``Authorization: Bearer``.
+
+        Args:
+            headers: of the request, names in small letters.
+        """
+        scheme, _, told = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer" and self.knows_write(told.strip()):
+            return True
+        return any(map(self.knows_write, _cookies(headers.get("cookie", ""), f"{self.cookie_name}_write")))
 
     def knows_cookie(self, headers: Mapping[str, str]) -> bool:
         """Whether a request brings the token as its cookie.

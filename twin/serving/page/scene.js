@@ -22,8 +22,10 @@ const graphics = () => {
 };
 
 export class Scene {
-  constructor(root) {
+  // distance: of the eye, in sizes of the instrument, from where all of it is seen
+  constructor(root, distance = 0.86) {
     this.root = root;
+    this.distance = distance;
     this.nodes = new Map();
     this.motions = {};
     this.ready = null;
@@ -104,7 +106,7 @@ export class Scene {
   home() {
     if (!this.model) return;
     const wide = Math.max(1, 1.25 / this.camera.aspect);
-    this.camera.position.copy(this.middle).add(new THREE.Vector3(0.35, -1.15, 0.55).multiplyScalar(0.86 * this.size * wide));
+    this.camera.position.copy(this.middle).add(new THREE.Vector3(0.35, -1.15, 0.55).multiplyScalar(this.distance * this.size * wide));
     this.controls.target.copy(this.middle);
     this.controls.update();
     this.draw();
@@ -151,10 +153,13 @@ export class Scene {
         node.matrix.copy(nominal);
         node.matrixWorldNeedsUpdate = true;
       }
-      if (Boolean(motion) !== Boolean(node.userData.moved)) {
-        node.userData.moved = Boolean(motion);
-        node.traverse((part) => { if (part.isMesh && !this.beams.includes(part) && part.userData.name === name) this.tint(part, motion); });
-        if (node.isMesh) this.tint(node, motion);
+      node.userData.moved = Boolean(motion);
+      // a motion that is not sure is drawn without its colour
+      const tinted = Boolean(motion) && motion.sure !== false;
+      if (tinted !== Boolean(node.userData.tinted)) {
+        node.userData.tinted = tinted;
+        node.traverse((part) => { if (part.isMesh && !this.beams.includes(part) && part.userData.name === name) this.tint(part, tinted); });
+        if (node.isMesh) this.tint(node, tinted);
       }
     }
     this.draw();
