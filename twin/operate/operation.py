@@ -72,6 +72,7 @@ class Operation:
         self.history, self.plan, self._advance = history, plan, advance
         self._stood: tuple[Standing | None, int] = None, 0
         self._newest = self._saved = 0
+        self._silent: tuple[tuple[str, int], ...] = ()
         first = history.first("monitor")
         if first is None:
             allowed = "a run of twin.recover or twin.render; python -m twin.operate ingest takes one"
@@ -160,21 +161,38 @@ class Operation:
         self._newest = newest
         standing = self._kept()
         moments = list(self._moments(None if standing is None else standing.time))
-        for count, entries in enumerate(moments):
+        count = 0
+        while count < len(moments):
             if standing is None:
-                standing = taking.start(int(entries[0]["time_us"]))
+                standing = taking.start(int(moments[0][0]["time_us"]))
             before = standing.scores.readings
-            standing = taking.take(standing, entries)
+            standing = taking.take(standing, moments[count])
+            count += 1
+            if standing.found_stuck:
+                standing = self._without(standing)
+                moments, count = list(self._moments(None if standing is None else standing.time)), 0
+                if standing is None:
+                    standing = taking.start(int(moments[0][0]["time_us"]), self._silent)
+                continue
             number = standing.scores.readings // EVERY
             if number > before // EVERY:
                 self._keep(standing, number, newest)
                 standing = standing.anew()
-            self._advance(count + 1, len(moments))
+            self._advance(count, len(moments))
         assert standing is not None  # there is a reading of the monitor
         if standing.scores.readings >= self._saved + HEAD:
             self._keep(standing, _HEAD, newest)
             self._saved = standing.scores.readings
         return standing
+
+    def _without(self, standing: Standing) -> Standing | None:
+        """Where the estimate stood before a sensor began to repeat itself; its readings from there on are not used."""
+        self._silent = (*standing.silent, *standing.found_stuck)
+        since = min(time for _, time in standing.found_stuck)
+        self.history.drop_checkpoints(self.key, since)
+        self._saved = 0
+        kept = self.history.checkpoint(self.key, before_us=since, valid=True)
+        return None if kept is None else replace(Standing.from_bytes(kept.content).anew(), silent=self._silent)
 
     def _kept(self) -> Standing | None:
         """Where the estimate stood before what is new; None for nowhere."""

@@ -168,6 +168,8 @@ class Standing:
         used: (U,) ids of the entries that were used since it was last kept for good, in their order.
         left: (U, m) what share of the mean square of jumps could not be told before each of them.
         told: innovations since then.
+        silent: (body, time_us) of sensors that repeat themselves and of the first of their equal readings, of which none
+            is used.
     """
 
     belief: Belief
@@ -182,6 +184,7 @@ class Standing:
     used: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     left: Array = field(default_factory=lambda: np.zeros((0, 0)))
     told: tuple[tuple[int, float, int], ...] = ()
+    silent: tuple[tuple[str, int], ...] = ()
 
     @property
     def explained(self) -> Array:
@@ -201,6 +204,12 @@ class Standing:
         return replace(
             self, time=max(self.time, time), left_out=(*self.left_out, (time, kind, subject, reason))[-KEPT:]
         )
+
+    @property
+    def found_stuck(self) -> tuple[tuple[str, int], ...]:
+        """Sensors that repeat themselves, whose first equal readings have been used: (body, time_us of the first)."""
+        stuck = ((one.body, one.since_us) for one in self.sensors.values() if one.stuck)
+        return tuple(one for one in stuck if one not in self.silent)
 
     def anew(self) -> Standing:
         """The same, counting what is used from now on."""
@@ -227,6 +236,7 @@ class Standing:
             "scores": asdict(self.scores),
             "innovations": self.innovations,
             "told": self.told,
+            "silent": self.silent,
             "jumps": [{"time": one.time, "jump": asdict(one.jump)} for one in self.jumps],
             "sensors": [asdict(one) for one in self.sensors.values()],
             "left_out": self.left_out,
@@ -260,6 +270,7 @@ class Standing:
             arrays["used"],
             arrays["span"],
             tuple((time, square, degrees) for time, square, degrees in plain["told"]),
+            tuple((body, time) for body, time in plain["silent"]),
         )
 
 
@@ -294,14 +305,16 @@ class Taking:
         """Of a time in microseconds."""
         return (time - self.epoch) / MICRO
 
-    def start(self, time: int) -> Standing:
+    def start(self, time: int, silent: tuple[tuple[str, int], ...] = ()) -> Standing:
         """Before any entry.
 
         Args:
             time: of the first, microseconds.
+            silent: sensors that are known to repeat themselves.
         """
         spread = np.zeros((4, len(self.model.quantities)))
-        return Standing(self.how.start(self.seconds(time)), time, spread=spread, basis=self.how.space.basis)
+        belief, basis = self.how.start(self.seconds(time)), self.how.space.basis
+        return Standing(belief, time, spread=spread, basis=basis, silent=silent)
 
     def take(self, standing: Standing, entries: Sequence[Mapping[str, Any]]) -> Standing:
         """All entries of one moment.
@@ -353,7 +366,7 @@ class Taking:
         standing = replace(standing, sensors={**standing.sensors, body: sensor})
         if self.how.heat is None or body not in self.how.heat.sensors:
             return standing.without(time, "temperature", body, "nothing is stated of its temperature")
-        if sensor.stuck:
+        if sensor.stuck or (body, sensor.since_us) in standing.silent:
             return standing.without(time, "temperature", body, "its sensor repeats itself")
         observed = self.observed(entry)
         there = self.how.at(standing.belief, observed.time)
