@@ -17,11 +17,11 @@ from tests.twin.operation_records import life_of, plan_of, record_of
 from tests.twin.operation_records import monitor_entry as own_entry
 from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.entries import MICRO, Alarm, Entry
-from twin.operate.following import Break, Course, Following, FoundJump, SensorState
-from twin.operate.history import History
-from twin.operate.plans import keep_plan
-from twin.operate.standing import Scores
+from twin.operate.estimate.following import Break, Course, Following, FoundJump, SensorState
+from twin.operate.estimate.plans import keep_plan
+from twin.operate.estimate.standing import Scores
+from twin.operate.record.entries import MICRO, Alarm, Entry
+from twin.operate.record.history import History
 
 HOUR = 3600 * MICRO
 DAY = 24 * HOUR
@@ -88,7 +88,7 @@ def plan(events: bool = True) -> Any:
 
 @dataclass
 class StandIn:
-    """Has the attributes of `twin.operate.operation.Operation`: quantities grow evenly, one jump, one stuck sensor."""
+    """In place of `twin.operate.estimate.operation.Operation`: quantities grow evenly, one jump, one stuck sensor."""
 
     history: History
     plan: Any = field(default_factory=plan)

@@ -15,12 +15,12 @@ from analysis.monitor.disturbances import Disturbances
 from analysis.monitor.limits import quantities
 from scenes.specs.operation import OperationSetup, OperationSpec, resolve_operation
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.entries import MICRO
+from twin.operate.record.entries import MICRO
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """As `twin.operate.operation.Course`."""
+    """As `twin.operate.estimate.operation.Course`."""
 
     times: np.ndarray
     quantities: tuple

@@ -21,9 +21,9 @@ from tests.twin.operation_records import (
     temperature_entry,
 )
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate import operation as operation_module
-from twin.operate.entries import MICRO, Entry
-from twin.operate.operation import Operation, beyond
+from twin.operate.estimate import operation as operation_module
+from twin.operate.estimate.operation import Operation, beyond
+from twin.operate.record.entries import MICRO, Entry
 
 
 @pytest.fixture(scope="module")

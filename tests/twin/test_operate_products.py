@@ -32,14 +32,14 @@ from tests.twin.record_bench import START, given, made, pair
 from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.observation import StateReader
 from twin.operate.__main__ import app as operate
-from twin.operate.entries import MICRO, Entry, micros, utc_text
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import keep_plan
 from twin.operate.estimated_motions import EstimatedMotions, perturbation, prior_files, state_file
-from twin.operate.history import History, initialised
-from twin.operate.operation import Operation
-from twin.operate.plans import keep_plan
 from twin.operate.product_files import product_files
 from twin.operate.products import Products
 from twin.operate.products import made as products_of
+from twin.operate.record.entries import MICRO, Entry, micros, utc_text
+from twin.operate.record.history import History, initialised
 from twin.operate.validity import Mark, validity
 from twin.orbit.export.estimated_change import ground_sigma
 from twin.orbit.export.export_run import ExportSource, read_source

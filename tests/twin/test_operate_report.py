@@ -18,13 +18,13 @@ from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, li
 from tests.twin.policed_page import breaches
 from tests.twin.record_bench import START, given
 from twin.operate.__main__ import app
-from twin.operate.alarms import percent
 from twin.operate.daily_report import daily_report, end_of_day, report_html, state_table
-from twin.operate.entries import Alarm, Entry, micros
-from twin.operate.history import History, PastHistory, content_of, initialised
-from twin.operate.operation import Operation
+from twin.operate.estimate.alarms import percent
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import kept_plan
 from twin.operate.overview import Overview, coverage, points_of, spread, trend
-from twin.operate.plans import kept_plan
+from twin.operate.record.entries import Alarm, Entry, micros
+from twin.operate.record.history import History, PastHistory, content_of, initialised
 from twin.operate.shown_readings import first_time, last_time, readings
 
 

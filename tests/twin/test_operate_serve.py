@@ -29,13 +29,13 @@ from tests.twin.operate_bench import COUNT, DAY, EVIL, HOUR, StandIn, filled, li
 from tests.twin.record_bench import START, given, made
 from twin.operate import past_view
 from twin.operate.__main__ import app
-from twin.operate.database import RecordFailed
 from twin.operate.desk import Desk, plain, unix_micros
-from twin.operate.entries import Alarm, Given, digest_of_data, micros
-from twin.operate.history import History
-from twin.operate.operation import Operation
+from twin.operate.estimate.operation import Operation
+from twin.operate.estimate.plans import kept_plan
 from twin.operate.overview import Overview
-from twin.operate.plans import kept_plan
+from twin.operate.record.database import RecordFailed
+from twin.operate.record.entries import Alarm, Given, digest_of_data, micros
+from twin.operate.record.history import History
 from twin.operate.serve import LONGEST_POST, PARTS, OperateServer
 from twin.serving.guard import Guard
 from twin.serving.server import listen

@@ -18,14 +18,14 @@ from scenes.specs.load import EXAMPLES
 from scenes.specs.resolved import resolve_with
 from tests.twin.commands import invoke
 from twin.operate.__main__ import app
-from twin.operate.entries import MICRO, micros
-from twin.operate.history import History, content_of, initialised
-from twin.operate.judged_life import covered
-from twin.operate.judged_report import likely_shares
-from twin.operate.simulate import Simulation, sensed_temperatures
-from twin.operate.simulated_life import Life, drawn_course, drawn_life
-from twin.operate.simulation_run import take_files
-from twin.operate.telemetry import WITHIN
+from twin.operate.lives.judged_life import covered
+from twin.operate.lives.judged_report import likely_shares
+from twin.operate.lives.simulate import Simulation, sensed_temperatures
+from twin.operate.lives.simulated_life import Life, drawn_course, drawn_life
+from twin.operate.lives.simulation_run import take_files
+from twin.operate.record.entries import MICRO, micros
+from twin.operate.record.history import History, content_of, initialised
+from twin.operate.record.telemetry import WITHIN
 from twin.verify.__main__ import app as verify
 
 PLAN = EXAMPLES / "operation.yaml"

@@ -15,11 +15,11 @@ from optics.numerics.backend import load_backend
 from scenes.specs.load import DISTURBANCES, EXAMPLES, LIBRARY
 from scenes.specs.operation import read_operation
 from scenes.yaml.yaml_file import dump_yaml
-from twin.operate.entries import micros
-from twin.operate.judged_life import JudgedLife, judged
-from twin.operate.judged_report import SHARES, judged_numbers, likely_shares
-from twin.operate.simulate import TELEMETRY, Simulation
-from twin.operate.simulation_run import Places, simulate_into
+from twin.operate.lives.judged_life import JudgedLife, judged
+from twin.operate.lives.judged_report import SHARES, judged_numbers, likely_shares
+from twin.operate.lives.simulate import TELEMETRY, Simulation
+from twin.operate.lives.simulation_run import Places, simulate_into
+from twin.operate.record.entries import micros
 from twin.run.procedure import silent
 
 START = micros("2027-01-01T00:00:00Z")

@@ -13,8 +13,8 @@ from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
-from twin.operate.entries import MICRO, utc_text
 from twin.operate.overview import Overview, Trend, group_name
+from twin.operate.record.entries import MICRO, utc_text
 from twin.run import svg
 
 BANDS = ((1.9600, 0.22, "95 %"), (0.9945, 0.42, "68 %"))

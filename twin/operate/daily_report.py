@@ -11,10 +11,8 @@ from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
 from scenes.yaml.errors import Problem
-from twin.operate.alarms import name_of, percent
 from twin.operate.daily_plots import courses_svg, innovations_svg
-from twin.operate.entries import micros, utc_text
-from twin.operate.history import History
+from twin.operate.estimate.alarms import name_of, percent
 from twin.operate.overview import (
     CONFIDENCE,
     DAY,
@@ -28,12 +26,14 @@ from twin.operate.overview import (
     trend,
     with_sigma,
 )
+from twin.operate.record.entries import micros, utc_text
+from twin.operate.record.history import History
 from twin.run.artefact import Artefact, Cell, Marked, OwnDecimals, SvgFigure, Table, Text, decimals_for
 from twin.run.page import report_page
 from twin.run.report import Report, Section, answer
 
 if TYPE_CHECKING:
-    from twin.operate.following import FoundJump
+    from twin.operate.estimate.following import FoundJump
 
 RECENT = 30 * DAY
 """Before the newest reading, of the second figure of courses."""

@@ -19,20 +19,20 @@ from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from scenes.models.disturbances import HEAT, state_of
 from scenes.yaml.errors import Problem
-from twin.operate.alarms import name_of
 from twin.operate.daily_report import rivals_text
-from twin.operate.entries import MICRO, one_line, utc_text
-from twin.operate.history import History
+from twin.operate.estimate.alarms import name_of
 from twin.operate.overview import CONFIDENCE, DAY, Overview, carried_text, code_of, group_name, largest_part, points_of
 from twin.operate.past_view import View, Views
-from twin.operate.schema import ACKNOWLEDGEMENT, ALARM, ENTRY, REFUSED
+from twin.operate.record.entries import MICRO, one_line, utc_text
+from twin.operate.record.history import History
+from twin.operate.record.schema import ACKNOWLEDGEMENT, ALARM, ENTRY, REFUSED
 from twin.operate.shown_readings import plain_reading, reading_near, readings
 from twin.pictures.scene_file import motions, write_scene
 from twin.run.report import sentence
 
 if TYPE_CHECKING:
-    from twin.operate.following import FoundJump
-    from twin.operate.operation import Operation
+    from twin.operate.estimate.following import FoundJump
+    from twin.operate.estimate.operation import Operation
 
 _ALARM = ("id", "kind", "subject", "text", "time_us", "time_utc", "raised_utc", "acknowledged")
 """What a page gets of an alarm."""

@@ -9,8 +9,8 @@ from scenes.specs.operation import OperationSetup
 from scenes.yaml.json_file import read_json
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import dump_yaml, read_yaml
-from twin.operate.run_readings import CONFIG
-from twin.operate.simulate import FOLDER, LIFE, TELEMETRY
+from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY
+from twin.operate.record.run_readings import CONFIG
 from twin.run.cli import InputErrorText, Options
 from twin.run.command import Result, finished, run_command
 from twin.run.procedure import Session
@@ -38,8 +38,8 @@ def judge_life(place: Path, truth: Path | None, options: Options) -> None:
         return validate(OperationSetup, read_yaml(files / CONFIG))
 
     def work(plan: OperationSetup, session: Session) -> Result:
-        from twin.operate.judged_life import judged
-        from twin.operate.judged_report import judged_numbers, judged_report
+        from twin.operate.lives.judged_life import judged
+        from twin.operate.lives.judged_report import judged_numbers, judged_report
 
         life = judged(plan, files / TELEMETRY, _truth(known), session.advance)
         numbers = judged_numbers(life)

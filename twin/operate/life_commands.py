@@ -72,7 +72,7 @@ def simulate(
     with told() as errors, durable.exit_on_terminate():
         check_backend(backend)
         from optics.numerics.backend import load_backend
-        from twin.operate.simulation_run import Places, simulate_into, simulation
+        from twin.operate.lives.simulation_run import Places, simulate_into, simulation
         from twin.run.command import progress_shown
 
         options = {"--from": start, "--days": f"{days:.17g}", "--every": every, "--frames": str(frames)}

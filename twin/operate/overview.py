@@ -1,7 +1,7 @@
 """What readers are told of an instrument in operation, for the daily report and for the served page alike.
 
-An overview takes the estimate as `twin.operate.operation` gives it, with the alarms of the record, and says in words
-and rows what holds, what changed and whether predictions came true. Nothing is estimated here.
+An overview takes the estimate as `twin.operate.estimate.operation` gives it, with the alarms of the record, and says
+in words and rows what holds, what changed and whether predictions came true. Nothing is estimated here.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from scipy.stats import beta, norm
 from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from optics.numerics.frozen_map import FrozenMap
-from twin.operate.alarms import name_of, percent
-from twin.operate.entries import MICRO, utc_text
+from twin.operate.estimate.alarms import name_of, percent
+from twin.operate.record.entries import MICRO, utc_text
 from twin.operate.shown_readings import first_time, readings
 from twin.run.artefact import SAME, decimals_for, fixed
 
 if TYPE_CHECKING:
-    from twin.operate.following import Break, Course, Following, FoundJump
-    from twin.operate.history import History
-    from twin.operate.operation import Operation
+    from twin.operate.estimate.following import Break, Course, Following, FoundJump
+    from twin.operate.estimate.operation import Operation
+    from twin.operate.record.history import History
 
 DAY = 86_400 * MICRO
 """Microseconds."""

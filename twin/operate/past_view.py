@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from twin.operate.history import History
 from twin.operate.overview import DAY, Overview, spread
+from twin.operate.record.history import History
 from twin.operate.shown_readings import reading_times
 
 LIFE, RECENT = 300, 200

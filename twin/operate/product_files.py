@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from twin.operate.entries import utc_text
 from twin.operate.estimated_motions import LeftOut
 from twin.operate.products import PRIOR, STATE, Products
+from twin.operate.record.entries import utc_text
 from twin.operate.validity import SHARE
 from twin.orbit.export.export_report import LINE, export_files
 from twin.run.data_files import WRITER

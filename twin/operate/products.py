@@ -21,10 +21,10 @@ from sqlalchemy import select
 from optics.numerics.frozen_map import FrozenMap
 from scenes.specs.orbit.setup import AngleSetup
 from scenes.yaml.errors import InputError, Problem
-from twin.operate.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
+from twin.operate.estimate.plans import plan_digest
 from twin.operate.estimated_motions import EstimatedMotions, LeftOut, Prior, prior_files, state_file
-from twin.operate.plans import plan_digest
-from twin.operate.schema import ENTRY
+from twin.operate.record.entries import MICRO, digest_of_data, instrument_digest, micros, utc_text
+from twin.operate.record.schema import ENTRY
 from twin.operate.validity import Mark, Validity, validity
 from twin.orbit.export.estimated_change import EstimatedChange
 from twin.orbit.export.export_run import USUAL_HEIGHTS, Export, run_export
@@ -34,8 +34,8 @@ from twin.run.procedure import BenchError
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
     from scenes.models.disturbances import Component
-    from twin.operate.history import History
-    from twin.operate.operation import Course, Following, Operation
+    from twin.operate.estimate.operation import Course, Following, Operation
+    from twin.operate.record.history import History
     from twin.orbit.export.export_run import ExportSource
 
 Array = NDArray[np.float64]

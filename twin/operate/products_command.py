@@ -47,8 +47,8 @@ def products(
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
-    from twin.operate.entries import one_line
-    from twin.operate.history import History
+    from twin.operate.record.entries import one_line
+    from twin.operate.record.history import History
 
     with told() as errors, History(record) as history:
         from optics.numerics.backend import load_backend
@@ -78,8 +78,8 @@ def products(
 
 def _time(moment: str | None, scene: ExportSource | None) -> int:
     """Of the estimate, microseconds of TAI since 2000. Raises InputErrorText."""
-    from twin.operate.entries import micros, one_line
     from twin.operate.products import scene_time
+    from twin.operate.record.entries import micros, one_line
 
     try:
         if moment is not None:

@@ -21,8 +21,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from analysis.images.image_file import ImageError
-from twin.operate.database import RecordFailed
 from twin.operate.desk import Desk
+from twin.operate.record.database import RecordFailed
 from twin.operate.shown_readings import frame_numbered, frame_png
 from twin.serving.guard import Guard
 from twin.serving.server import SHARED, TYPES, PageServer, nothing

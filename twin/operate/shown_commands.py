@@ -16,7 +16,7 @@ from twin.run import durable
 from twin.run.cli import AsJson, InputErrorText, Quiet, print_verdict
 
 if TYPE_CHECKING:
-    from twin.operate.operation import Operation
+    from twin.operate.estimate.operation import Operation
 
 PORT = 8791
 TOKEN, WRITE_TOKEN = "TWIN_OPERATE_TOKEN", "TWIN_OPERATE_WRITE_TOKEN"
@@ -52,8 +52,8 @@ def report(
     """
     with told() as errors:
         from twin.operate.daily_report import daily_report, end_of_day, report_html
-        from twin.operate.history import History, PastHistory
         from twin.operate.overview import Overview
+        from twin.operate.record.history import History, PastHistory
         from twin.operate.shown_readings import first_time, last_time
 
         with History(record) as history:
@@ -125,7 +125,7 @@ def serve(
         except ImportError as error:
             raise InputErrorText(f"{EXTRA} ({error.name})") from None
         from twin.operate.desk import Desk
-        from twin.operate.history import History
+        from twin.operate.record.history import History
         from twin.operate.shown_readings import last_time
 
         console = Console(quiet=quiet)

@@ -15,9 +15,9 @@ from sqlalchemy import Select, func, select
 
 from analysis.images.image_file import ImageFile
 from scenes.yaml.input_file import digest_of
-from twin.operate.entries import utc_text
-from twin.operate.history import History, content_of
-from twin.operate.schema import ENTRY, FRAME, SOURCE
+from twin.operate.record.entries import utc_text
+from twin.operate.record.history import History, content_of
+from twin.operate.record.schema import ENTRY, FRAME, SOURCE
 
 KIND = "monitor"
 _TOGETHER = 400

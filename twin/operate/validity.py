@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.monitor.limits import Quantity
-from twin.operate.entries import MICRO
+from twin.operate.record.entries import MICRO
 
 Array = NDArray[np.float64]
 SHARE = 0.2

@@ -11,10 +11,10 @@ from pathlib import Path
 from scenes.specs.measured.telemetry import RUNS, ReadingTableSpec
 from scenes.yaml.csv_table import rows_of
 from scenes.yaml.errors import InputError, Problem
-from twin.operate.entries import Given, Refused, digest_of_data, micros
-from twin.operate.history import History
-from twin.operate.run_readings import run_entries
-from twin.operate.telemetry import LARGEST, read_table_file, read_telemetry, tables_of
+from twin.operate.record.entries import Given, Refused, digest_of_data, micros
+from twin.operate.record.history import History
+from twin.operate.record.run_readings import run_entries
+from twin.operate.record.telemetry import LARGEST, read_table_file, read_telemetry, tables_of
 from twin.run.cli import InputErrorText
 from twin.run.owned_files import MANIFEST
 from twin.run.run_folder import is_run_folder

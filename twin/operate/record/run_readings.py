@@ -11,7 +11,7 @@ from scenes.yaml.errors import InputError, Problem, names_text
 from scenes.yaml.input_file import digest_of, is_file
 from scenes.yaml.json_file import parse_json, read_json
 from scenes.yaml.yaml_file import read_yaml
-from twin.operate.entries import (
+from twin.operate.record.entries import (
     MICRO,
     Entry,
     Given,
@@ -21,7 +21,7 @@ from twin.operate.entries import (
     instrument_digest,
     one_line,
 )
-from twin.operate.history import History
+from twin.operate.record.history import History
 from twin.run.run_folder import Manifest, read_manifest
 
 RESULTS = {"monitor": "recovered.json", "calibration": "calibration.json", "angle": "angle.json"}

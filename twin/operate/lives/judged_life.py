@@ -21,11 +21,11 @@ from analysis.monitor.limits import Quantity
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.json_file import read_json
-from twin.operate.entries import MICRO, Entry, Given
-from twin.operate.history import History, initialised
-from twin.operate.operation import Course, Following, Operation
-from twin.operate.run_readings import RESULTS
-from twin.operate.telemetry import read_table_file, read_telemetry, tables_of
+from twin.operate.estimate.operation import Course, Following, Operation
+from twin.operate.record.entries import MICRO, Entry, Given
+from twin.operate.record.history import History, initialised
+from twin.operate.record.run_readings import RESULTS
+from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
 from twin.run.procedure import Advance
 
 Array = NDArray[np.float64]

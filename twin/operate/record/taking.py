@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, insert, select
 
 from scenes.yaml.json_file import parse_json
-from twin.operate.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, now, utc_text
-from twin.operate.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
+from twin.operate.record.entries import MICRO, Entry, Given, Refused, canonical, digest_of_data, now, utc_text
+from twin.operate.record.schema import CHECKPOINT, ENTRY, FRAME, REFUSED, SOURCE
 
 SAME_IMAGES = 0.2
 """Root mean square of the differences of spots of the same images, over their sigmas, at most. Those of other images of

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, IntegrityError, NoSuchModuleError
 
-from twin.operate.schema import NotARecord
+from twin.operate.record.schema import NotARecord
 
 FILE = "record.sqlite"
 """Of a record in a folder."""

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.stats import binom
 
 from analysis.monitor.parameters import ANGLE_GROUP, GROUND_GROUP
-from twin.operate.entries import MICRO, utc_text
-from twin.operate.judged_life import WAYS, JudgedLife, covered, rms
+from twin.operate.lives.judged_life import WAYS, JudgedLife, covered, rms
+from twin.operate.record.entries import MICRO, utc_text
 from twin.run import svg
 from twin.run.artefact import Cell, SvgFigure, Table
 from twin.run.report import Report, Section, answer

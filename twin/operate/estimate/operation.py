@@ -26,12 +26,12 @@ from optics.numerics.threads import one_blas_thread
 from scenes.specs.operation import OperationSetup
 from scenes.yaml.errors import Problem
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.entries import MICRO, digest_of_data, utc_text
-from twin.operate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
-from twin.operate.history import History, content_of
-from twin.operate.operation_model import OperationModel, traced_model
-from twin.operate.plans import plan_digest
-from twin.operate.standing import Standing, Taking
+from twin.operate.estimate.following import Break, Course, Following, FoundJump, Motions, SensorState, beyond, widening
+from twin.operate.estimate.operation_model import OperationModel, traced_model
+from twin.operate.estimate.plans import plan_digest
+from twin.operate.estimate.standing import Standing, Taking
+from twin.operate.record.entries import MICRO, digest_of_data, utc_text
+from twin.operate.record.history import History, content_of
 from twin.run.provenance import source_digest
 
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "Operation", "SensorState", "beyond"]

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from scenes.specs.measured.telemetry import RUNS
-from twin.operate.entries import MICRO
-from twin.operate.history import History, content_of
+from twin.operate.record.entries import MICRO
+from twin.operate.record.history import History, content_of
 from twin.run.data_files import DataTable
 from twin.run.quantity import Quantity, Record, in_unit
 

@@ -26,9 +26,18 @@ from scenes.yaml.input_file import digest_of
 from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
-from twin.operate.entries import Entry, Given, Refused, digest_of_data, digest_of_job, micros, micros_after, one_line
-from twin.operate.history import History
-from twin.operate.run_readings import run_entries
+from twin.operate.record.entries import (
+    Entry,
+    Given,
+    Refused,
+    digest_of_data,
+    digest_of_job,
+    micros,
+    micros_after,
+    one_line,
+)
+from twin.operate.record.history import History
+from twin.operate.record.run_readings import run_entries
 
 LARGEST = 1 << 28
 """Bytes of a table."""

@@ -13,8 +13,8 @@ from scipy.special import ndtr
 from analysis.chi_square import limit_of
 from analysis.monitor.disturbances import FALSE_ALARM
 from analysis.monitor.limits import Quantity
-from twin.operate.entries import utc_text
-from twin.operate.standing import Scores
+from twin.operate.estimate.standing import Scores
+from twin.operate.record.entries import utc_text
 
 __all__ = ["Break", "Course", "Following", "FoundJump", "Motions", "SensorState", "beyond", "widening"]
 

@@ -22,9 +22,9 @@ from twin.monitor.monitor_experiment import MonitorExperiment
 from twin.monitor.monitor_memory import largest_piece
 from twin.monitor.observation import Observation, Observing, observe, one_detector
 from twin.monitor.reading_table import ReadingTable, reading_table
-from twin.operate.entries import MICRO, utc_text
-from twin.operate.run_readings import CONFIG, RESULTS
-from twin.operate.simulated_life import Life, drawn_life
+from twin.operate.lives.simulated_life import Life, drawn_life
+from twin.operate.record.entries import MICRO, utc_text
+from twin.operate.record.run_readings import CONFIG, RESULTS
 from twin.run.procedure import Advance
 from twin.run.random_streams import stream
 from twin.run.reference_frames import described

@@ -10,8 +10,8 @@ from scenes.specs.operation import OperationSetup, read_operation
 from scenes.yaml.errors import Problem, names_text, nearest, shown
 from scenes.yaml.spec import validate
 from scenes.yaml.yaml_file import YamlFile
-from twin.operate.entries import digest_of_data, digest_of_job
-from twin.operate.history import History
+from twin.operate.record.entries import digest_of_data, digest_of_job
+from twin.operate.record.history import History
 
 
 def read_plan(path: Path, history: History) -> OperationSetup:

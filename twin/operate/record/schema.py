@@ -90,7 +90,7 @@ ENTRY = _table(
     Index("entry_origin", "origin"),
     Index("entry_time", "time_us", "id"),
 )
-"""A row for each reading or event, as `twin.operate.entries.Entry`."""
+"""A row for each reading or event, as `twin.operate.record.entries.Entry`."""
 REFUSED = _table(
     "refused",
     _digest("sha256", nullable=False, unique=True),
@@ -121,7 +121,7 @@ ALARM = _table(
     Column("content", Text, nullable=False),
     Index("alarm_stream", "kind", "subject", "time_us"),
 )
-"""A row for each alarm, as `twin.operate.entries.Alarm`."""
+"""A row for each alarm, as `twin.operate.record.entries.Alarm`."""
 ACKNOWLEDGEMENT = _table(
     "acknowledgement",
     Column("alarm_id", _NUMBER, ForeignKey("alarm.id"), nullable=False, unique=True),

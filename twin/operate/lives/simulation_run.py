@@ -17,13 +17,13 @@ from scenes.yaml.spec import validate
 from scenes.yaml.units import MOMENT, SCALE, TEMPERATURE_DIFFERENCE, Kind, parse_quantity
 from scenes.yaml.yaml_file import read_yaml
 from twin.monitor.monitor_experiment import MonitorExperiment
-from twin.operate.entries import micros, one_line, utc_text
-from twin.operate.history import History, initialised
-from twin.operate.plans import keep_plan, read_plan
-from twin.operate.run_readings import CONFIG
-from twin.operate.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
-from twin.operate.taking import Taken
-from twin.operate.telemetry import read_table_file, read_telemetry, tables_of
+from twin.operate.estimate.plans import keep_plan, read_plan
+from twin.operate.lives.simulate import FOLDER, LIFE, TELEMETRY, Simulation, recorded, truth_numbers, write_simulated
+from twin.operate.record.entries import micros, one_line, utc_text
+from twin.operate.record.history import History, initialised
+from twin.operate.record.run_readings import CONFIG
+from twin.operate.record.taking import Taken
+from twin.operate.record.telemetry import read_table_file, read_telemetry, tables_of
 from twin.run.cli import InputErrorText
 from twin.run.durable import write_safely
 from twin.run.procedure import WRITE, Advance

@@ -15,8 +15,8 @@ from scipy.special import erf
 
 from analysis.monitor.jump_detection import Jump
 from analysis.monitor.series_filter import Belief, Innovation, Observed, SeriesFilter, Track
-from twin.operate.entries import MICRO
-from twin.operate.operation_model import OperationModel, packed, unpacked
+from twin.operate.estimate.operation_model import OperationModel, packed, unpacked
+from twin.operate.record.entries import MICRO
 
 Array = NDArray[np.float64]
 KEPT = 200
@@ -168,8 +168,8 @@ class Standing:
         used: (U,) ids of the entries that were used since it was last kept for good, in their order.
         left: (U, m) what share of the mean square of jumps could not be told before each of them.
         told: innovations since then.
-        silent: (body, time_us) of sensors that repeat themselves and of the first of their equal readings, of which none
-            is used.
+        silent: (body, time_us) of sensors that repeat themselves, and of the first of their equal readings: none counts
+            from there on.
     """
 
     belief: Belief

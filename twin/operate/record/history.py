@@ -17,9 +17,9 @@ from scenes.models.instrument_builder import build_instrument
 from scenes.specs.resolved import ResolvedJob
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.json_file import parse_json
-from twin.operate import schema
-from twin.operate.database import RecordFailed, engine_of, failures_told, opened, said, url_of, writing
-from twin.operate.entries import (
+from twin.operate.record import schema
+from twin.operate.record.database import RecordFailed, engine_of, failures_told, opened, said, url_of, writing
+from twin.operate.record.entries import (
     Alarm,
     Checkpoint,
     Given,
@@ -29,7 +29,7 @@ from twin.operate.entries import (
     now,
     utc_text,
 )
-from twin.operate.schema import (
+from twin.operate.record.schema import (
     ACKNOWLEDGEMENT,
     ALARM,
     CHECKPOINT,
@@ -40,7 +40,7 @@ from twin.operate.schema import (
     SOURCE,
     NotARecord,
 )
-from twin.operate.taking import Taken, Taking
+from twin.operate.record.taking import Taken, Taking
 from twin.run.data_files import WRITER
 from twin.run.durable import make_folders, sync_folder
 

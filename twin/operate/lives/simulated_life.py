@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from scenes.models.disturbances import Component, StatedMotions
 from scenes.specs.disturbances import TimeLawSpec
-from twin.operate.entries import MICRO
+from twin.operate.record.entries import MICRO
 from twin.run.random_streams import stream
 
 Array = NDArray[np.float64]
