@@ -62,6 +62,8 @@ _UNLIKELY = 1e-4
 """Likelihood over that of the likeliest time, below which the step did not come at a time."""
 _AHEAD = 100.0
 """Lengths of the series after its end for which a forecast knows that jumps go on."""
+_AGAIN, _TWO_VALUED = 2.0, 1.5
+"""Times that what is not known of a told jump, and what is, count for a smoother."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """By how much the variance of a jump is tried to be larger than stated."""
 
@@ -115,8 +117,8 @@ class Jump:
         times: standard deviations of the jump over those stated, which the smoother takes it to have.
         parts: (motions, variance) of each body that may have jumped, over that stated and times the chance that it was
             this body; empty for the motions above alone.
-        change: of the parameters by the jump, whichever body it was; spread: covariance of its error. Empty where it is
-            not worked out, as is shift, of the spots, px.
+        change: (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is
+            not worked out. spread: covariance of its error.
     """
 
     body: str
@@ -135,7 +137,6 @@ class Jump:
     parts: tuple[tuple[tuple[int, ...], float], ...] = ()
     change: tuple[float, ...] = ()
     spread: tuple[tuple[float, ...], ...] = ()
-    shift: tuple[float, ...] = ()
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -164,15 +165,24 @@ class Step:
         parts: (motions, variance over that stated) of what steps, independent of each other.
         chances: (time, chance that it has come by then) in the order of time, linear between; one entry (time, 1) for a
             known moment, seconds.
+        moment: (D + P, D + P) mean square of what it does to spots and parameters; None for that of independent parts.
     """
 
     parts: tuple[tuple[tuple[int, ...], float], ...]
     chances: tuple[tuple[float, float], ...]
+    moment: Array | None = None
 
     @classmethod
     def of(cls, jump: Jump) -> Step:
-        """Of a jump, of all motions that may have taken part."""
-        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances)
+        """Of a jump that was told, for a smoother: its mean square as it was found, one body having made it. What the
+        readings said of it they will say once more, so that what they left unknown counts twice. Between the readings
+        around it the state is one of two, the jump away from each other, and no normal: half of its square more.
+        """
+        moment = None
+        if jump.change:
+            change = np.array(jump.change)
+            moment = _TWO_VALUED * np.outer(change, change) + _AGAIN * np.array(jump.spread)
+        return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
 
     def come(self, time: float) -> float:
         """Chance that it has come by a time, seconds."""

@@ -228,6 +228,10 @@ class SeriesFilter:
         """(n, n) covariance of the states by each step."""
         out = []
         for one in self.steps:
+            if one.moment is not None:
+                does = self.space.level_doing
+                out.append(does @ one.moment @ does.T)
+                continue
             together = np.zeros((self.space.size, self.space.size))
             for motions, variance in one.parts:
                 own = list(motions)
@@ -471,16 +475,15 @@ class SeriesFilter:
         size, size_spread = mixed([named], [self.stated.sigmas[list(alone.motions), None] * alone.root], weight[None])
         does = [self.space.outputs_of(one.motions) @ one.root for one in bodies.own]
         change, spread = mixed(bodies.amounts, does, bodies.weight)
-        width, empty = self.space.width, np.zeros(0)
+        empty = np.zeros(0)
         told = replace(
             jump,
             sizes=tuple(size.tolist()),
             sigmas=tuple(np.sqrt(np.diag(size_spread)).tolist()),
             chances=knots(belief.after, belief.until, weight),
             parts=bodies.parts,
-            change=tuple(change[width:].tolist()),
-            spread=tuple(tuple(row) for row in spread[width:, width:].tolist()),
-            shift=tuple(change[:width].tolist()),
+            change=tuple(change.tolist()),
+            spread=tuple(tuple(row) for row in spread.tolist()),
         )
         return replace(belief, state=state, search=search, after=empty, until=empty), told
 

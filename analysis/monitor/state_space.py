@@ -203,6 +203,16 @@ class StateSpace:
         out[block.at] = self._coordinates(block, motions)
         return out
 
+    @cached_property
+    def level_doing(self) -> Array:
+        """(n, D + P) states of the level that do what is asked for, in the sense of least squares."""
+        block = self._blocks[0]
+        scale = np.abs(block.outputs).max(axis=1, initial=0.0)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        out = np.zeros((self.size, len(scale)))
+        out[block.at] = np.linalg.pinv(block.outputs / scale[:, None]) / scale
+        return out
+
     def _coordinates(self, block: _Block, motions: Sequence[int]) -> Array:
         """(r, m) states of a block that do what motions do."""
         scale = np.abs(block.outputs).max(axis=1, initial=0.0)

@@ -251,8 +251,9 @@ class Operation:
         sizes = tuple(zip(jump.labels, jump.units, jump.sizes, jump.sigmas, strict=True))
         after, until = (self.epoch + round(time * MICRO) for time in (jump.after, jump.until))
         change, spread, rows = np.array(jump.change), np.array(jump.spread), self.model.rows
-        read, changed = rows @ (self.model.reading @ np.array(jump.shift)), rows @ change
-        sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread, rows))
+        width = self.model.how.space.width
+        read, changed = rows @ (self.model.reading @ change[:width]), rows @ change[width:]
+        sigma = np.sqrt(np.einsum("qi,ij,qj->q", rows, spread[width:, width:], rows))
         names = [f"{one.group} {one.key}" for one in self.quantities]
         carried = dict(zip(names, zip(read.tolist(), changed.tolist(), sigma.tolist(), strict=True), strict=True))
         return FoundJump(jump.body, after, until, told, sizes, jump.log_ratio, jump.chance, jump.rivals, carried)

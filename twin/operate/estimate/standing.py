@@ -275,7 +275,7 @@ class Standing:
 
 
 def _jump(plain: dict[str, Any]) -> Jump:
-    lists = ("motions", "labels", "units", "sizes", "sigmas", "change", "shift")
+    lists = ("motions", "labels", "units", "sizes", "sigmas", "change")
     chances = tuple((time, chance) for time, chance in plain["chances"])
     rivals = dict(sorted(plain["rivals"].items(), key=lambda one: -one[1]))  # the best first, as they were
     more = {"chances": chances, "rivals": rivals, "spread": tuple(map(tuple, plain["spread"]))}
