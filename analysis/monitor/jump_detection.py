@@ -62,8 +62,8 @@ _UNLIKELY = 1e-4
 """Likelihood over that of the likeliest time, below which the step did not come at a time."""
 _AHEAD = 100.0
 """Lengths of the series after its end for which a forecast knows that jumps go on."""
-_AGAIN, _TWO_VALUED = 2.0, 1.5
-"""Times that what is not known of a told jump, and what is, count for a smoother."""
+_AGAIN, _TWO_VALUED = 1.0, 1.5
+"""Times that, for a smoother, what spots leave unknown of a told jump counts once more, and what it did counts."""
 _INFLATIONS = np.logspace(0.0, 8.0, 161)
 """By how much the variance of a jump is tried to be larger than stated."""
 
@@ -118,7 +118,7 @@ class Jump:
         parts: (motions, variance) of each body that may have jumped, over that stated and times the chance that it was
             this body; empty for the motions above alone.
         change: (D + P) of the spots, px, and of the parameters by the jump, whichever body it was; empty where that is
-            not worked out. spread: covariance of its error.
+            not worked out. spread: covariance of its error; width: D.
     """
 
     body: str
@@ -137,6 +137,7 @@ class Jump:
     parts: tuple[tuple[tuple[int, ...], float], ...] = ()
     change: tuple[float, ...] = ()
     spread: tuple[tuple[float, ...], ...] = ()
+    width: int = 0
 
     @cached_property
     def law(self) -> TimeLaw:
@@ -175,13 +176,16 @@ class Step:
     @classmethod
     def of(cls, jump: Jump) -> Step:
         """Of a jump that was told, for a smoother: its mean square as it was found, one body having made it. What the
-        readings said of it they will say once more, so that what they left unknown counts twice. Between the readings
-        around it the state is one of two, the jump away from each other, and no normal: half of its square more.
+        readings said of it they will say once more, so that what they left unknown of what spots see counts twice; what
+        spots do not see stays as it is. Between the readings around it the state is one of two, the jump away from each
+        other, and no normal: half of its square more.
         """
         moment = None
         if jump.change:
             change = np.array(jump.change)
-            moment = _TWO_VALUED * np.outer(change, change) + _AGAIN * np.array(jump.spread)
+            spread, spots = np.array(jump.spread), slice(jump.width)
+            seen = spread[:, spots] @ np.linalg.pinv(spread[spots, spots], hermitian=True) @ spread[spots]
+            moment = _TWO_VALUED * np.outer(change, change) + spread + _AGAIN * seen
         return cls(jump.parts or ((jump.motions, jump.times**2),), jump.chances, moment)
 
     def come(self, time: float) -> float:

@@ -484,6 +484,7 @@ class SeriesFilter:
             parts=bodies.parts,
             change=tuple(change.tolist()),
             spread=tuple(tuple(row) for row in spread.tolist()),
+            width=self.space.width,
         )
         return replace(belief, state=state, search=search, after=empty, until=empty), told
 
