@@ -294,7 +294,8 @@ class ImagePointsFileSpec(Spec):
 
     Attributes:
         file: path, CSV with columns `point`, `camera`, `line`, `pixel`, `line_sigma`, `pixel_sigma` and perhaps
-            `correlation`.
+            `correlation`; or the .gcp of the Ames Stereo Pipeline that is the file of the ground points, with images
+            that are called as the lines, `nadir.tif`.
         centre: image coordinates of the middle of pixel (or line) n: n, or n + 0.5.
         first_pixel: number of the first pixel of a line.
         first_pixel_sees: to which side of the track the first pixel looks.

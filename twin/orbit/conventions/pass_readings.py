@@ -11,7 +11,7 @@ import numpy as np
 
 from optics.numerics.frozen_map import FrozenMap
 from scenes.yaml.csv_table import Column, read_table
-from scenes.yaml.errors import nearest, shown
+from scenes.yaml.errors import names_text, nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.measured.clock import Readings
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
@@ -106,7 +106,10 @@ def read_pass(spec: OrbitCheckSpec, camera: ThreeLineCameraSpec, folder: Path) -
     platform, meant = read_platform(spec.platform, folder)
     lines = read_line_clocks(spec.lines, tuple(camera.lines), folder)
     ground = read_ground_points(spec.ground, folder)
-    images = _image_points(spec.image_points, ground, lines, folder)
+    if Path(spec.image_points.file).suffix.lower() == ".gcp":
+        images = _gcp_points(spec, ground, lines, folder)
+    else:
+        images = _image_points(spec.image_points, ground, lines, folder)
     half = 0.5 if spec.image_points.centre == "half" else 0.0
     stated = PassConventions(
         meant,
@@ -172,6 +175,31 @@ def _image_points(
             raise table.error(row, "point", f"twice in {camera}", shown(str(names[row])), "each point once")
         spread = image_covariance(table, rows)
         found[camera] = ImagePoints(number[rows], table["line"][rows], table["pixel"][rows], spread)
+    return FrozenMap(found)
+
+
+def _gcp_points(
+    spec: OrbitCheckSpec, ground: GroundFile, lines: Mapping[str, LineClock], folder: Path
+) -> Mapping[str, ImagePoints]:
+    """Image points of the .gcp file that holds the ground points; an image is that of the line of its name."""
+    file = spec.image_points.file
+    if (folder / file) != (folder / spec.ground.file):
+        allowed = "the file of `ground`, or a table"
+        raise spec.image_points.error("image points of another .gcp file", ("file",), found=file, allowed=allowed)
+    found = {}
+    for image, rows in ground.images.items():
+        camera = Path(image).stem
+        if camera not in lines:
+            problem, allowed = (
+                "an image that is none of the camera's lines",
+                names_text(f"{name}.tif" for name in lines),
+            )
+            raise spec.image_points.error(problem, ("file",), found=shown(image), allowed=allowed)
+        number = rows[:, 0].astype(np.intp)
+        covariance = rows[:, 3:, None] ** 2 * np.eye(2)
+        found[camera] = ImagePoints.of(number, rows[:, 1], rows[:, 2], covariance)
+    if not found:
+        raise spec.image_points.error("a .gcp file without images", ("file",), allowed="image, column, row, two sigmas")
     return FrozenMap(found)
 
 
