@@ -111,8 +111,8 @@ class RationalPolynomial:
         step = _STEP * self.scale[2:4]
         for _ in range(_MOST_STEPS):
             here, north, east = (
-                np.stack(self.image(*(place + move).T, at), axis=-1)
-                for move in (np.zeros(2), [step[0], 0.0], [0.0, step[1]])
+                np.stack(self.image(place[:, 0] + up, place[:, 1] + aside, at), axis=-1)
+                for up, aside in ((0.0, 0.0), (step[0], 0.0), (0.0, step[1]))
             )
             slope = np.stack([(north - here) / step[0], (east - here) / step[1]], axis=-1)
             move = np.linalg.solve(slope, (wanted - here)[..., None])[..., 0]
