@@ -11,9 +11,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from scenes.specs.measured.orbit_data import LineTimesFileSpec
 from scenes.specs.measured.pass_files import PlatformFilesSpec
 from scenes.yaml.errors import InputError
 from tests.twin.dimap_bench import Oracle, Scene, clock, dimap, rpc, write
+from twin.orbit.conventions.pass_readings import read_line_clocks
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.export.rpc_files import read_rpc
 from twin.orbit.flight.platform_table import TabulatedTrajectory
@@ -286,3 +288,19 @@ def test_any_edit_is_read_or_told(tmp_path: Path, which: int, put: str) -> None:
     except InputError as error:
         told = error.issues
     assert all(issue.file == str(path) and issue.problem for issue in told)
+
+
+def test_line_times_of_a_scene(tmp_path: Path) -> None:
+    path = write(tmp_path, SPOT)  # over midnight
+    said = {"file": path.name, "time_scale": "UTC", "moment": "middle"}
+    found = read_line_clocks(LineTimesFileSpec.model_validate(said), ("pan",), tmp_path)["pan"]
+    scene = read_scene(path)
+    moments = found.clock.instants("UTC").since(scene.epoch)
+    # the table's seconds of the day have 1e-11 s
+    np.testing.assert_allclose(moments, scene.sensor.time(found.line), rtol=0, atol=1e-9)
+    for change, cameras, message in (
+        ({}, ("pan", "ms"), "the times of one line"),
+        ({"time_scale": "GPS"}, ("pan",), "in UTC"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_line_clocks(LineTimesFileSpec.model_validate(said | change), cameras, tmp_path)

@@ -92,7 +92,7 @@ def test_draws_of_a_wrong_camera_have_the_stated_covariance(sensors) -> None:
 
 
 def test_intersected_points_against_least_squares(sensors) -> None:
-    """Each error by itself, found anew: wrong sensors image a point, the right ones intersect it by least squares in the images."""
+    """Each error by itself, found anew: wrong sensors image a point, the right ones intersect it in the images."""
     pair = {name: sensors[name] for name in ("nadir", "forward", "backward")}
     stated = uncertainty()
     found = intersected_accuracy(pair, stated, HEIGHT)

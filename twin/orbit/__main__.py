@@ -152,7 +152,7 @@ def export(
         from scenes.yaml.errors import InputError, Issue
         from twin.orbit.export import export_report
         from twin.orbit.export.export_run import SceneSource, run_export
-        from twin.orbit.export.quality import with_quality
+        from twin.orbit.export.quality_run import with_quality
         from twin.run.procedure import BenchError
 
         read, heights, wishes = given

@@ -277,7 +277,8 @@ class LineTimesFileSpec(Spec):
     """When lines were exposed: a table of camera, line and time.
 
     Attributes:
-        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`.
+        file: path, CSV with columns `camera`, `line` and `time [s]` or `date_time`; or the DIMAP file of a scene, for a
+            camera of one line.
         time_scale: of the clock.
         epoch: reading of that clock at 0 s, for tables with `time [s]`.
         moment: which moment of its exposure a line's time is.

@@ -14,11 +14,13 @@ from scenes.yaml.csv_table import Column, read_table
 from scenes.yaml.errors import names_text, nearest, shown
 from scenes.yaml.units import TIME
 from twin.orbit.measured.clock import Readings
+from twin.orbit.measured.dimap_file import is_dimap, read_dimap
 from twin.orbit.measured.ground_files import GroundFile, read_ground_points
 from twin.orbit.measured.measurement_tables import COLUMNS, image_covariance, require_known
 from twin.orbit.measured.pass_measurements import ImagePoints
 from twin.orbit.measured.platform_files import Conventions, PlatformReadings, clock_of, read_platform
 from twin.orbit.measured.platform_readings import AttitudeReadings, OrbitReadings
+from twin.orbit.measured.text_file import first_lines
 
 if TYPE_CHECKING:
     from scenes.specs.measured.orbit_data import ImagePointsFileSpec, LineTimesFileSpec, OrbitCheckSpec
@@ -135,6 +137,8 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
         InputError: the table cannot be read, a camera that is none, fewer than two lines of one, lines or times that do
             not rise.
     """
+    if is_dimap(list(first_lines(folder / spec.file, "line times: CSV, or DIMAP"))):
+        return _scene_lines(spec, cameras, folder)
     table = read_table(folder / spec.file, _LINES, 2)
     clock = clock_of(table, spec)
     names = table["camera"].astype(str)
@@ -152,6 +156,21 @@ def read_line_clocks(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: 
                 raise table.error(row, head, f"{what}s of {name} do not rise", None, "rows in order, each line once")
         found[name] = LineClock(line, taken)
     return found
+
+
+def _scene_lines(spec: LineTimesFileSpec, cameras: tuple[str, ...], folder: Path) -> dict[str, LineClock]:
+    """Line times of a DIMAP file, which has one line; its lines count from 0."""
+    if len(cameras) != 1:
+        allowed = "a camera of one line, or a table"
+        raise spec.error("a scene has the times of one line", ("file",), found=names_text(cameras), allowed=allowed)
+    if spec.time_scale != "UTC":
+        raise spec.error("a scene's times are in UTC", ("time_scale",), found=spec.time_scale, allowed="UTC")
+    read = read_dimap(folder / spec.file)
+    last = max(read.lines - 1, 1)
+    second = read.first_line.second[0] + np.array([0.0, last * read.line_time])
+    over = np.floor(second / 86400.0)
+    clock = Readings(read.first_line.day[0] + over.astype(np.int64), second - 86400.0 * over)
+    return {cameras[0]: LineClock(np.array([0.0, float(last)]), clock)}
 
 
 def _image_points(

@@ -27,6 +27,7 @@ from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
 from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
+from twin.orbit.export.quality import Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.corrected_lines import calibrated_lines, corrected_line
 from twin.orbit.flight.line_camera import LineCamera
@@ -39,7 +40,6 @@ from twin.run.run_folder import read_manifest
 
 if TYPE_CHECKING:
     from optics.numerics.backend import Backend
-    from twin.orbit.export.quality import Quality
 
 READS = ("orbit_simulate", "orbit_angle")
 """Kinds of files that say a camera and its way."""
