@@ -89,6 +89,10 @@ def test_draws_of_a_wrong_camera_have_the_stated_covariance(sensors) -> None:
     inside = np.mean(np.hypot(*np.array(away)[:, :2].T) < found.ce90[k])
     assert inside == pytest.approx(0.9, abs=0.049)  # 4 sigma of 600 draws
     assert found.le90[k] == pytest.approx(1.6449 * 2.0, rel=1e-4)
+    # heights belong to the ground, and not to the model
+    level_ground = single_accuracy(sensor, uncertainty(height=0.0), HEIGHT)
+    assert found.horizontal() == level_ground.horizontal()
+    assert found.ce90[k] > level_ground.ce90[k]
 
 
 def test_intersected_points_against_least_squares(sensors) -> None:

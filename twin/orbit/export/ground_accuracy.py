@@ -83,7 +83,8 @@ class AccuracyMap:
         longitude, latitude: (N,) radians; NaN where a look misses the Earth or, of several lines, fewer than two see.
         height: of the ground above the ellipsoid, metres.
         constant: (N, 3, 3) to the east, to the north and up, m^2, of what points have in common.
-        random: (N, 3, 3) of what is another in every point.
+        random: (N, 3, 3) of what is another in every point: its measured places.
+        heights: (N, 3, 3) of the heights that points of one line have from elsewhere, which move them in plan as well.
         shape: of the grid.
     """
 
@@ -94,12 +95,13 @@ class AccuracyMap:
     height: float
     constant: Array
     random: Array
+    heights: Array
     shape: tuple[int, int]
 
     @property
     def covariance(self) -> Array:
         """(N, 3, 3) of a point, m^2."""
-        return self.constant + self.random
+        return self.constant + self.random + self.heights
 
     @property
     def ce90(self) -> Array:
@@ -118,7 +120,7 @@ class AccuracyMap:
 
     def horizontal(self) -> tuple[float, float]:
         """Roots of the sums of the variances to the east and to the north, root mean square over the scene, metres:
-        of what points have in common, and of what is another in each.
+        of what points have in common, and of their measured places; without heights from elsewhere.
         """
         return tuple(  # type: ignore[return-value]
             float(np.sqrt(np.mean(np.trace(part[self.seen, :2, :2], axis1=1, axis2=2))))
@@ -215,12 +217,12 @@ def single_accuracy(
     line, pixel = _grid(sensor, first_pixel, sensor.camera.pixels if pixels is None else pixels)
     longitude, latitude, level = _places(sensor, line, pixel, height)
     found = _derivatives(sensor, line, pixel, height, level[:, :2])
-    constant, random = np.zeros((len(line), 3, 3)), np.zeros((len(line), 3, 3))
+    constant, random = np.zeros((2, len(line), 3, 3))
     constant[:, :2, :2] = _taken(found.platform, uncertainty.platform) + _taken(found.interior, uncertainty.interior)
     tilt = np.concatenate([found.height, np.ones((len(line), 1))], axis=1)
-    random[:] = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
-    random[:, :2, :2] += _taken(found.place, uncertainty.image)
-    return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, _GRID)
+    heights = uncertainty.height**2 * tilt[:, :, None] * tilt[:, None, :]
+    random[:, :2, :2] = _taken(found.place, uncertainty.image)
+    return AccuracyMap(line, pixel, longitude, latitude, height, constant, random, heights, _GRID)
 
 
 def intersected_accuracy(
@@ -280,7 +282,8 @@ def intersected_accuracy(
         constant[held] += _taken(inverse[held] @ interior, uncertainty.interior)
         random[held] += _taken(inverse[held] @ turned, uncertainty.image)
     nowhere = np.where(good, 0.0, np.nan)
-    return AccuracyMap(line, pixel, longitude + nowhere, latitude + nowhere, height, constant, random, _GRID)
+    none = np.zeros_like(random)
+    return AccuracyMap(line, pixel, longitude + nowhere, latitude + nowhere, height, constant, random, none, _GRID)
 
 
 def _places(sensor: Sensor, line: Array, pixel: Array, height: float) -> tuple[Array, Array, Array]:

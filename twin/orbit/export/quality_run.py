@@ -60,7 +60,7 @@ def _with_errors(line: ExportedLine, found: AccuracyMap, is_controlled: bool) ->
     notes = (
         f"on ground {found.height:.0f} m high points have CE90 up to {found.ce90[worst]:.4g} m, of camera, orbit "
         f"and attitude; covariance there, east east, east north, north north: {a:.6g} {b:.6g} {c:.6g} m^2",
-        f"of it in common to all points {bias:.4g} m, another in every point {random:.4g} m: roots of the sums of the "
+        f"of it in common to all points {bias:.4g} m, of measured places {random:.4g} m: roots of the sums of the "
         "variances to the east and to the north, root mean square over the image",
     )
     isd = {**line.scanner.isd, "notes": [*line.scanner.isd["notes"], *notes]}

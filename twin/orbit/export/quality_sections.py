@@ -40,7 +40,11 @@ ACCURACY: Record[AccuracyMap] = Record(
     Quantity("le90_median_m", _over(lambda f: f.le90, np.median), "interval of 90 % of the vertical errors, median"),
     Quantity("le90_largest_m", _over(lambda f: f.le90, np.max), "the largest"),
     Quantity("common_m", lambda f: f.horizontal()[0], "horizontal error that points have in common, root mean square"),
-    Quantity("random_m", lambda f: f.horizontal()[1], "horizontal error that is another in every point, likewise"),
+    Quantity(
+        "random_m",
+        lambda f: f.horizontal()[1],
+        "that of the measured places, likewise; heights from elsewhere are in neither",
+    ),
 )
 CONTROL: Record[Controlled] = Record(
     "How control points corrected a line's polynomials; measured minus predicted.",
@@ -209,8 +213,8 @@ def _map_section(maps: Mapping[str, AccuracyMap]) -> Section:
             points.append((_called(name), *map(float, (*place, found.height, ce[k], le[k], *sigma[k]))))
     heads = ("points of", "CE90 median [m]", "CE90 largest [m]", "LE90 median [m]", "LE90 largest [m]")
     caption = (
-        "In common: errors of camera, orbit and attitude; random: of the measured places, and of heights. Both are "
-        "roots of the sums of the variances to the east and to the north."
+        "In common: errors of camera, orbit and attitude; random: of the measured places. Both are roots of the sums of "
+        "the variances to the east and to the north. CE90 holds the heights' errors, too."
     )
     table = Table("accuracy", "Errors on the ground", caption, (*heads, "in common [m]", "random [m]"), rows, digits=3)
     places = ("points of", "line", "pixel", "longitude [deg]", "latitude [deg]", "height [m]", "CE90 [m]", "LE90 [m]")
