@@ -213,8 +213,8 @@ def _map_section(maps: Mapping[str, AccuracyMap]) -> Section:
             points.append((_called(name), *map(float, (*place, found.height, ce[k], le[k], *sigma[k]))))
     heads = ("points of", "CE90 median [m]", "CE90 largest [m]", "LE90 median [m]", "LE90 largest [m]")
     caption = (
-        "In common: errors of camera, orbit and attitude; random: of the measured places. Both are roots of the sums of "
-        "the variances to the east and to the north. CE90 holds the heights' errors, too."
+        "In common: errors of camera, orbit and attitude; random: of the measured places. Both are roots of the sums "
+        "of the variances to the east and to the north. CE90 holds the heights' errors, too."
     )
     table = Table("accuracy", "Errors on the ground", caption, (*heads, "in common [m]", "random [m]"), rows, digits=3)
     places = ("points of", "line", "pixel", "longitude [deg]", "latitude [deg]", "height [m]", "CE90 [m]", "LE90 [m]")
