@@ -16,6 +16,7 @@ from tests.twin.line_scanner_model import LineScannerModel
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.export.rpc_files import read_rpc
 from twin.orbit.measured.dimap_sensor import read_scene
+from twin.run.data_files import FrameFacts, tiff
 
 run = partial(invoke, command.app)
 SCENE = Scene(lines=4000, pixels=6000)
@@ -190,3 +191,38 @@ def test_gcp_files_as_others_write_them(folder: Path, tmp_path: Path) -> None:
     for name in variants:
         # PROJ's two ways from the same datum differ by 1e-9 m
         np.testing.assert_allclose(found[name], found["plain"], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("form", ["a_RPC.TXT", "RPC_SCENE.XML", "a.tif"])
+def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str) -> None:
+    """The same polynomials from three formats take the same correction, as the scene's own do."""
+    model = read_rpc(folder / "RPC_SCENE.XML")
+    (tmp_path / "a_RPC.TXT").write_text(model.text())
+    (tmp_path / "a.tif").write_bytes(tiff(np.zeros((1, 32, 32), np.uint16), FrameFacts(place=model)))
+    (tmp_path / "RPC_SCENE.XML").write_bytes((folder / "RPC_SCENE.XML").read_bytes())
+    points = ("--control", folder / "points.gcp")
+    result = run("export", tmp_path / form, *points, "--out", tmp_path / "out")
+    assert result.exit_code == 0, result.stderr
+    name = form.partition(".")[0].removesuffix("_RPC")
+    told = json.loads((tmp_path / "out" / "export.json").read_text())["control"][name]
+    whole = run("export", folder / "DIM_SCENE.XML", *points, "--out", tmp_path / "whole", "--quiet")
+    assert whole.exit_code == 0
+    scene = json.loads((tmp_path / "whole" / "export.json").read_text())["control"]["SCENE_P"]
+    # offsets of DIMAP 2 have lost 1e-12 by the 1 that was added
+    np.testing.assert_allclose(told["coefficients_px"], scene["coefficients_px"], rtol=0, atol=1e-6)
+    assert told["left_out"] == ["3"]
+    found, other = (
+        read_rpc(tmp_path / place / "models" / f"{one}_RPC.TXT") for place, one in (("out", name), ("whole", "SCENE_P"))
+    )
+    latitude, longitude = model.ground([100.0, 3900.0], [5000.0, 30.0], [0.0, 2000.0])
+    np.testing.assert_allclose(
+        found.image(latitude, longitude, [0.0, 2000.0]), other.image(latitude, longitude, [0.0, 2000.0]), atol=1e-5
+    )
+    assert "ISD" not in result.output
+    for options, message in (
+        ((), "nothing to do"),
+        ((*points, "--attitude-sigma", "1 arcsec"), "no camera and no orbit"),
+    ):
+        bad = run("export", tmp_path / form, *options, "--out", tmp_path / "bad")
+        assert bad.exit_code == 2
+        assert message in re.sub(r"\s+", " ", bad.stderr)

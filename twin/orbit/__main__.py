@@ -21,7 +21,10 @@ from twin.run.procedure import Session
 
 if TYPE_CHECKING:
     from twin.orbit.export.export_run import ExportSource, SceneSource
+    from twin.orbit.export.polynomial_export import PolynomialSource
     from twin.orbit.export.quality import Wishes
+
+    Exportable = ExportSource | SceneSource | PolynomialSource
 
 PROGRAM = "twin.orbit"
 
@@ -61,7 +64,7 @@ def export(
         typer.Argument(
             readable=False,
             help="Run folder or YAML file of a simulation or of a test of intersection angles, "
-            "or the DIMAP file of a scene, DIM_NAME.XML.",
+            "the DIMAP file of a scene, DIM_NAME.XML, or a file of rational polynomials.",
         ),
     ],
     lowest: Annotated[
@@ -126,7 +129,8 @@ def export(
         python -m twin.orbit export DIM_SCENE.XML --control points.gcp --attitude-sigma '2 arcsec'
 
     Of a scene of Pléiades or SPOT 6 and 7 the rigorous model of its DIMAP file is exported. Control points correct the
-    polynomials, with ERR_BIAS by their covariance. Sigmas of camera and orbit make a map of CE90 and LE90.
+    polynomials, with ERR_BIAS by their covariance; they do so for NAME_RPC.TXT, RPC_NAME.XML or a GeoTIFF alone, too.
+    Sigmas of camera and orbit make a map of CE90 and LE90.
 
     Exit codes: 0 success, 2 bad input (nothing is written), 1 anything else.
     """
@@ -138,42 +142,52 @@ def export(
         "height": (height_sigma, "--height-sigma"),
     }
 
-    def resolve() -> tuple[ExportSource | SceneSource, tuple[float, float] | None, Wishes]:
+    def resolve() -> tuple[Exportable, tuple[float, float] | None, Wishes]:
         from twin.orbit.export.export_run import read_exportable
         from twin.orbit.export.ground_accuracy import CameraUncertainty
+        from twin.orbit.export.polynomial_export import read_polynomial_source
         from twin.orbit.export.quality import Wishes, read_control
 
         stated = {name: _sigma(name, *one) for name, one in sigmas.items() if one[0] is not None}
         uncertainty = CameraUncertainty.of(**stated) if stated else None
         points = None if control is None else read_control(control, correction.value)
-        return read_exportable(source, seed, band), _ground(lowest, highest), Wishes(uncertainty, points)
+        read = read_polynomial_source(source) or read_exportable(source, seed, band)
+        return read, _ground(lowest, highest), Wishes(uncertainty, points)
 
-    def work(given: tuple[ExportSource | SceneSource, tuple[float, float] | None, Wishes], session: Session) -> Result:
+    def work(given: tuple[Exportable, tuple[float, float] | None, Wishes], session: Session) -> Result:
         from scenes.yaml.errors import InputError, Issue
-        from twin.orbit.export import export_report
+        from twin.orbit.export import export_report, polynomial_export
         from twin.orbit.export.export_run import SceneSource, run_export
+        from twin.orbit.export.polynomial_export import PolynomialSource, run_polynomial_export
         from twin.orbit.export.quality_run import with_quality
         from twin.run.procedure import BenchError
 
         read, heights, wishes = given
-        try:
-            run = with_quality(run_export(read, session.backend, heights, truth, session.advance), wishes)
-        except BenchError as error:
-            if isinstance(read, SceneSource):
-                raise InputError(Issue(str(error), read.scene.read.file, allowed=error.remedy)) from error
-            raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
-        for name, content in export_report.export_files(run).items():
+        contents: dict[str, bytes]
+        if isinstance(read, PolynomialSource):
+            alone = run_polynomial_export(read, wishes)
+            contents, drawn = polynomial_export.polynomial_files(alone), 0
+            shown, numbers = polynomial_export.polynomial_report(alone), polynomial_export.POLYNOMIALS(alone)
+        else:
+            try:
+                run = with_quality(run_export(read, session.backend, heights, truth, session.advance), wishes)
+            except BenchError as error:
+                if isinstance(read, SceneSource):
+                    raise InputError(Issue(str(error), read.scene.read.file, allowed=error.remedy)) from error
+                raise InputError(*read.setup.test.error(str(error), error.key, allowed=error.remedy).issues) from error
+            contents, drawn = export_report.export_files(run), read.seed
+            shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        for name, content in contents.items():
             session.folder.write_bytes(name, content)
         ends = () if heights is None else ("--lowest", f"{heights[0]!r} m", "--highest", f"{heights[1]!r} m")
         name = session.backend.name
         asked = [word for one in sigmas.values() if one[0] is not None for word in (one[1], str(one[0]))]
         asked += [] if band is None else ["--band", band]
         asked += [] if control is None else ["--control", str(control), "--correction", correction.value]
-        options = (*ends, *(("--truth",) if truth else ()), *asked, "--seed", str(read.seed))
+        options = (*ends, *(("--truth",) if truth else ()), *asked, "--seed", str(drawn))
         again = (PROGRAM, "export", str(source), *options, *(() if name == "llvm" else ("--backend", name)))
         inputs = (source,) if control is None else (source, control)
-        facts = {"config": read.config, "seed": read.seed, "again": again, "given": inputs}
-        shown, numbers = export_report.export_report(run), export_report.EXPORT(run)
+        facts = {"config": read.config, "seed": drawn, "again": again, "given": inputs}
         return finished(session, "export", shown, numbers, program=PROGRAM, **facts)
 
     stem = source.resolve().name if source.is_dir() else source.stem

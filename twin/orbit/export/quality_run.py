@@ -69,33 +69,47 @@ def _with_errors(line: ExportedLine, found: AccuracyMap, is_controlled: bool) ->
 
 def _controlled(control: ControlPoints, lines: Mapping[str, ExportedLine]) -> dict[str, Controlled]:
     """Line -> its polynomials after control."""
-    images = control.read.images
-    found = {}
+    found: dict[str, Controlled] = {}
     for name, line in lines.items():
-        rows = images.get(name)
-        rows = next((r for image, r in images.items() if Path(image).stem == name), None) if rows is None else rows
-        if rows is None and len(images) == 1 and len(lines) == 1:
-            rows = next(iter(images.values()))
-        if rows is None or line.polynomial is None:
-            continue
-        point = rows[:, 0].astype(np.intp)
-        ground = control.read.points.taken(point)
-        spread = rows[:, 3:, None] ** 2 * np.eye(2)
-        try:
-            correction = polynomial_correction(
-                line.polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
-            )
-            after = controlled(line.polynomial, correction)
-        except ValueError as error:
-            allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
-            raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
-        found[name] = Controlled(ground.ids, after)
+        if line.polynomial is not None:
+            one = controlled_line(control, name, line.polynomial, len(lines) == 1)
+            found |= {} if one is None else {name: one}
     if not found:
-        allowed = names_text(f"{name}.tif" for name in lines)
-        raise InputError(
-            Issue("no control point is in one of the images", control.file, None, (), names_text(images), allowed)
-        )
+        problem, allowed = "no control point is in one of the images", names_text(f"{name}.tif" for name in lines)
+        raise InputError(Issue(problem, control.file, None, (), names_text(control.read.images), allowed))
     return found
+
+
+def controlled_line(
+    control: ControlPoints, name: str, polynomial: RationalPolynomial, alone: bool
+) -> Controlled | None:
+    """Polynomials of an image after control; None where no point is in it.
+
+    Args:
+        control: points with their places in images.
+        name: of the image, without its ending.
+        polynomial: of it.
+        alone: whether it is the only one, whatever the points' only image is called.
+
+    Raises:
+        InputError: points that do not determine a correction.
+    """
+    images = control.read.images
+    rows = next((places for image, places in images.items() if name in (image, Path(image).stem)), None)
+    if rows is None and alone and len(images) == 1:
+        rows = next(iter(images.values()))
+    if rows is None:
+        return None
+    ground = control.read.points.taken(rows[:, 0].astype(np.intp))
+    spread = rows[:, 3:, None] ** 2 * np.eye(2)
+    try:
+        correction = polynomial_correction(
+            polynomial, ground.itrs, ground.covariance, rows[:, 1:3], spread, control.kind
+        )
+        return Controlled(ground.ids, controlled(polynomial, correction))
+    except ValueError as error:
+        allowed = f"{LEAST_POINTS[control.kind]} points or more, spread over the image of {name}"
+        raise InputError(Issue(str(error), control.file, allowed=allowed)) from None
 
 
 def _products(run: Export, scene: DimapScene) -> Mapping[str, ProductPolynomial]:

@@ -94,7 +94,7 @@ def quality_sections(run: Export) -> tuple[Section, ...]:
     if quality.products:
         found.append(_product_section(quality.products))
     if quality.control:
-        found.append(_control_section(quality.control))
+        found.append(control_section(quality.control))
     if quality.maps:
         found.append(_map_section(quality.maps))
     return tuple(found)
@@ -166,7 +166,8 @@ def _product_section(products: Mapping[str, ProductPolynomial]) -> Section:
     return Section(title, text, (table,), name="product")
 
 
-def _control_section(control: Mapping[str, Controlled]) -> Section:
+def control_section(control: Mapping[str, Controlled]) -> Section:
+    """Corrections and residuals of every line."""
     rows: list[tuple[Cell, ...]] = []
     points: list[tuple[Cell, ...]] = []
     for name, one in control.items():

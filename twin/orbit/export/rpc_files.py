@@ -45,6 +45,20 @@ def read_rpc(path: str | Path) -> RationalPolynomial:
     return _from_text(Path(path))
 
 
+def is_rpc(path: Path) -> bool:
+    """Whether a file holds rational polynomials alone: NAME_RPC.TXT, a GeoTIFF, or the RPC file of DIMAP.
+
+    Raises:
+        InputError: it is XML that cannot be read.
+    """
+    match path.suffix.lower():
+        case ".tif" | ".tiff" | ".txt":
+            return True
+        case ".xml":
+            return bool(read_xml(path, _WHAT).all("Rational_Function_Model"))
+    return False
+
+
 def _made(
     file: str, offset: list[float], scale: list[float], parts: list[np.ndarray], errors: list[float | None]
 ) -> RationalPolynomial:
