@@ -18,6 +18,7 @@ from tests.twin.dimap_bench import Oracle, Scene, clock, dimap, rpc, write
 from twin.orbit.conventions.pass_readings import read_line_clocks
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.export.rpc_files import read_rpc
+from twin.orbit.flight.earth import east_north_up
 from twin.orbit.flight.platform_table import TabulatedTrajectory
 from twin.orbit.measured import xml_file
 from twin.orbit.measured.dimap_file import read_dimap
@@ -70,6 +71,30 @@ def test_the_rigorous_model_is_that_of_the_format(tmp_path: Path, name: str) -> 
     assert np.abs(sensor.ground(row, column, height) - there).max() < AGREE
     back = sensor.image(there)
     np.testing.assert_allclose(back, (row, column), rtol=0, atol=3e-6)  # AGREE in pixels of 0.5 m and more
+
+
+def test_refraction_is_there_where_the_file_says_so(tmp_path: Path) -> None:
+    """At sea level a look of z leaves its straight line by 2.3 m tan z / cos^2 z, toward the satellite; 1 % for the
+    exact layers."""
+    tilted = replace(PLEIADES, pitch=0.4)
+    row, column = np.array([6000.0]), np.array([10_000.0])
+    straight = read_scene(write(tmp_path, tilted)).sensor
+    for value, on in (("true", True), ("1", True), ("false", False), ("TRUE", True)):
+        scene = replace(tilted, settings={"ATMOSPHERIC_REFRACTION_SETTING": value, "LIGHT_SPEED_SETTING": "false"})
+        sensor = read_scene(write(tmp_path, scene)).sensor
+        assert (sensor.effects.refraction, sensor.effects.aberration, sensor.effects.light_time) == (on, False, False)
+        moved = (sensor.ground(row, column) - straight.ground(row, column))[0]
+        ground = straight.ground(row, column)[0]
+        look = straight.trajectory.position(straight.time(row))[0] - ground
+        longitude, latitude, _ = straight.earth.geodetic(ground[None])
+        up = east_north_up(longitude, latitude)[0, 2] @ look / np.linalg.norm(look)
+        zenith = np.arccos(up)
+        wanted = 2.33 * np.tan(zenith) / np.cos(zenith) ** 2 if on else 0.0
+        assert np.linalg.norm(moved) == pytest.approx(wanted, rel=0.01)
+        assert moved @ look >= 0.0
+    scene = replace(tilted, settings={"ATMOSPHERIC_REFRACTION_SETTING": "perhaps"})
+    with pytest.raises(InputError, match="ATMOSPHERIC_REFRACTION_SETTING: neither true nor false"):
+        read_scene(write(tmp_path, scene))
 
 
 def test_midnight_within_a_scene_changes_nothing(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -226,3 +227,14 @@ def test_polynomials_alone_are_corrected(folder: Path, tmp_path: Path, form: str
         bad = run("export", tmp_path / form, *options, "--out", tmp_path / "bad")
         assert bad.exit_code == 2
         assert message in re.sub(r"\s+", " ", bad.stderr)
+
+
+def test_the_speed_of_light_is_not_passed_over(folder: Path, tmp_path: Path) -> None:
+    """Nobody knows what the setting does to the geometry: the model leaves it out and says so."""
+    scene = replace(SCENE, settings={"LIGHT_SPEED_SETTING": "true", "ATMOSPHERIC_REFRACTION_SETTING": "true"})
+    result = run("export", write(tmp_path, scene), "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "LIGHT_SPEED_SETTING is true" in result.output.replace("\n", " ")
+    # and refraction, which straight sensor models carry at one height only, is in the numbers: 1e-8 px without
+    errors = json.loads((tmp_path / "out" / "export.json").read_text())["lines"]["SCENE_P"]["isd_errors"]
+    assert max(one["line_px"] for one in errors) > 0.05

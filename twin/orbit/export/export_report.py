@@ -164,7 +164,8 @@ def export_report(run: Export) -> Report:
     )
     known = "camera and orbit as they truly are" if run.truth else "the laboratory's camera on the measured orbit"
     if isinstance(run.source, SceneSource):
-        known = "the rigorous model of the file"
+        refracted = run.source.scene.read.refracted
+        known = f"the rigorous model of the file, {'with' if refracted else 'without'} refraction"
     facts = (
         ("Lines", known),
         ("Second 0 of the orbit", run.epoch),
@@ -216,6 +217,11 @@ def _sections(run: Export) -> tuple[Section, ...]:
 
 def _warnings(run: Export) -> tuple[str, ...]:
     found = []
+    if isinstance(run.source, SceneSource) and run.source.scene.read.light_speed:
+        found.append(
+            "the file's LIGHT_SPEED_SETTING is true: light time and aberration are not in the model, up to 13 m along "
+            "the track; compare it with the product's own polynomials"
+        )
     for name, line in run.lines.items():
         if line.polynomial is None:
             found.append(f"{name} has no rational polynomials: {line.refused}")

@@ -160,8 +160,8 @@ def _product_section(products: Mapping[str, ProductPolynomial]) -> Section:
     title = "The product's own polynomials"
     table = Table("product_rpc", title, "Polynomials minus rigorous model; rms about the mean.", heads, rows, digits=3)
     text = (
-        "A mean along the track of 25 µrad, 12 m from 500 km, would be the aberration of the light, and one across it "
-        "that grows with the look refraction: the format's rigorous model has straight looks.",
+        "A mean along the track of 12 m would be the aberration of the light, which the rigorous model does not have; "
+        "an error that goes with the height, across the track where the look is oblique, refraction.",
     )
     return Section(title, text, (table,), name="product")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,13 +34,13 @@ class DimapScene:
     epoch: str
 
 
-def read_scene(path: str | Path, band: str | None = None, effects: LightEffects = NO_EFFECTS) -> DimapScene:
+def read_scene(path: str | Path, band: str | None = None, effects: LightEffects | None = None) -> DimapScene:
     """The scene of a DIMAP file.
 
     Args:
         path: of its file DIM_*.XML.
         band: whose looks are taken; may be left out where all bands have the same.
-        effects: what happens to the light beyond the format's model, which has straight looks.
+        effects: what happens to the light; None for refraction where the file says so, and nothing else.
 
     Raises:
         InputError: it cannot be read, or its orbit or attitude do not reach over the image.
@@ -50,6 +50,8 @@ def read_scene(path: str | Path, band: str | None = None, effects: LightEffects 
     table = platform_table(readings, _ITRS)
     trajectory = TabulatedTrajectory(table)
     first = float(read.first_line.instants("UTC").since(table.epoch)[0])
+    if effects is None:
+        effects = replace(NO_EFFECTS, refraction=read.refracted)
     camera = polynomial_line(read.name, read.pixels, read.forward, read.right)
     try:
         sensor = Sensor(camera, trajectory, Earth(), read.line_time, first, read.lines, effects)
