@@ -36,7 +36,7 @@ def test_two_hundred_draws_keep_to_their_covariances(kind: str) -> None:
     """
     place, spread = points(14)
     corner = np.array([[0.0, 0.0], [SIZE[0], 0.0], [0.0, SIZE[1]], SIZE])
-    error, left, freedom = 0.0, 0.0, 0
+    error, left, freedom, each = 0.0, 0.0, 0, []
     own = {"shift": 2, "affine": 6}[kind]
     for seed in range(DRAWS):
         found = image_correction(place, drawn(kind, place, spread, seed), spread, kind, screened=False)
@@ -47,9 +47,13 @@ def test_two_hundred_draws_keep_to_their_covariances(kind: str) -> None:
         error += float(rows @ np.linalg.solve(known, rows))
         left += found.chi_square
         freedom += found.freedom
+        each.append(np.einsum("ni,nij,nj->n", found.residual, np.linalg.inv(found.variance), found.residual))
         single = found.covariance_at(*corner.T)
         off = found.at(*corner.T) - TRUE[kind](corner)
         assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(single), off).max() < chi2.isf(1e-8, 2)
+    # residuals of one point over all draws are independent, each with the covariance that is told
+    assert chi2.ppf(1e-5, 2 * DRAWS) < np.sum(each, axis=0).min()
+    assert np.sum(each, axis=0).max() < chi2.isf(1e-5, 2 * DRAWS)
     assert freedom == DRAWS * (2 * len(place) - own)
     for value, count in ((error, DRAWS * own), (left, freedom)):
         assert chi2.ppf(2.5e-5, count) < value < chi2.isf(2.5e-5, count)
