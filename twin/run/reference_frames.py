@@ -172,7 +172,9 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
         "georeference": {"longitude, latitude": _GEODETIC, "rows, columns": "to the south, to the east"},
         "export": {
             "times": _SECONDS,
-            "heights_m": "above the ellipsoid",
+            "heights_m, height_m": "above the ellipsoid",
+            "coefficients_px, covariance_px2": "of line and sample, measured minus predicted",
+            "artefacts/accuracy_map.csv": f"longitude and latitude: {_GEODETIC}; sigmas in the local horizon",
             "models/*.json": f"{_ITRS}; lines and samples count from the image's corner, pixel centres are at halves",
             "models/*_RPC.TXT, models/*.tif": f"{_GEODETIC}; line 0 and sample 0 are the centres of the first pixel",
         },

@@ -2,11 +2,13 @@
 software, with their images where there are any.
 
 The camera is the laboratory's and the way the measured one, as the user of the images knows them; or, where asked for,
-both as they truly are. An instrument's cameras can be those that its monitor has estimated in orbit.
+both as they truly are. An instrument's cameras can be those that its monitor has estimated in orbit. The scene of a
+DIMAP file is as that file tells it.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,16 +23,18 @@ from scenes.kinds.file_kinds import kind_of
 from scenes.models.instrument_builder import build_instrument
 from scenes.specs.orbit.setup import AngleSetup, SimulateSetup, resolve_angle, resolve_simulate
 from scenes.yaml.errors import InputError, Issue
-from scenes.yaml.yaml_file import read_yaml
+from scenes.yaml.yaml_file import dump_yaml, read_yaml
 from twin.orbit.angle.angle_flight import angle_camera, fly
 from twin.orbit.export.estimated_change import EstimatedChange, GroundSigma, ground_sigma
 from twin.orbit.export.line_scanner import LineScanner, line_scanner
+from twin.orbit.export.quality import Quality
 from twin.orbit.export.rational_polynomial import RationalPolynomial
 from twin.orbit.flight.corrected_lines import calibrated_lines, corrected_line
 from twin.orbit.flight.line_camera import LineCamera
 from twin.orbit.flight.sensor import Sensor
 from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.simulate_run import fly_simulation
+from twin.orbit.measured.dimap_sensor import DimapScene, read_scene
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.run_folder import read_manifest
 
@@ -59,6 +63,29 @@ class ExportSource:
     folder: Path | None
     seed: int
     windows: Mapping[str, tuple[int, int, int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSource:
+    """The scene of a DIMAP file.
+
+    Attributes:
+        scene: what the file tells.
+        config: its path and what was chosen of it, as YAML.
+    """
+
+    scene: DimapScene
+    config: str
+
+    @property
+    def folder(self) -> None:
+        """No run."""
+        return None
+
+    @property
+    def seed(self) -> int:
+        """Any: nothing is drawn."""
+        return 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,13 +139,36 @@ class Export:
         truth: whether camera and orbit are the true ones.
         heights: of the ground above the ellipsoid that models were fitted to: lowest, middle, highest, metres.
         lines: by name.
+        quality: what they are worth; None where it was not looked at.
     """
 
-    source: ExportSource
+    source: ExportSource | SceneSource
     epoch: str
     truth: bool
     heights: tuple[float, float, float]
     lines: Mapping[str, ExportedLine]
+    quality: Quality | None = None
+
+
+def read_exportable(path: Path, seed: int | None = None, band: str | None = None) -> ExportSource | SceneSource:
+    """Whatever has a camera and its way: what `read_source` takes, or the DIMAP file of a scene.
+
+    Args:
+        path: of it.
+        seed: in place of the file's.
+        band: of a scene whose bands do not look alike.
+
+    Raises:
+        InputError: it is neither, or cannot be read.
+    """
+    if path.is_file() and path.suffix.lower() in _SCENES:
+        return SceneSource(read_scene(path, band), dump_yaml({"source": str(path)} | ({"band": band} if band else {})))
+    if band is not None:
+        raise InputError(Issue("only the scene of a DIMAP file has bands", str(path), None, ("band",), band))
+    return read_source(path, seed)
+
+
+_SCENES = (".xml", ".dim")
 
 
 def read_source(path: Path, seed: int | None = None) -> ExportSource:
@@ -136,7 +186,7 @@ def read_source(path: Path, seed: int | None = None) -> ExportSource:
     kind = kind_of(read_yaml(path).data)
     if kind is None or kind.name not in READS:
         found = None if kind is None else kind.what
-        allowed = "a simulation, a test of intersection angles, or the run folder of one"
+        allowed = "a simulation, a test of intersection angles, the run folder of one, or DIM_NAME.XML of a scene"
         hint = _PAYLOAD_HINT if kind is not None and kind.name in ("three_line_camera", "instrument") else allowed
         raise InputError(Issue("twin.orbit export does not read this", str(path), found=found, allowed=hint))
     resolve: Callable[[Path], SimulateSetup | AngleSetup] = (
@@ -168,7 +218,7 @@ def _of_run(folder: Path) -> ExportSource:
 
 
 def run_export(
-    source: ExportSource,
+    source: ExportSource | SceneSource,
     backend: Backend,
     heights: tuple[float, float] | None,
     truth: bool = False,
@@ -191,7 +241,8 @@ def run_export(
         BenchError: no such orbit, or ground that cannot be modelled.
         ValueError: changes of a payload, or of the truth.
     """
-    if changes is not None and (truth or not isinstance(source.setup, AngleSetup) or source.setup.instrument is None):
+    setup = None if isinstance(source, SceneSource) else source.setup
+    if changes is not None and (truth or not isinstance(setup, AngleSetup) or setup.instrument is None):
         raise ValueError("only the cameras of an instrument, as their user knows them, have estimated changes")
     chosen = _heights(source, heights)
     epoch, windows = _windows(source, backend, truth, changes)
@@ -211,7 +262,7 @@ _ROOM = 100.0
 """Metres about the heights of an elevation model, which has errors."""
 
 
-def _heights(source: ExportSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
+def _heights(source: ExportSource | SceneSource, heights: tuple[float, float] | None) -> tuple[float, float, float]:
     if heights is not None:
         return heights[0], 0.5 * (heights[0] + heights[1]), heights[1]
     if source.folder is None:
@@ -221,17 +272,19 @@ def _heights(source: ExportSource, heights: tuple[float, float] | None) -> tuple
     return low, float(np.mean(ground)), high
 
 
-def _level(source: ExportSource, heights: tuple[float, float, float]) -> float:
+def _level(source: ExportSource | SceneSource, heights: tuple[float, float, float]) -> float:
     """Mean height of the ground, metres: that of a test's terrain, within the heights that are modelled."""
-    if isinstance(source.setup, AngleSetup):
+    if isinstance(source, ExportSource) and isinstance(source.setup, AngleSetup):
         return float(np.clip(source.setup.test.terrain.height, heights[0], heights[2]))
     return heights[1]
 
 
 def _windows(
-    source: ExportSource, backend: Backend, truth: bool, changes: Mapping[str, EstimatedChange] | None
+    source: ExportSource | SceneSource, backend: Backend, truth: bool, changes: Mapping[str, EstimatedChange] | None
 ) -> tuple[str, dict[str, ImagedWindow]]:
     """Epoch, and the images by line."""
+    if isinstance(source, SceneSource):
+        return source.scene.epoch, _of_scene(source.scene, truth)
     setup = source.setup
     if isinstance(setup, AngleSetup):
         return str(setup.test.orbit.epoch), _of_angle(setup, backend, source.seed, truth, changes)
@@ -276,6 +329,22 @@ def _of_angle(
         sensor = Sensor(line, flown.trajectory, flown.earth, step, first, lines, flown.effects)
         windows[name] = ImagedWindow(name, sensor, 0, line.pixels, pitch, None, known.get(name))
     return windows
+
+
+def _of_scene(scene: DimapScene, truth: bool) -> dict[str, ImagedWindow]:
+    """The one image of a scene. What is told of it is all that is known."""
+    read = scene.read
+    if truth:
+        raise InputError(Issue("nobody knows the truth of a scene", read.file, allowed="no --truth"))
+    name = _UNSAFE.sub("_", read.name)[:_LONGEST] or "scene"
+    return {name: ImagedWindow(name, scene.sensor, 0, read.pixels, read.pitch or _USUAL_PITCH, None)}
+
+
+_UNSAFE = re.compile(r"[^A-Za-z0-9_-]")
+"""Letters of a data set's name that names of files do without."""
+_LONGEST = 100
+_USUAL_PITCH = 13e-6
+"""Metres, of Pleiades; a camera model is the same for every pitch, as its principal distance goes with it."""
 
 
 def _pitch(setup: AngleSetup, name: str) -> float:
