@@ -465,10 +465,12 @@ class SeriesFilter:
         gap = belief.until - belief.after
         bodies = Bodies.of(self._may, jump, belief.until, gap, looking, own)
         levels = [self.space.level_of(one.motions) @ one.root for one in bodies.own]
-        state = _compensated(belief.state, bodies.amounts, bodies.weight, levels, bodies.spots)
-        search = None
-        if belief.search is not None:
-            search = _compensated(belief.search, bodies.judged, bodies.weight, levels, bodies.spots)
+        state, search = belief.state, belief.search
+        mean, covariance = bodies.known(state.mean, state.covariance, state.response, levels, bodies.amounts)
+        state = replace(state.alone(), mean=mean, covariance=covariance)
+        if search is not None:
+            mean, covariance = bodies.known(search.mean, search.covariance, search.response, levels, bodies.judged)
+            search = replace(search.alone(), mean=mean, covariance=covariance)
         # sizes are those of the motions that explain it best, had they jumped alone
         alone, weight = next(one for one in self._may if one.motions == jump.motions), bodies.weight.sum(axis=0)
         named = Amounts.of(*own, alone.spots, jump.times)
@@ -570,23 +572,6 @@ class SeriesFilter:
             return rows @ mean, rows @ covariance @ rows.T + left
         values, rows, beside = self.space.acting(rows, mean, covariance)
         return values, rows @ covariance @ rows.T + left + beside
-
-
-def _compensated(
-    track: Track, amounts: Sequence[Amounts], weight: Array, levels: Sequence[Array], outputs: Sequence[Array]
-) -> Track:
-    """The filter as if it had known of the jump, averaged over bodies and places; nothing is looked for beside it."""
-    n = len(track.mean)
-    shift, spread = np.zeros(n), np.zeros((n, n))
-    for one, share, level, does in zip(amounts, weight, levels, outputs, strict=True):
-        moved = level - track.response @ does
-        each = np.einsum("knr,kr->kn", moved, one.mean)
-        shift += share @ each
-        spread += (share[:, None] * each).T @ each
-        inner = np.matmul(share[:, None, None] * moved, one.covariance)
-        spread += np.tensordot(inner, moved, axes=([0, 2], [0, 2]))
-    covariance = track.covariance + spread - np.outer(shift, shift)
-    return replace(track.alone(), mean=track.mean + shift, covariance=0.5 * (covariance + covariance.T))
 
 
 def series_of(found: Sequence[tuple[Array, Array]], width: int) -> SeriesChanges:

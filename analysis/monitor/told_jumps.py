@@ -83,6 +83,29 @@ class Bodies:
         every = zip(self.own, chance.tolist(), self.times, strict=True)
         return tuple((one.motions, share * times**2) for one, share, times in every)
 
+    def known(
+        self, mean: Array, covariance: Array, response: Array, levels: Sequence[Array], amounts: Sequence[Amounts]
+    ) -> tuple[Array, Array]:
+        """States of a filter as if it had known of the jump: mean (n,) and covariance (n, n), over bodies and places.
+
+        Args:
+            mean: (n,) of the filter.
+            covariance: (n, n) of it.
+            response: (L, n, q) of the mean to steps of unit outputs at each place.
+            levels: (n, r) of each body, what unit amounts do to the states.
+            amounts: of each.
+        """
+        shift, spread = np.zeros(len(mean)), np.zeros(covariance.shape)
+        for one, share, level, does in zip(amounts, self.weight, levels, self.spots, strict=True):
+            moved = level - response @ does
+            each = np.einsum("knr,kr->kn", moved, one.mean)
+            shift += share @ each
+            spread += (share[:, None] * each).T @ each
+            inner = np.matmul(share[:, None, None] * moved, one.covariance)
+            spread += np.tensordot(inner, moved, axes=([0, 2], [0, 2]))
+        out = covariance + spread - np.outer(shift, shift)
+        return mean + shift, 0.5 * (out + out.T)
+
 
 def mixed(amounts: Sequence[Amounts], does: Sequence[Array], weight: Array) -> tuple[Array, Array]:
     """Mean and covariance of what jumps do, each body and place counting by its chance.
