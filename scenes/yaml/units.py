@@ -78,9 +78,15 @@ PER_LENGTH3 = Kind("an inverse length cubed", "1/m^3", ("1/m^3", "1/mm^3"), "1e-
 PER_LENGTH5 = Kind("an inverse length to the fifth", "1/m^5", ("1/m^5", "1/mm^5"), "1e-3 1/m^5")
 PER_LENGTH7 = Kind("an inverse length to the seventh", "1/m^7", ("1/m^7", "1/mm^7"), "1e-3 1/m^7")
 TEMPERATURE_GRADIENT = Kind("a temperature gradient", "K/m", ("K/m", "mK/m"), "0.1 K/m")
+FREQUENCY = Kind("a frequency", "Hz", ("Hz", "mHz", "kHz"), "0.65 Hz", ("Hz", "mHz", "kHz"))
+ANGLE_SPECTRUM = Kind(
+    "a spectral density of an angle", "rad^2/Hz", ("arcsec^2/Hz", "rad^2/Hz"), "0.01 arcsec^2/Hz", ("arcsec^2/Hz",)
+)
+"""Mean square of an angle per frequency, one-sided."""
 EXPANSION = Kind("a thermal expansion", "1/K", ("ppm/K", "1/K"), "7.1 ppm/K", ("ppm/K", "1/K"))
 KINDS = (
     *(ANGLE, LENGTH, SCALE, TIME, SPEED, POWER, MASS, TEMPERATURE, TEMPERATURE_GRADIENT, EXPANSION),
+    *(FREQUENCY, ANGLE_SPECTRUM),
     *(PER_LENGTH, PER_LENGTH3, PER_LENGTH5, PER_LENGTH7),
 )
 
@@ -124,6 +130,11 @@ _KNOWN: dict[str, tuple[Decimal, str]] = {
     "mK/m": (Decimal("1e-3"), "K/m"),
     "1/K": (Decimal(1), "1/K"),
     "ppm/K": (Decimal("1e-6"), "1/K"),
+    "Hz": (Decimal(1), "1/s"),
+    "mHz": (Decimal("1e-3"), "1/s"),
+    "kHz": (Decimal(1000), "1/s"),
+    "rad^2/Hz": (Decimal(1), "rad**2*s"),
+    "arcsec^2/Hz": ((_DEGREE / 3600) ** 2, "rad**2*s"),
     "1/m": (Decimal(1), "1/m"),
     "1/mm": (Decimal(1000), "1/m"),
     "1/m^2": (Decimal(1), "1/m**2"),

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, WithJsonSchema, model_validator
 
+from scenes.specs.orbit.jitter import JitterSpec
 from scenes.yaml.errors import Problem, shown
 from scenes.yaml.quantity import AngleSigmas, Quantity, Vector
 from scenes.yaml.spec import Number, Reference, Spec, TitledSpec, one_given
@@ -185,11 +186,13 @@ class AttitudeSpec(Spec):
         steering: X lies along the inertial velocity (none), or along the track on the turning Earth (yaw), so that the
             image at nadir does not drift along the line.
         offset: rotation vector of the body against the orbital frame, radians (roll, pitch, yaw).
+        jitter: small fast turns about the body's own axes.
     """
 
     nadir: Literal["geodetic", "geocentric"] = "geodetic"
     steering: Literal["none", "yaw"] = "none"
     offset: Annotated[tuple[float, float, float], Vector(Quantity(ANGLE, largest="60 deg"))] = _ZERO
+    jitter: JitterSpec = JitterSpec()
 
 
 class GpsErrorsSpec(Spec):

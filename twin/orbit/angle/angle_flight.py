@@ -34,7 +34,7 @@ from twin.orbit.flight.light_effects import NO_EFFECTS, LightEffects
 from twin.orbit.flight.line_camera import LineAngles, LineCamera, line_cameras, line_normal, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.flight.trajectory import Trajectory
 from twin.run.procedure import BenchError
 
 if TYPE_CHECKING:
@@ -379,7 +379,7 @@ def fly(setup: AngleSetup, camera: AngleCamera, seed: np.random.SeedSequence) ->
         pixel=FrozenMap(pixel),
         spec=spec,
         earth=earth,
-        trajectory=Trajectory(orbit, Attitude.from_spec(spec.attitude)),
+        trajectory=Trajectory.flown(orbit, spec.attitude, seed),
         laboratory=camera.laboratory,
         trace=camera.trace,
         height=FrozenMap(height),

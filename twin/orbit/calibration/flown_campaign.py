@@ -30,7 +30,7 @@ from twin.orbit.flight.line_camera import LineTimes, changed_payload, drifted_pa
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.platform_table import PlatformTable, TabulatedTrajectory
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import TERMS, Attitude, Trajectory
+from twin.orbit.flight.trajectory import TERMS, Trajectory
 from twin.orbit.measured.pass_measurements import GroundPoints, ImagePoints, PassMeasurements
 from twin.run.procedure import Advance, BenchError, silent
 from twin.run.random_streams import stream
@@ -157,7 +157,7 @@ def _pass(
     readings = _sample_readings(spec, named, drift, seed)
     cameras = line_cameras(drifted_payload(changed, drift))
     place, image, ground, season, data = (np.random.default_rng(s) for s in seed.spawn(5))
-    trajectory = _trajectory(name, field, spec, earth)
+    trajectory = _trajectory(name, field, spec, earth, seed)
     errors = spec.errors
     turn = np.array(errors.star_tracker.bias) + np.array(errors.season) * season.standard_normal(3)
     tracker = errors.star_tracker.model_copy(update={"bias": tuple(turn.tolist())})
@@ -281,7 +281,9 @@ def _simulated_points(
     return FieldPoints(data, control_images, given, np.ones(count, bool), control, check_images, points[count:])
 
 
-def _trajectory(name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth) -> Trajectory:
+def _trajectory(
+    name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: Earth, seed: np.random.SeedSequence
+) -> Trajectory:
     """The true orbit, which passes the field's middle at its epoch, and the true attitude."""
     passing = PassingSpec.model_construct(
         longitude=field.longitude,
@@ -294,7 +296,7 @@ def _trajectory(name: str, field: FieldSpec, spec: OrbitCalibrationSpec, earth: 
         epoch=field.epoch, before=spec.span, after=spec.span, passing=passing, elements=None, state=None
     )
     try:
-        return Trajectory(propagate(orbit, earth), Attitude.from_spec(spec.attitude))
+        return Trajectory.flown(propagate(orbit, earth), spec.attitude, seed)
     except ValueError as error:
         remedy = "a field that a sun-synchronous orbit passes"
         raise BenchError(str(error), ("fields", name), remedy) from error

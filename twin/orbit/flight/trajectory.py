@@ -21,7 +21,9 @@ from scipy.signal import lfilter
 
 from optics.geometry.pose import rotation_matrix
 from twin.orbit.flight.earth import Earth, curvature_radii, east_north_up
+from twin.orbit.flight.jitter import JITTER_STREAM, Jitter
 from twin.orbit.flight.orbit import Orbit
+from twin.run.random_streams import stream
 
 if TYPE_CHECKING:
     from scenes.specs.orbit.flight import AttitudeSpec, ErrorsSpec
@@ -238,11 +240,27 @@ class Trajectory:
         orbit: true orbit.
         attitude: law that the true attitude follows.
         errors: of the measured orbit and attitude; None for the truth.
+        jitter: rotation vectors (..., 3) about the body's own axes at times (...), seconds, in which the body departs
+            from the law; None for none. Of a measured trajectory it is what readings of the attitude show of it.
     """
 
     orbit: Orbit
     attitude: Attitude = field(default_factory=Attitude)
     errors: MeasurementErrors | None = None
+    jitter: Series | None = None
+
+    @classmethod
+    def flown(cls, orbit: Orbit, spec: AttitudeSpec, seed: int | np.random.SeedSequence, *number: int) -> Trajectory:
+        """The true trajectory of an orbit.
+
+        Args:
+            orbit: where the satellite is.
+            spec: how it holds itself.
+            seed: of what is random in its jitter, in a stream of its own of this seed.
+            number: of the pass, where several share a seed.
+        """
+        jitter = Jitter.of(spec.jitter, stream(seed, JITTER_STREAM, *number)) if spec.jitter.stated else None
+        return cls(orbit, Attitude.from_spec(spec), jitter=jitter)
 
     @property
     def first(self) -> float:
@@ -274,13 +292,16 @@ class Trajectory:
         """Axes of the body as columns, (...) -> (..., 3, 3): x_itrs = matrix @ x_body."""
         true = self.orbit.itrs(seconds)
         body = self.attitude.body_to_itrs(*true)
+        if self.jitter is not None:
+            body = body @ rotation_matrix(self.jitter(seconds))
         if self.errors is None:
             return body
         latitude = self.orbit.earth.geodetic(true[0])[1]
         return body @ rotation_matrix(self.errors.attitude(seconds, latitude))
 
     def with_errors(self, spec: ErrorsSpec, seed: int, terms: Collection[str] = TERMS) -> Trajectory:
-        """The trajectory as the satellite measures it: this one with errors, in place of those it may have.
+        """The trajectory as the satellite measures it: this one with errors, in place of those it may have, and with
+        jitter as readings of the attitude show it.
 
         Args:
             spec: how large the errors are.
@@ -290,7 +311,10 @@ class Trajectory:
         Raises:
             ValueError: an unknown term.
         """
-        return replace(self, errors=_draw_errors(spec, self.first, self.last, seed, terms))
+        errors, jitter = _draw_errors(spec, self.first, self.last, seed, terms), self.jitter
+        if isinstance(jitter, Jitter):
+            jitter = jitter.read(readings(self.first, self.last, spec.star_tracker.interval))
+        return replace(self, errors=errors, jitter=jitter)
 
     def _motion(self, seconds: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         position, velocity, inertial = self.orbit.itrs(seconds)

@@ -28,6 +28,7 @@ from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import apparent, around, reflectance
 from twin.orbit.images import pushbroom
 from twin.orbit.images.imaged_ground import ImagedGround, LineFrame
+from twin.orbit.images.jitter_exposure import collected
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 from twin.orbit.images.pushbroom import BORDER, LookMap, PushbroomScene, Window
 from twin.run.random_streams import stream
@@ -187,7 +188,9 @@ def imaged_lines(
         seed: of the pixels' differences, which stay the same in all images of the line.
     """
     return {
-        name: ImagedLine(sensor, measured[name], optics[name], optics[name].ccd.pattern(stream(seed, k)))
+        name: ImagedLine(
+            collected(sensor, optics[name]), measured[name], optics[name], optics[name].ccd.pattern(stream(seed, k))
+        )
         for k, (name, sensor) in enumerate(sensors.items())
     }
 

@@ -25,11 +25,14 @@ from twin.orbit.flight.sensor import Sensor
 from twin.orbit.ground.grid import GroundFrame
 from twin.orbit.ground.terrain import Terrain
 from twin.orbit.ground.texture import Extent
+from twin.orbit.images.jitter_exposure import exposures, steady
 from twin.orbit.images.line_optics import ImageMotion, LineOptics
 
 TOLERANCE = 2e-4
 """Metres: largest interpolation error of the look's place at given heights."""
 _COUNTS = (4, 6, 8, 12, 16, 24, 32, 48)
+_JITTERING = (96, 192, 384, 768, 1536)
+"""Nodes along the lines where the attitude is rougher than the looks of a line are."""
 _HEIGHTS = 4
 """The look bends over the ellipsoid's curvature by 3 cm in 500 m of height, and by nothing more."""
 _MET = 1e-4
@@ -81,17 +84,18 @@ class LookMap:
         probe = [random.uniform(ends[0], ends[1], 200) for ends in span]
         exact = np.stack(_local(sensor, frame, *probe))
         error = np.inf
-        for count in _COUNTS:
-            nodes = [_nodes(ends, n) for ends, n in zip(span, (count, count, _HEIGHTS), strict=True)]
+        for count, along in [*((n, n) for n in _COUNTS), *((n, _COUNTS[-3]) for n in _JITTERING)]:
+            nodes = [_nodes(ends, n) for ends, n in zip(span, (count, along, _HEIGHTS), strict=True)]
             grid = [a.ravel() for a in np.meshgrid(nodes[2], nodes[0], nodes[1], indexing="ij")]
-            known = [v.reshape(_HEIGHTS, count, count) for v in _local(sensor, frame, grid[1], grid[2], grid[0])]
+            known = [v.reshape(_HEIGHTS, count, along) for v in _local(sensor, frame, grid[1], grid[2], grid[0])]
             east, north = (_coefficients(v) for v in known)
             one = cls(frame, terrain, span, east, north, error)
             error = float(np.max(np.abs(one._at(*probe) - exact)))
             if error <= tolerance:
                 return cls(frame, terrain, span, east, north, error)
         raise UnphysicalError(
-            f"{_COUNTS[-1]} nodes along lines and pixels leave {error:.2g} m, more than {tolerance:g} m"
+            f"an attitude so rough that {_JITTERING[-1]} nodes along the lines leave {error:.2g} m, more than "
+            f"{tolerance:g} m"
         )
 
     def ground(self, lines: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -359,7 +363,29 @@ def render_patch(
     looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     line, pixel = window.middle
     height = float(looks.ground(np.array([line]), np.array([pixel]))[2][0, 0])
-    motion = ImageMotion.of(sensor, line, pixel, height)
+    # what jitter blurs differs from line to line: it is in the moments that the light is collected at
+    motion = ImageMotion.of(steady(sensor), line, pixel, height)
+    moments = exposures(sensor, optics)
+    if len(moments) > 1 or moments[0][1] is not sensor:
+        seen = [(share, _expected(one, optics, scene, window, oversampling, motion, None)) for share, one in moments]
+        photons = np.sum([share * photons for share, (photons, _) in seen], axis=0)
+        return RenderedPatch(np.maximum(photons, 0.0), window, motion, max(error for _, (_, error) in seen))
+    photons, error = _expected(sensor, optics, scene, window, oversampling, motion, looks)
+    # a point spread function that a grid of samples cuts off rings by 1e-4 of an edge
+    return RenderedPatch(np.maximum(photons, 0.0), window, motion, error)
+
+
+def _expected(
+    sensor: Sensor,
+    optics: LineOptics,
+    scene: PushbroomScene,
+    window: Window,
+    oversampling: int,
+    motion: ImageMotion,
+    looks: LookMap | None,
+) -> tuple[np.ndarray, float]:
+    """Expected photons at one moment of the collection, and the error of places; arguments as `render_patch`."""
+    looks = looks or look_map(sensor, scene.frame, scene.terrain, window)
     # samples at pixels first, then finer if the terrain asks for it
     for fine in (1, oversampling):
         error = _interpolation_error(sensor, looks, window, oversampling, fine)
@@ -384,8 +410,7 @@ def render_patch(
 
     with ThreadPoolExecutor(cores()) as pool:
         list(pool.map(strip, range(0, window.lines, count)))
-    # a point spread function that a grid of samples cuts off rings by 1e-4 of an edge
-    return RenderedPatch(np.maximum(photons, 0.0), window, motion, error)
+    return photons, error
 
 
 def _samples(looks: LookMap, window: Window, oversampling: int, fine: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ from twin.orbit.flight.light_effects import LightEffects
 from twin.orbit.flight.line_camera import LineCamera, changed_payload, line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.images.image_points import POINTS_REMEDY, PatchPoints, PointsError, measure_points
 from twin.orbit.images.line_optics import optics_of
 from twin.orbit.images.patch import ImagedLine, Patch, PatchError, fly_patch, imaged_lines
@@ -99,7 +99,7 @@ def fly_simulation(setup: SimulateSetup, seed: int) -> SimulatedFlight:
     spec, root = setup.test, np.random.SeedSequence(seed)
     earth = Earth.from_spec(spec.earth)
     try:
-        trajectory = Trajectory(propagate(spec.orbit, earth), Attitude.from_spec(spec.attitude))
+        trajectory = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, root)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that the satellite can fly") from error
     measured = trajectory.with_errors(spec.errors, int(np.random.default_rng(stream(root, 0)).integers(2**31)))

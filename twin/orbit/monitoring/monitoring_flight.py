@@ -32,7 +32,7 @@ from twin.orbit.flight.light_effects import NO_EFFECTS
 from twin.orbit.flight.line_camera import LineCamera, look_angle, traced_line_cameras
 from twin.orbit.flight.orbit import propagate
 from twin.orbit.flight.sensor import Sensor
-from twin.orbit.flight.trajectory import Attitude, Trajectory
+from twin.orbit.flight.trajectory import Trajectory
 from twin.orbit.monitoring.monitor_series import TOO_FAR, MonitorSeries, Readings, SmoothedReadings
 from twin.run.procedure import Advance, BenchError
 
@@ -307,7 +307,7 @@ def _look_down(
     """
     earth = Earth.from_spec(spec.earth)
     try:
-        true = Trajectory(propagate(spec.orbit, earth), Attitude.from_spec(spec.attitude))
+        true = Trajectory.flown(propagate(spec.orbit, earth), spec.attitude, seed)
     except ValueError as error:
         raise BenchError(str(error), ("orbit",), "an orbit that exists") from error
     data, *streams = seed.spawn(1 + len(lines))
