@@ -1,0 +1,314 @@
+"""Oscillations of an attitude that are found in observations of it, and its course over time with a covariance.
+
+Lines are found one after the other, the strongest first: the highest power of the periodogram is a line if its chance
+is below the stated rate; then all lines found so far are fitted together, frequencies included, and the search goes on
+beside them. Observations that no oscillation explains (wrong matches) are left out, and taken up again if a line that
+is found later explains them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+
+from analysis.orbit.jitter_spectrum import Array, JitterError, Observations, Periodogram, periodogram
+
+MOST_LINES = 20
+_FAR = 5.0
+"""Robust standard deviations beyond which an observation is wrong: one in two million of good ones is lost."""
+_MEDIAN = 1.4826
+_ROUNDS = 40
+_ARRIVED = 1e-10
+_CELL = 1.0
+"""Resolution elements to each side of a line that is fitted in which none else is sought."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Oscillations that were found, fitted together.
+
+    theta(t) = sum over lines of sine sin(2 pi f (t - origin)) + cosine cos(2 pi f (t - origin)).
+
+    Attributes:
+        frequency: (K,) hertz.
+        sine, cosine: (K, A) radians.
+        covariance: of frequency, sine and cosine of the first line, then of the next, (K (1 + 2 A), ...), with the
+            variance of the noise that the observations show.
+        chance: (K,) largest probability that noise alone would have shown one like it, anywhere, when it was found.
+        origin: moment from which phases count, seconds.
+    """
+
+    frequency: Array
+    sine: Array
+    cosine: Array
+    covariance: Array
+    chance: Array
+    origin: float
+
+    @property
+    def amplitude(self) -> Array:
+        """(K, A) radians."""
+        return np.hypot(self.sine, self.cosine)
+
+    @property
+    def phase(self) -> Array:
+        """(K, A) p of amplitude sin(2 pi f t + p) with t from the epoch, radians, 0 to 2 pi."""
+        at = np.arctan2(self.cosine, self.sine) - 2.0 * np.pi * self.frequency[:, None] * self.origin
+        return np.asarray(np.mod(at, 2.0 * np.pi))
+
+    @property
+    def frequency_sigma(self) -> Array:
+        """(K,) hertz."""
+        width = 1 + 2 * self.sine.shape[1]
+        return np.asarray(np.sqrt(np.diag(self.covariance)[::width]))
+
+    @property
+    def amplitude_sigma(self) -> Array:
+        """(K, A) radians: of the component along the amplitude."""
+        axes = self.sine.shape[1]
+        out = np.zeros_like(self.sine)
+        for k in range(len(self.frequency)):
+            first = k * (1 + 2 * axes) + 1
+            for a in range(axes):
+                at = [first + a, first + axes + a]
+                along = np.array([self.sine[k, a], self.cosine[k, a]])
+                along = along / max(float(np.linalg.norm(along)), 1e-300)
+                out[k, a] = np.sqrt(along @ self.covariance[np.ix_(at, at)] @ along)
+        return out
+
+    def design(self, seconds: ArrayLike) -> Array:
+        """(T, A, K (1 + 2 A)) derivative of the attitude at times (T,) by what `covariance` is of."""
+        t = np.asarray(seconds, np.float64) - self.origin
+        axes, width = self.sine.shape[1], 1 + 2 * self.sine.shape[1]
+        out = np.zeros((len(t), axes, width * len(self.frequency)))
+        for k, f in enumerate(self.frequency):
+            angle = 2.0 * np.pi * f * t
+            sine, cosine = np.sin(angle), np.cos(angle)
+            slope = 2.0 * np.pi * t
+            out[:, :, k * width] = (slope * cosine)[:, None] * self.sine[k] - (slope * sine)[:, None] * self.cosine[k]
+            for a in range(axes):
+                out[:, a, k * width + 1 + a] = sine
+                out[:, a, k * width + 1 + axes + a] = cosine
+        return out
+
+    def course(self, seconds: ArrayLike) -> tuple[Array, Array]:
+        """Attitude (T, A), radians, at times (T,), and its covariance (T, A, A)."""
+        t = np.asarray(seconds, np.float64) - self.origin
+        angle = 2.0 * np.pi * t[:, None] * self.frequency
+        value = np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine
+        by = self.design(seconds)
+        return np.asarray(value), np.asarray(np.einsum("tap,pq,tbq->tab", by, self.covariance, by, optimize=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A search for jitter.
+
+    Attributes:
+        lines: that were found.
+        before: periodogram of the observations.
+        after: the same beside all lines that were found.
+        used: (R,) observations that were not left out as wrong.
+        factor: variance of the noise over that of the covariances.
+        threshold: power of ``after`` that noise alone exceeds with the stated probability.
+    """
+
+    lines: Lines
+    before: Periodogram
+    after: Periodogram
+    used: NDArray[np.bool_]
+    factor: float
+    threshold: float
+
+    @property
+    def detectable(self) -> Array:
+        """(F, A) amplitude about one axis alone that reaches the threshold without noise, radians; inf where blind."""
+        least = np.sqrt(self.threshold) * self.before.sigma
+        return np.where(self.before.blind[:, None], np.inf, least)
+
+
+def search(given: Observations, lowest: float, highest: float, false_alarm: float) -> Found:
+    """Find oscillations.
+
+    Args:
+        given: what was observed.
+        lowest: frequency, hertz.
+        highest: likewise.
+        false_alarm: probability of finding any where there is none, over all frequencies looked at.
+
+    Raises:
+        JitterError: observations that say nothing of jitter.
+    """
+    used = _good(given, None)
+    first: Periodogram | None = None
+    frequency: list[float] = []
+    chance: list[float] = []
+    lines: Lines | None = None
+    while True:
+        kept = given.taken(used)
+        beside = kept if lines is None else kept.beside(_columns(kept, lines))
+        now = periodogram(beside, lowest, highest)
+        if first is None:
+            first = now
+        step = _CELL / kept.span
+        open_ = ~now.blind & np.all(np.abs(now.frequency[:, None] - np.array(frequency)) > step, axis=1)
+        if not np.any(open_) or len(frequency) >= MOST_LINES:
+            break
+        best = int(np.argmax(np.where(open_, now.power, -1.0)))
+        probability = float(now.chance(now.power[best]))
+        if probability > false_alarm:
+            break
+        frequency.append(float(now.frequency[best]))
+        chance.append(probability)
+        lines = _fitted(kept, np.array(frequency), np.array(chance))
+        frequency = lines.frequency.tolist()
+        again = _good(given, lines)
+        if not np.array_equal(again, used):
+            used = again
+            lines = _fitted(given.taken(used), np.array(frequency), np.array(chance))
+            frequency = lines.frequency.tolist()
+            if len(frequency) == 1:
+                # wrong matches were taken for good ones before
+                first = periodogram(given.taken(used), lowest, highest)
+    factor = now.total / now.freedom
+    if lines is None:
+        axes = given.axes
+        lines = Lines(
+            np.zeros(0), np.zeros((0, axes)), np.zeros((0, axes)), np.zeros((0, 0)), np.zeros(0), given.middle
+        )
+    return Found(lines, first, now, used, factor, now.threshold(false_alarm))
+
+
+def _columns(given: Observations, lines: Lines) -> Array:
+    """Derivatives of the observations by all that is fitted of lines, (R, P)."""
+    by = np.zeros((len(given.value), lines.covariance.shape[0]))
+    for j in range(given.time.shape[1]):
+        by += np.einsum("ra,rap->rp", given.weight[:, j], lines.design(given.time[:, j]))
+    return by
+
+
+def _predicted(given: Observations, lines: Lines) -> Array:
+    out = np.zeros(len(given.value))
+    for j in range(given.time.shape[1]):
+        angle = 2.0 * np.pi * (given.time[:, j, None] - lines.origin) * lines.frequency
+        turn = np.sin(angle) @ lines.sine + np.cos(angle) @ lines.cosine
+        out += np.sum(given.weight[:, j] * turn, axis=1)
+    return out
+
+
+def _good(given: Observations, lines: Lines | None) -> NDArray[np.bool_]:
+    """Which observations are explained by nuisance and lines, as far as noise goes."""
+    value = given.value if lines is None else given.value - _predicted(given, lines)
+    keep = np.ones(len(value), bool)
+    for _ in range(_ROUNDS):
+        known = given.taken(keep).nuisance
+        x = np.linalg.lstsq(known, value[keep], rcond=1e-10)[0] if known.shape[1] else np.zeros(0)
+        off = np.abs(value - given.nuisance @ x)
+        again = off <= _FAR * max(_MEDIAN * float(np.median(off[off > 0.0])), 1e-300)
+        if np.array_equal(again, keep):
+            break
+        keep = again
+    return keep
+
+
+def _fitted(given: Observations, frequency: Array, chance: Array) -> Lines:
+    """All lines together, by Gauss and Newton from these frequencies (K,).
+
+    Raises:
+        JitterError: two of them cannot be told apart.
+    """
+    axes, count, value = given.axes, len(frequency), given.rest(given.value)
+    f = frequency.copy()
+    width = 1 + 2 * axes
+    empty = np.zeros((count * width, count * width))
+    for _ in range(_ROUNDS):
+        waves = given.rest(given.waves(f)).reshape(len(value), -1)
+        linear = np.linalg.lstsq(waves, value, rcond=None)[0].reshape(count, 2, axes)
+        lines = Lines(
+            f, np.asarray(linear[:, 0], np.float64), np.asarray(linear[:, 1], np.float64), empty, chance, given.middle
+        )
+        by = given.rest(_columns(given, lines))
+        size = np.linalg.norm(by, axis=0)
+        if not np.all(size > 0.0):
+            raise JitterError("an oscillation that was found moves nothing")
+        left = value - waves @ linear.ravel()
+        u, s, vt = np.linalg.svd(by / size, full_matrices=False)
+        if s[-1] < 1e-8 * s[0]:
+            raise JitterError("two oscillations that were found cannot be told apart")
+        step = (vt.T @ ((u.T @ left) / s)) / size
+        # half a resolution element at most
+        move = np.clip(step[::width], -0.5 / given.span, 0.5 / given.span)
+        f = f + move
+        if np.max(np.abs(move)) * given.span < _ARRIVED:
+            break
+    factor = float(left @ left) / max(given.freedom - count * width, 1)
+    spread = (vt.T / s**2) @ vt / size[:, None] / size
+    return replace(
+        lines,
+        frequency=f,
+        covariance=np.asarray(factor * spread),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """An attitude over time as a cubic spline, with the covariance of its coefficients.
+
+    Attributes:
+        knots: (K + 4,) seconds.
+        coefficients: (K, A) radians.
+        covariance: (K A, K A), of the coefficients of all axes of the first spline, then of the next.
+    """
+
+    knots: Array
+    coefficients: Array
+    covariance: Array
+
+    def basis(self, seconds: ArrayLike) -> Array:
+        """(T, K) values of the splines at times (T,) within the knots."""
+        return np.asarray(BSpline.design_matrix(np.asarray(seconds, np.float64), self.knots, 3).toarray())
+
+    def at(self, seconds: ArrayLike) -> tuple[Array, Array]:
+        """Attitude (T, A), radians, at times (T,), and its covariance (T, A, A)."""
+        by = self.basis(seconds)
+        axes = self.coefficients.shape[1]
+        spread = self.covariance.reshape(by.shape[1], axes, by.shape[1], axes)
+        return by @ self.coefficients, np.asarray(np.einsum("tk,kalb,tl->tab", by, spread, by, optimize=True))
+
+
+def splined(given: Observations, interval: float, sigma: float) -> Course:
+    """The attitude as a cubic spline of which nothing is known but how large it may be: for jitter that is no lines.
+
+    What differences between moments do not tell, such as its mean and blind frequencies, keeps the prior's variance.
+
+    Args:
+        given: what was observed.
+        interval: of the knots, seconds; oscillations of a period below two of them are not in it.
+        sigma: standard deviation of a coefficient before the observations, radians.
+
+    Raises:
+        JitterError: no time between the first and the last moment.
+    """
+    used = np.any(given.weight != 0.0, axis=2)
+    first, last = float(given.time[used].min()), float(given.time[used].max())
+    if not last > first or not interval > 0.0:
+        raise JitterError("a course needs moments that lie apart and an interval above zero")
+    count = max(int(np.ceil((last - first) / interval)), 1)
+    inner = np.linspace(first, last, count + 1)
+    step = inner[1] - inner[0]
+    knots = np.concatenate([first - step * np.arange(3, 0, -1), inner, last + step * np.arange(1, 4)])
+    axes, splines = given.axes, len(knots) - 4
+    by = np.zeros((len(given.value), splines, axes))
+    for j in range(given.time.shape[1]):
+        rows = np.flatnonzero(used[:, j])
+        values = BSpline.design_matrix(np.clip(given.time[rows, j], first, last), knots, 3).toarray()
+        by[rows] += values[:, :, None] * given.weight[rows, j, None]
+    design = given.rest(by.reshape(len(given.value), -1))
+    left = given.rest(given.value)
+    normal = design.T @ design + np.eye(splines * axes) / sigma**2
+    covariance = np.linalg.inv(normal)
+    solved = np.asarray(covariance @ (design.T @ left), np.float64)
+    return Course(knots, solved.reshape(splines, axes), np.asarray(covariance, np.float64))

@@ -1,0 +1,302 @@
+"""Jitter of an attitude from what two or more lines saw of the same places at different moments.
+
+A place that is seen at several moments tells how the attitude differs between them. An observation is
+
+    value = sum over moments j of weight_j . theta(t_j) + nuisance . x + noise,
+
+whitened, so that its noise has one variance for all. For two bands that see the ground a time dt apart it is
+theta(t + dt) - theta(t), whose response to an oscillation of f hertz is 2 |sin(pi f dt)|: it is blind at k/dt.
+
+**Periodogram.** At every frequency sine and cosine about every axis are fitted together with the nuisance, and the sum
+of squares that they take away is the power. No disparity is interpolated and no even spacing is assumed, so that there
+is no interpolation whose period could be found. Frequencies at which an axis is seen with less than a share of its best
+response are blind: they are named and not looked at.
+
+**False alarms.** With noise alone the power at a frequency is a chi-square of s = 2 x axes degrees of freedom, the
+squared length of the noise's projection on a plane that turns with the frequency. The length R exceeds a level r
+somewhere with at most the probability that it does so at the begin plus the mean number of upcrossings (Rice; Davies
+1987). Of R' only the part of the plane's turning that leaves it counts, whose size over a step of the grid is the
+principal angles a_i between the two planes:
+
+    P(max R > r) <= segments x P(R > r) + p_R(r) / sqrt(2 pi) x sum over steps of sqrt(sum a_i^2 / s).
+
+That is a bound for the very times, weights and gaps of the observations, and close for small rates. A variance of the
+noise that has to be estimated from the n degrees of freedom of the rest makes the power a beta distribution at each
+frequency; it is brought to the chi-square of the same tail.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize, stats
+
+from optics.numerics.physical_error import PhysicalError
+
+Array = NDArray[np.float64]
+OVERSAMPLING = 6
+"""Frequencies in the inverse of the time that is observed; the highest of them has 98% of a line's power."""
+BLIND = 0.1
+"""Share of an axis's best response below which a frequency is blind."""
+_AT_ONCE = 2_000_000
+_RANK = 1e-9
+_NEVER = 1e-280
+"""Probability below which none is told apart."""
+_LEAST_ROWS = 30
+_STEPS = 30
+
+
+class JitterError(PhysicalError, ValueError):
+    """Observations that say nothing of jitter."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Whitened observations of an attitude.
+
+    Attributes:
+        value: (R,) of noise with one variance, 1 if the covariances that they were whitened by are right.
+        time: (R, J) moments that they compare, seconds.
+        weight: (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
+        nuisance: (R, P) columns of what else is unknown, of any rank.
+    """
+
+    value: Array
+    time: Array
+    weight: Array
+    nuisance: Array
+
+    @classmethod
+    def of(cls, value: ArrayLike, time: ArrayLike, weight: ArrayLike, nuisance: ArrayLike) -> Observations:
+        """Checked.
+
+        Raises:
+            JitterError: shapes that do not match, values that are not finite, too few observations.
+        """
+        v, t, w, n = (np.array(a, np.float64) for a in (value, time, weight, nuisance))
+        if v.ndim != 1 or t.shape != w.shape[:2] or w.ndim != 3 or len(t) != len(v) or n.shape[:1] != v.shape:
+            raise JitterError(f"observations of shapes {v.shape}, {t.shape}, {w.shape} and {n.shape} do not match")
+        if not all(np.all(np.isfinite(a)) for a in (v, t, w, n)):
+            raise JitterError("an observation is not finite")
+        found = cls(v, t, w, n)
+        if found.freedom < _LEAST_ROWS:
+            raise JitterError(
+                f"{len(v)} observations with {len(v) - found.freedom} unknowns are too few for a spectrum"
+            )
+        return found
+
+    @classmethod
+    def of_disparities(
+        cls,
+        first: ArrayLike,
+        second: ArrayLike,
+        disparity: ArrayLike,
+        sigma: ArrayLike,
+        pair: ArrayLike | None = None,
+        degree: int = 2,
+    ) -> Observations:
+        """Of one axis, from displacements of places that two lines saw.
+
+        Args:
+            first: (n,) moments of the first sight, seconds.
+            second: (n,) of the second.
+            disparity: (n,) attitude at the second less that at the first, radians.
+            sigma: (n,) or one for all.
+            pair: (n,) whole numbers: of which pair of lines; each has a trend of its own.
+            degree: of the trend in time.
+
+        Raises:
+            JitterError: as `of`.
+        """
+        a, b, d = (np.array(v, np.float64) for v in (first, second, disparity))
+        s = np.broadcast_to(np.asarray(sigma, np.float64), d.shape)
+        which = np.zeros(len(d), int) if pair is None else np.asarray(pair)
+        weight = np.stack([-1.0 / s, 1.0 / s], axis=-1)[..., None]
+        trend = _powers(a, degree) / s[:, None]
+        each = [trend * (which == k)[:, None] for k in np.unique(which)]
+        return cls.of(d / s, np.stack([a, b], axis=-1), weight, np.concatenate(each, axis=1))
+
+    @property
+    def axes(self) -> int:
+        """How many."""
+        return self.weight.shape[2]
+
+    @cached_property
+    def span(self) -> float:
+        """From the first to the last moment, seconds."""
+        used = np.any(self.weight != 0.0, axis=2)
+        return float(np.ptp(self.time[used])) if np.any(used) else 0.0
+
+    @cached_property
+    def middle(self) -> float:
+        """Moment from which phases count within this module, seconds."""
+        used = np.any(self.weight != 0.0, axis=2)
+        return float(0.5 * (self.time[used].min() + self.time[used].max()))
+
+    @cached_property
+    def known(self) -> Array:
+        """(R, K) orthonormal columns of the nuisance."""
+        if not self.nuisance.shape[1]:
+            return np.zeros((len(self.value), 0))
+        size = np.linalg.norm(self.nuisance, axis=0)
+        u, s, _ = np.linalg.svd(self.nuisance[:, size > 0.0] / size[size > 0.0], full_matrices=False)
+        return np.asarray(u[:, s > _RANK * s[:1]])
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom beside the nuisance."""
+        return len(self.value) - self.known.shape[1]
+
+    def rest(self, columns: Array) -> Array:
+        """What of columns (R, ...) the nuisance does not explain."""
+        return np.asarray(columns - np.tensordot(self.known, np.tensordot(self.known.T, columns, 1), 1))
+
+    def waves(self, frequency: ArrayLike) -> Array:
+        """Sines and cosines about all axes as they appear in the observations, (R, F, 2 A), by radian of amplitude."""
+        f = np.atleast_1d(np.asarray(frequency, np.float64))
+        out = np.zeros((len(self.value), len(f), 2, self.axes))
+        for j in range(self.time.shape[1]):
+            angle = 2.0 * np.pi * (self.time[:, j, None] - self.middle) * f
+            for k, wave in enumerate((np.sin(angle), np.cos(angle))):
+                out[:, :, k] += wave[..., None] * self.weight[:, j, None]
+        return out.reshape(len(self.value), len(f), 2 * self.axes)
+
+    def taken(self, keep: ArrayLike) -> Observations:
+        """Some of them, by mask."""
+        where = np.asarray(keep)
+        return Observations(self.value[where], self.time[where], self.weight[where], self.nuisance[where])
+
+    def beside(self, columns: Array) -> Observations:
+        """The same with further columns (R, P) of what is unknown."""
+        return replace(self, nuisance=np.concatenate([self.nuisance, columns], axis=1))
+
+
+def _powers(time: Array, degree: int) -> Array:
+    middle, half = 0.5 * (time.min() + time.max()), max(0.5 * float(np.ptp(time)), 1e-9)
+    return np.asarray(np.polynomial.legendre.legvander((time - middle) / half, degree))
+
+
+@dataclass(frozen=True, eq=False)
+class Periodogram:
+    """Power over frequency, and what it is worth.
+
+    Attributes:
+        frequency: (F,) hertz, evenly spaced.
+        power: (F,) sum of squares that an oscillation takes away.
+        amplitude: (F, A) that is fitted about each axis, radians.
+        sigma: (F, A) of an amplitude's components, radians, for noise of variance 1.
+        response: (F, A) to an oscillation, as against one sight of it; 2 for two sights in opposite phase.
+        blind: (F,) whether it is looked at no further.
+        turning: over all steps between frequencies that are looked at, sum of the planes' turning; see the module.
+        segments: of frequencies that are looked at.
+        total: sum of squares without any oscillation.
+        freedom: its degrees.
+    """
+
+    frequency: Array
+    power: Array
+    amplitude: Array
+    sigma: Array
+    response: Array
+    blind: NDArray[np.bool_]
+    turning: float
+    segments: int
+    total: float
+    freedom: int
+
+    @property
+    def order(self) -> int:
+        """Degrees of freedom of an oscillation's amplitudes."""
+        return 2 * self.amplitude.shape[1]
+
+    def chance(self, power: ArrayLike) -> Array:
+        """Largest probability that noise alone has such a power at any of the frequencies; variance of the noise
+        unknown.
+        """
+        share = np.clip(np.asarray(power, np.float64) / self.total, 0.0, 1.0)
+        single = np.maximum(stats.beta.sf(share, 0.5 * self.order, 0.5 * (self.freedom - self.order)), _NEVER)
+        r = stats.chi.isf(single, self.order)
+        rate = stats.chi.pdf(r, self.order) / np.sqrt(2.0 * np.pi)
+        return np.asarray(np.minimum(self.segments * single + rate * self.turning, 1.0))
+
+    def threshold(self, false_alarm: float) -> float:
+        """Power that noise alone exceeds anywhere with at most this probability."""
+        level = optimize.brentq(lambda x: float(np.log(self.chance(x * self.total)) - np.log(false_alarm)), 1e-9, 0.999)
+        return float(level * self.total)
+
+    @property
+    def best(self) -> int:
+        """Index of the highest power that is looked at."""
+        return int(np.argmax(np.where(self.blind, -1.0, self.power)))
+
+    def intervals(self) -> list[tuple[float, float]]:
+        """First and last frequency of every run of blind ones."""
+        edge = np.flatnonzero(np.diff(np.concatenate([[0], self.blind.astype(int), [0]])))
+        return [(float(self.frequency[a]), float(self.frequency[b - 1])) for a, b in edge.reshape(-1, 2)]
+
+
+def periodogram(given: Observations, lowest: float, highest: float) -> Periodogram:
+    """Power between two frequencies, hertz.
+
+    Raises:
+        JitterError: no frequency between them is seen.
+    """
+    step = 1.0 / (OVERSAMPLING * given.span)
+    f = np.arange(np.ceil(lowest / step), np.floor(highest / step) + 1.0) * step
+    if len(f) < 2:
+        raise JitterError(f"no frequencies between {lowest:g} and {highest:g} Hz that {given.span:.3g} s tell apart")
+    value = given.rest(given.value)
+    order, axes = 2 * given.axes, given.axes
+    power, amplitude, sigma = np.zeros(len(f)), np.zeros((len(f), axes)), np.full((len(f), axes), np.inf)
+    angle = np.full(len(f), np.nan)  # from the frequency before
+    before: Array | None = None
+    for part in _parts(len(f), len(given.value) * order):
+        waves = given.rest(given.waves(f[part]))
+        normal = np.einsum("rfa,rfb->fab", waves, waves, optimize=True)
+        right = np.einsum("rfa,r->fa", waves, value, optimize=True)
+        size = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
+        size = np.where(size > 0.0, size, 1.0)
+        even = normal / size[:, :, None] / size[:, None, :]
+        w, v = np.linalg.eigh(even)
+        good = np.all(w > _RANK, axis=1)
+        w = np.where(w > _RANK, w, np.inf)
+        root = np.einsum("fab,fb->fab", v, 1.0 / np.sqrt(w))
+        planes = np.einsum("rfa,fab->rfb", waves / size, root, optimize=True)
+        along = np.einsum("fab,fa->fb", root, right / size)
+        power[part] = np.sum(along**2, axis=1)
+        inverse = np.einsum("fab,fcb->fac", root, root) / size[:, :, None] / size[:, None, :]
+        solved = np.einsum("fab,fb->fa", inverse, right).reshape(-1, 2, axes)
+        amplitude[part] = np.sqrt(np.sum(solved**2, axis=1))
+        variance = np.diagonal(inverse, axis1=1, axis2=2).reshape(-1, 2, axes)
+        sigma[part] = np.where(good[:, None], np.sqrt(0.5 * np.sum(variance, axis=1)), np.inf)
+        chain = planes if before is None else np.concatenate([before[:, None], planes], axis=1)
+        between = np.einsum("rfa,rfb->fab", chain[:, :-1], chain[:, 1:], optimize=True)
+        turned = np.arccos(np.clip(np.linalg.svd(between, compute_uv=False), -1.0, 1.0))
+        angle[part][len(planes[0]) - len(turned) :] = np.sqrt(np.sum(turned**2, axis=1) / order)
+        before = planes[:, -1]
+    sights = np.maximum(np.sum(np.any(given.weight != 0.0, axis=2), axis=1), 1)
+    once = np.sqrt(0.5 * np.sum(np.sum(given.weight**2, axis=1) / sights[:, None], axis=0))
+    with np.errstate(divide="ignore"):
+        response = 1.0 / (sigma * np.where(once > 0.0, once, np.inf))
+    most = np.max(response, axis=0)
+    if not np.all(most > 0.0):
+        raise JitterError("an axis of the attitude moves nothing that was observed")
+    blind = np.any(response < BLIND * most, axis=1)
+    if np.all(blind):
+        raise JitterError(f"all frequencies between {lowest:g} and {highest:g} Hz are blind")
+    joined = ~blind[1:] & ~blind[:-1]
+    segments = int(np.sum(~blind) - np.sum(joined))
+    total = float(value @ value)
+    return Periodogram(
+        f, power, amplitude, sigma, response, blind, float(np.sum(angle[1:][joined])), segments, total, given.freedom
+    )
+
+
+def _parts(count: int, size: int) -> Iterator[slice]:
+    length = max(_AT_ONCE // max(size, 1), 2)
+    for begin in range(0, count, length):
+        yield slice(begin, min(begin + length, count))
