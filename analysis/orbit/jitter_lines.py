@@ -186,7 +186,7 @@ def _columns(given: Observations, lines: Lines) -> Array:
     """Derivatives of the observations by all that is fitted of lines, (R, P)."""
     by = np.zeros((len(given.value), lines.covariance.shape[0]))
     for j in range(given.time.shape[1]):
-        by += np.einsum("ra,rap->rp", given.weight[:, j], lines.design(given.time[:, j]))
+        by += np.einsum("ra,rap->rp", given.weight[:, j], lines.design(given.time[:, j])[given.group])
     return by
 
 
@@ -195,19 +195,21 @@ def _predicted(given: Observations, lines: Lines) -> Array:
     for j in range(given.time.shape[1]):
         angle = 2.0 * np.pi * (given.time[:, j, None] - lines.origin) * lines.frequency
         turn = np.sin(angle) @ lines.sine + np.cos(angle) @ lines.cosine
-        out += np.sum(given.weight[:, j] * turn, axis=1)
+        out += np.sum(given.weight[:, j] * turn[given.group], axis=1)
     return out
 
 
 def _good(given: Observations, lines: Lines | None) -> NDArray[np.bool_]:
-    """Which observations are explained by nuisance and lines, as far as noise goes."""
+    """Which observations are explained by nuisance and lines, as far as noise goes; of a place all or none."""
     value = given.value if lines is None else given.value - _predicted(given, lines)
     keep = np.ones(len(value), bool)
     for _ in range(_ROUNDS):
         known = given.taken(keep).nuisance
         x = np.linalg.lstsq(known, value[keep], rcond=1e-10)[0] if known.shape[1] else np.zeros(0)
         off = np.abs(value - given.nuisance @ x)
-        again = off <= _FAR * max(_MEDIAN * float(np.median(off[off > 0.0])), 1e-300)
+        worst = np.zeros(len(given.time))
+        np.maximum.at(worst, given.group, off)
+        again = worst[given.group] <= _FAR * max(_MEDIAN * float(np.median(off)), 1e-300)
         if np.array_equal(again, keep):
             break
         keep = again
@@ -292,8 +294,7 @@ def splined(given: Observations, interval: float, sigma: float) -> Course:
     Raises:
         JitterError: no time between the first and the last moment.
     """
-    used = np.any(given.weight != 0.0, axis=2)
-    first, last = float(given.time[used].min()), float(given.time[used].max())
+    first, last = given.ends
     if not last > first or not interval > 0.0:
         raise JitterError("a course needs moments that lie apart and an interval above zero")
     count = max(int(np.ceil((last - first) / interval)), 1)
@@ -303,9 +304,8 @@ def splined(given: Observations, interval: float, sigma: float) -> Course:
     axes, splines = given.axes, len(knots) - 4
     by = np.zeros((len(given.value), splines, axes))
     for j in range(given.time.shape[1]):
-        rows = np.flatnonzero(used[:, j])
-        values = BSpline.design_matrix(np.clip(given.time[rows, j], first, last), knots, 3).toarray()
-        by[rows] += values[:, :, None] * given.weight[rows, j, None]
+        values = BSpline.design_matrix(np.clip(given.time[:, j], first, last), knots, 3).toarray()
+        by += values[given.group][:, :, None] * given.weight[:, j, None]
     design = given.rest(by.reshape(len(given.value), -1))
     left = given.rest(given.value)
     normal = design.T @ design + np.eye(splines * axes) / sigma**2

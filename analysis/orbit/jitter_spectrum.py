@@ -15,10 +15,9 @@ response are blind: they are named and not looked at.
 **False alarms.** With noise alone the power at a frequency is a chi-square of s = 2 x axes degrees of freedom, the
 squared length of the noise's projection on a plane that turns with the frequency. The length R exceeds a level r
 somewhere with at most the probability that it does so at the begin plus the mean number of upcrossings (Rice; Davies
-1987). Of R' only the part of the plane's turning that leaves it counts, whose size over a step of the grid is the
-principal angles a_i between the two planes:
+1987). Of R' only the part L of the plane's slope by the frequency counts that leaves the plane:
 
-    P(max R > r) <= segments x P(R > r) + p_R(r) / sqrt(2 pi) x sum over steps of sqrt(sum a_i^2 / s).
+    P(max R > r) <= segments x P(R > r) + p_R(r) / sqrt(2 pi) x integral of sqrt(tr(L' L) / s) over the frequency.
 
 That is a bound for the very times, weights and gaps of the observations, and close for small rates. A variance of the
 noise that has to be estimated from the n degrees of freedom of the rest makes the power a beta distribution at each
@@ -27,7 +26,6 @@ frequency; it is brought to the chi-square of the same tail.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -60,33 +58,40 @@ class Observations:
 
     Attributes:
         value: (R,) of noise with one variance, 1 if the covariances that they were whitened by are right.
-        time: (R, J) moments that they compare, seconds.
+        group: (R,) whole numbers from 0 on that do not fall: which observations come from the same place.
+        time: (G, J) moments that those of a group compare, seconds.
         weight: (R, J, A) by radian about each axis at each moment; zero where there are fewer moments.
         nuisance: (R, P) columns of what else is unknown, of any rank.
     """
 
     value: Array
+    group: NDArray[np.intp]
     time: Array
     weight: Array
     nuisance: Array
 
     @classmethod
-    def of(cls, value: ArrayLike, time: ArrayLike, weight: ArrayLike, nuisance: ArrayLike) -> Observations:
+    def of(
+        cls, value: ArrayLike, group: ArrayLike, time: ArrayLike, weight: ArrayLike, nuisance: ArrayLike
+    ) -> Observations:
         """Checked.
 
         Raises:
             JitterError: shapes that do not match, values that are not finite, too few observations.
         """
         v, t, w, n = (np.array(a, np.float64) for a in (value, time, weight, nuisance))
-        if v.ndim != 1 or t.shape != w.shape[:2] or w.ndim != 3 or len(t) != len(v) or n.shape[:1] != v.shape:
-            raise JitterError(f"observations of shapes {v.shape}, {t.shape}, {w.shape} and {n.shape} do not match")
+        g = np.array(group, np.intp)
+        shapes = v.shape, g.shape, t.shape, w.shape, n.shape
+        if v.ndim != 1 or w.ndim != 3 or t.ndim != 2 or not (len(v) == len(g) == len(w) == len(n)):
+            raise JitterError(f"observations of shapes {shapes} do not match")
+        if w.shape[1] != t.shape[1] or np.any(np.diff(g) < 0) or np.any(g < 0) or np.any(g >= len(t)):
+            raise JitterError(f"observations of shapes {shapes} do not match, or their groups are mixed")
         if not all(np.all(np.isfinite(a)) for a in (v, t, w, n)):
             raise JitterError("an observation is not finite")
-        found = cls(v, t, w, n)
+        found = cls(v, g, t, w, n)
         if found.freedom < _LEAST_ROWS:
-            raise JitterError(
-                f"{len(v)} observations with {len(v) - found.freedom} unknowns are too few for a spectrum"
-            )
+            unknown = len(v) - found.freedom
+            raise JitterError(f"{len(v)} observations with {unknown} unknowns are too few for a spectrum")
         return found
 
     @classmethod
@@ -118,7 +123,7 @@ class Observations:
         weight = np.stack([-1.0 / s, 1.0 / s], axis=-1)[..., None]
         trend = _powers(a, degree) / s[:, None]
         each = [trend * (which == k)[:, None] for k in np.unique(which)]
-        return cls.of(d / s, np.stack([a, b], axis=-1), weight, np.concatenate(each, axis=1))
+        return cls.of(d / s, np.arange(len(d)), np.stack([a, b], axis=-1), weight, np.concatenate(each, axis=1))
 
     @property
     def axes(self) -> int:
@@ -126,16 +131,20 @@ class Observations:
         return self.weight.shape[2]
 
     @cached_property
+    def ends(self) -> tuple[float, float]:
+        """First and last moment, seconds."""
+        moments = self.time[self.group][np.any(self.weight != 0.0, axis=2)]
+        return (float(moments.min()), float(moments.max())) if len(moments) else (0.0, 0.0)
+
+    @property
     def span(self) -> float:
         """From the first to the last moment, seconds."""
-        used = np.any(self.weight != 0.0, axis=2)
-        return float(np.ptp(self.time[used])) if np.any(used) else 0.0
+        return self.ends[1] - self.ends[0]
 
-    @cached_property
+    @property
     def middle(self) -> float:
         """Moment from which phases count within this module, seconds."""
-        used = np.any(self.weight != 0.0, axis=2)
-        return float(0.5 * (self.time[used].min() + self.time[used].max()))
+        return 0.5 * (self.ends[0] + self.ends[1])
 
     @cached_property
     def known(self) -> Array:
@@ -158,17 +167,15 @@ class Observations:
     def waves(self, frequency: ArrayLike) -> Array:
         """Sines and cosines about all axes as they appear in the observations, (R, F, 2 A), by radian of amplitude."""
         f = np.atleast_1d(np.asarray(frequency, np.float64))
-        out = np.zeros((len(self.value), len(f), 2, self.axes))
-        for j in range(self.time.shape[1]):
-            angle = 2.0 * np.pi * (self.time[:, j, None] - self.middle) * f
-            for k, wave in enumerate((np.sin(angle), np.cos(angle))):
-                out[:, :, k] += wave[..., None] * self.weight[:, j, None]
-        return out.reshape(len(self.value), len(f), 2 * self.axes)
+        angle = 2.0 * np.pi * (self.time[:, :, None] - self.middle) * f
+        both = np.stack([np.sin(angle), np.cos(angle)], axis=-1)[self.group]
+        return np.einsum("rjfk,rja->rfka", both, self.weight).reshape(len(self.value), len(f), 2 * self.axes)
 
     def taken(self, keep: ArrayLike) -> Observations:
         """Some of them, by mask."""
         where = np.asarray(keep)
-        return Observations(self.value[where], self.time[where], self.weight[where], self.nuisance[where])
+        some, group = np.unique(self.group[where], return_inverse=True)
+        return Observations(self.value[where], group, self.time[some], self.weight[where], self.nuisance[where])
 
     def beside(self, columns: Array) -> Observations:
         """The same with further columns (R, P) of what is unknown."""
@@ -191,7 +198,7 @@ class Periodogram:
         sigma: (F, A) of an amplitude's components, radians, for noise of variance 1.
         response: (F, A) to an oscillation, as against one sight of it; 2 for two sights in opposite phase.
         blind: (F,) whether it is looked at no further.
-        turning: over all steps between frequencies that are looked at, sum of the planes' turning; see the module.
+        turning: integral over the frequencies that are looked at of the plane's turning; see the module.
         segments: of frequencies that are looked at.
         total: sum of squares without any oscillation.
         freedom: its degrees.
@@ -245,43 +252,37 @@ def periodogram(given: Observations, lowest: float, highest: float) -> Periodogr
     Raises:
         JitterError: no frequency between them is seen.
     """
+    if not given.span > 0.0:
+        raise JitterError("all observations are of one moment")
     step = 1.0 / (OVERSAMPLING * given.span)
     f = np.arange(np.ceil(lowest / step), np.floor(highest / step) + 1.0) * step
     if len(f) < 2:
         raise JitterError(f"no frequencies between {lowest:g} and {highest:g} Hz that {given.span:.3g} s tell apart")
-    value = given.rest(given.value)
-    order, axes = 2 * given.axes, given.axes
-    power, amplitude, sigma = np.zeros(len(f)), np.zeros((len(f), axes)), np.full((len(f), axes), np.inf)
-    angle = np.full(len(f), np.nan)  # from the frequency before
-    before: Array | None = None
-    for part in _parts(len(f), len(given.value) * order):
-        waves = given.rest(given.waves(f[part]))
-        normal = np.einsum("rfa,rfb->fab", waves, waves, optimize=True)
-        right = np.einsum("rfa,r->fa", waves, value, optimize=True)
-        size = np.sqrt(np.diagonal(normal, axis1=1, axis2=2))
+    value, axes = given.rest(given.value), given.axes
+    products = _Products.of(given, value)
+    power, variance, square, turning = np.zeros(len(f)), *np.zeros((2, len(f), axes)), np.zeros(len(f))
+    for begin in range(0, len(f), products.at_once):
+        part = slice(begin, begin + products.at_once)
+        normal, mixed, slopes, right = products.at(f[part])
+        size = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 0.0))
         size = np.where(size > 0.0, size, 1.0)
-        even = normal / size[:, :, None] / size[:, None, :]
-        w, v = np.linalg.eigh(even)
+        w, v = np.linalg.eigh(normal / size[:, :, None] / size[:, None, :])
         good = np.all(w > _RANK, axis=1)
         w = np.where(w > _RANK, w, np.inf)
-        root = np.einsum("fab,fb->fab", v, 1.0 / np.sqrt(w))
-        planes = np.einsum("rfa,fab->rfb", waves / size, root, optimize=True)
-        along = np.einsum("fab,fa->fb", root, right / size)
-        power[part] = np.sum(along**2, axis=1)
-        inverse = np.einsum("fab,fcb->fac", root, root) / size[:, :, None] / size[:, None, :]
-        solved = np.einsum("fab,fb->fa", inverse, right).reshape(-1, 2, axes)
-        amplitude[part] = np.sqrt(np.sum(solved**2, axis=1))
-        variance = np.diagonal(inverse, axis1=1, axis2=2).reshape(-1, 2, axes)
-        sigma[part] = np.where(good[:, None], np.sqrt(0.5 * np.sum(variance, axis=1)), np.inf)
-        chain = planes if before is None else np.concatenate([before[:, None], planes], axis=1)
-        between = np.einsum("rfa,rfb->fab", chain[:, :-1], chain[:, 1:], optimize=True)
-        turned = np.arccos(np.clip(np.linalg.svd(between, compute_uv=False), -1.0, 1.0))
-        angle[part][len(planes[0]) - len(turned) :] = np.sqrt(np.sum(turned**2, axis=1) / order)
-        before = planes[:, -1]
+        inverse = (v / w[:, None, :]) @ v.swapaxes(1, 2) / size[:, :, None] / size[:, None, :]
+        solved = (inverse @ right[..., None])[..., 0]
+        power[part] = np.sum(solved * right, axis=1)
+        square[part] = np.sum(solved.reshape(-1, 2, axes) ** 2, axis=1)
+        own = 0.5 * np.sum(np.diagonal(inverse, axis1=1, axis2=2).reshape(-1, 2, axes), axis=1)
+        variance[part] = np.where(good[:, None], own, np.inf)
+        # what of the planes' slope leaves them
+        leaving = slopes - mixed.swapaxes(1, 2) @ inverse @ mixed
+        rate = np.trace(inverse @ leaving, axis1=1, axis2=2)
+        turning[part] = np.sqrt(np.maximum(rate, 0.0) / (2 * axes))
     sights = np.maximum(np.sum(np.any(given.weight != 0.0, axis=2), axis=1), 1)
     once = np.sqrt(0.5 * np.sum(np.sum(given.weight**2, axis=1) / sights[:, None], axis=0))
-    with np.errstate(divide="ignore"):
-        response = 1.0 / (sigma * np.where(once > 0.0, once, np.inf))
+    sigma = np.sqrt(variance)
+    response = 1.0 / (sigma * np.where(once > 0.0, once, np.inf))
     most = np.max(response, axis=0)
     if not np.all(most > 0.0):
         raise JitterError("an axis of the attitude moves nothing that was observed")
@@ -289,14 +290,86 @@ def periodogram(given: Observations, lowest: float, highest: float) -> Periodogr
     if np.all(blind):
         raise JitterError(f"all frequencies between {lowest:g} and {highest:g} Hz are blind")
     joined = ~blind[1:] & ~blind[:-1]
+    turned = float(np.sum((0.5 * step * (turning[1:] + turning[:-1]))[joined]))
     segments = int(np.sum(~blind) - np.sum(joined))
     total = float(value @ value)
-    return Periodogram(
-        f, power, amplitude, sigma, response, blind, float(np.sum(angle[1:][joined])), segments, total, given.freedom
-    )
+    return Periodogram(f, power, np.sqrt(square), sigma, response, blind, turned, segments, total, given.freedom)
 
 
-def _parts(count: int, size: int) -> Iterator[slice]:
-    length = max(_AT_ONCE // max(size, 1), 2)
-    for begin in range(0, count, length):
-        yield slice(begin, min(begin + length, count))
+@dataclass(frozen=True, eq=False)
+class _Products:
+    """Sums over the observations from which those of all waves follow, whatever the frequency.
+
+    Attributes:
+        time: (G, J) moments, from the middle.
+        columns: (G J, A C) of the observations' weights with the value and the known columns.
+        pairs: (G J J, A A) of the weights with one another.
+        axes: A.
+    """
+
+    time: Array
+    columns: Array
+    pairs: Array
+    axes: int
+
+    @classmethod
+    def of(cls, given: Observations, value: Array) -> _Products:
+        first = np.searchsorted(given.group, np.arange(len(given.time)))
+        columns = np.concatenate([value[:, None], given.known], axis=1)
+        # every group has an observation, so that sums between begins are sums over groups
+        by_column = np.add.reduceat(given.weight[..., None] * columns[:, None, None, :], first, axis=0)
+        by_pair = np.add.reduceat(given.weight[:, :, None, :, None] * given.weight[:, None, :, None, :], first, axis=0)
+        groups, moments, axes = len(given.time), given.time.shape[1], given.axes
+        return cls(
+            given.time - given.middle,
+            by_column.reshape(groups * moments, -1),
+            by_pair.reshape(groups * moments**2, axes**2),
+            axes,
+        )
+
+    @property
+    def at_once(self) -> int:
+        """Frequencies for which the products of waves are held at a time."""
+        return max(_AT_ONCE // len(self.pairs), 1)
+
+    def at(self, frequency: Array) -> tuple[Array, Array, Array, Array]:
+        """At frequencies (F,), beside the known columns: products of all waves (F, 2 A, 2 A), of waves with their
+        slopes by the frequency, of slopes, and of waves with the value, (F, 2 A).
+        """
+        count, a = len(frequency), self.axes
+        t = 2.0 * np.pi * self.time
+        angle = frequency[:, None, None] * t
+        sine, cosine = np.sin(angle), np.cos(angle)
+        # waves and slopes: sine, cosine, and t cosine, - t sine
+        single = np.stack([sine, cosine, t * cosine, -t * sine]).reshape(4, count, -1)
+        with_columns = (single @ self.columns).reshape(4, count, a, -1)
+        products = np.empty((4, 4, count, a, a))
+        waves = (sine, cosine)
+        plain: dict[tuple[int, int, str], Array] = {}
+        weights = {
+            "": self.pairs,
+            "l": self.pairs * np.broadcast_to(t[:, None, :], (*t.shape, t.shape[1])).reshape(-1, 1),
+            "jl": self.pairs * (t[:, :, None] * t[:, None, :]).reshape(-1, 1),
+        }
+        for j in (0, 1):
+            for k in (0, 1):
+                outer = (waves[j][..., :, None] * waves[k][..., None, :]).reshape(count, -1)
+                for name, weight in weights.items():
+                    plain[j, k, name] = (outer @ weight).reshape(count, a, a)
+        for j in (0, 1):
+            for k in (0, 1):
+                sign = (1.0, -1.0)
+                products[j, k] = plain[j, k, ""]
+                products[j, 2 + k] = sign[k] * plain[j, 1 - k, "l"]
+                products[2 + j, 2 + k] = sign[j] * sign[k] * plain[1 - j, 1 - k, "jl"]
+        known = with_columns[..., 1:]
+        found = []
+        for rows, others in ((0, 0), (0, 2), (2, 2)):
+            block = np.empty((count, 2, a, 2, a))
+            for j in (0, 1):
+                for k in (0, 1):
+                    taken = known[rows + j] @ known[others + k].swapaxes(1, 2)
+                    block[:, j, :, k, :] = products[rows + j, others + k] - taken
+            found.append(block.reshape(count, 2 * a, 2 * a))
+        right = with_columns[:2, ..., 0].swapaxes(0, 1).reshape(count, 2 * a)
+        return found[0], found[1], found[2], right

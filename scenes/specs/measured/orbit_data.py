@@ -14,6 +14,7 @@ from scenes.specs.measured import pass_files
 from scenes.specs.orbit.angle import Angles, EffectsSpec, LightEffectsSpec, Moment
 from scenes.specs.orbit.calibration import LaunchSpec, MapLimitsSpec
 from scenes.specs.orbit.flight import Interval, LengthSigmas, PayloadTestSpec, SlowErrorsSpec, UtcTime
+from scenes.specs.orbit.jitter_search import JitterSearchSpec, SomeLines
 from scenes.specs.orbit.scene import ImagePointsSpec
 from scenes.yaml.errors import Problem, names_text
 from scenes.yaml.quantity import AngleSigmas, Quantity
@@ -271,6 +272,25 @@ class MeasuredAngleSpec(MeasuredTestSpec):
             problem = "angles know of readings and slow errors of the attitude, not of a drift or a walk"
             raise Problem(problem, None, "`slow:`", within=("errors", "star_tracker"))
         return self
+
+
+class MeasuredJitterSpec(MeasuredTestSpec):
+    """A search for jitter in points that several lines of a pass saw.
+
+    Attributes:
+        name: as the file is called.
+        description: for people.
+        camera: name in scenes/library/payloads or path of a file: the camera as the laboratory knows it.
+        data: folder with a ``data.yaml``, or the path of such a file; else `conventions` and `passes` stand here.
+        conventions: of all tables.
+        passes: by name.
+        effects: on the light, that are in the image points; `corrected` takes them out.
+        lines: that are used, by name; None for all that have points.
+        search: how jitter is sought.
+    """
+
+    lines: SomeLines = None
+    search: JitterSearchSpec
 
 
 class LineTimesFileSpec(Spec):

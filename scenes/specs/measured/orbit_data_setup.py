@@ -11,7 +11,16 @@ from scenes.specs.load import ORBIT, load_named
 from scenes.specs.measured import orbit_data
 from scenes.specs.measured.pass_files import PlatformFilesSpec, with_absolute_files
 from scenes.specs.orbit.calibration import checked_schemes
-from scenes.specs.orbit.setup import AngleSetup, CalibrationSetup, load_payload, resolve_angle, resolve_calibration
+from scenes.specs.orbit.setup import (
+    AngleSetup,
+    CalibrationSetup,
+    JitterSetup,
+    load_payload,
+    require_lines,
+    resolve_angle,
+    resolve_calibration,
+    resolve_jitter,
+)
 from scenes.specs.orbit.three_line_camera import ThreeLineCameraSpec
 from scenes.specs.resolved import ExperimentSetup, TestType, read_setup, test_keys
 from scenes.yaml.errors import Problem, unknown
@@ -53,7 +62,18 @@ class MeasuredAngleSetup(_FixedSetup[orbit_data.MeasuredAngleSpec]):
     data: orbit_data.OrbitDataSpec
 
 
-Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup)
+class MeasuredJitterSetup(_FixedSetup[orbit_data.MeasuredJitterSpec]):
+    """A search for jitter on measurements, with the camera.
+
+    Attributes:
+        camera: the payload.
+        data: the passes, with paths that hold from anywhere.
+    """
+
+    data: orbit_data.OrbitDataSpec
+
+
+Setup = TypeVar("Setup", MeasuredCalibrationSetup, MeasuredAngleSetup, MeasuredJitterSetup)
 
 
 def is_measured(path: str | Path) -> bool:
@@ -104,6 +124,24 @@ AnyAngle = AngleSetup | MeasuredAngleSetup
 def resolve_any_angle(path: str | Path) -> AnyAngle:
     """Read intersection angles as `resolve_angle`, or `resolve_measured_angle` for a file that names measurements."""
     return resolve_measured_angle(path) if is_measured(path) else resolve_angle(path)
+
+
+AnyJitter = JitterSetup | MeasuredJitterSetup
+"""On a simulation, or on measurements."""
+
+
+def resolve_any_jitter(path: str | Path) -> AnyJitter:
+    """Read a search for jitter as `resolve_jitter`, or one on measurements for a file that names them; a run's
+    config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or the camera has no such line.
+    """
+    if not is_measured(path):
+        return resolve_jitter(path)
+    setup = _resolved(MeasuredJitterSetup, orbit_data.MeasuredJitterSpec, path)
+    require_lines(setup.test, setup.test.lines, setup.camera)
+    return setup
 
 
 def _resolved(model: type[Setup], kind: type[Any], path: str | Path) -> Setup:

@@ -17,6 +17,7 @@ from scenes.specs.instrument import InstrumentSpec
 from scenes.specs.orbit.angle import OLD_LINES, OrbitAngleSpec, three_lines, usual_angles
 from scenes.specs.orbit.calibration import OrbitCalibrationSpec
 from scenes.specs.orbit.flight import PayloadTestSpec
+from scenes.specs.orbit.jitter_search import OrbitJitterSpec
 from scenes.specs.orbit.monitor import OrbitMonitorSpec
 from scenes.specs.orbit.scene import LineImageSpec
 from scenes.specs.orbit.simulate import OrbitSimulateSpec
@@ -313,6 +314,42 @@ def resolve_simulate(path: str | Path) -> SimulateSetup:
     _require_images(setup.test, setup.camera)
     _require_detectors(setup, setup.test.lines, setup.camera, setup.detectors)
     return setup
+
+
+class JitterSetup(ExperimentSetup[OrbitJitterSpec]):
+    """A pass whose jitter is sought, with its camera.
+
+    Attributes:
+        camera: the payload.
+    """
+
+    camera: ThreeLineCameraSpec
+
+
+def resolve_jitter(path: str | Path) -> JitterSetup:
+    """Read a simulated search for jitter and the camera it refers to; a run's config.yaml can be given in its place.
+
+    Raises:
+        InputError: a file cannot be read or is not valid, or the camera has no such line.
+    """
+    setup = read_setup(JitterSetup, path)
+    if setup is None:
+        test = load.load_named(OrbitJitterSpec, load.ORBIT, path)
+        setup = JitterSetup.model_construct(test=test, camera=load_payload(test))
+    require_lines(setup.test, setup.test.lines, setup.camera)
+    return setup
+
+
+def require_lines(test: Spec, named: tuple[str, ...] | None, camera: ThreeLineCameraSpec) -> None:
+    """InputError unless all lines that are named exist, and there are two or more."""
+    names = tuple(camera.lines)
+    for k, name in enumerate(named or ()):
+        if name not in names:
+            allowed = f"{names_text(names)}, the lines of {camera.name}"
+            raise test.error(unknown("no such line", name, names, allowed=allowed), ("lines", k))
+    if len(named or names) < 2:
+        found = f"{names_text(names)} in {camera.name}"
+        raise test.error("jitter is seen by two lines or more", ("camera",), found=found, allowed="a camera of several")
 
 
 def _require_images(test: OrbitSimulateSpec, camera: ThreeLineCameraSpec) -> None:

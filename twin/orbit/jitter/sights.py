@@ -1,0 +1,344 @@
+"""From image points of a pass to observations of its attitude.
+
+Each point is on the ground once, and lines see it one after the other. Its place there is not known, or not well: it is
+taken out, with what is known of it beforehand as a covariance. What remains, the lines' disagreement, tells of the
+attitude at the moments of their sights, whatever angle the lines look at: across the track always, along it as far as
+the height is known better than the lines' angles tell it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from analysis.orbit.jitter_spectrum import Observations
+from optics.geometry.pose import rotation_matrix
+from optics.numerics.physical_error import PhysicalError
+from scenes.specs.orbit.jitter_search import AXES, JitterSearchSpec
+from twin.orbit.flight.earth import Earth, east_north_up
+from twin.orbit.flight.light_effects import LightEffects
+from twin.orbit.flight.line_camera import LineCamera, LineTimes
+from twin.orbit.flight.platform_table import TabulatedTrajectory
+from twin.orbit.flight.sensor import Sensor
+from twin.orbit.jitter.steady_platform import SteadyPlatform, TurnedPlatform
+from twin.orbit.measured.pass_measurements import PassMeasurements
+
+_SPARE = 200
+"""Lines about the points' that are looked through for them."""
+_TURN = 1e-5
+"""Radians: of the difference quotients."""
+_STEP = 10.0
+"""Metres: likewise."""
+_EXACT = 1e-3
+"""Metres: of points that are said to be exact."""
+_LEAST_POINTS = 15
+_FAR = 200.0
+"""Pixels between lines and what is known of camera and platform."""
+
+
+class SightsError(PhysicalError, ValueError):
+    """Points that tell nothing of the attitude."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """What lines saw of the same points.
+
+    Attributes:
+        observations: of the attitude about the axes that are sought, whitened.
+        lines: that are used, in the order in which they see a place.
+        gaps: (first line, second line) -> seconds between their sights of the same points: median, and between which nine
+            tenths of them lie, as (lower end, median, upper end).
+        pixel: angle of a pixel along the line, radians.
+        points: how many are seen by two lines or more.
+        pairs: (first line, second line) -> moments (n,) of the first sight, and what the second line sees the points by
+            farther across (pixels to the right) and along (lines later) than the first, as far as neither ground nor
+            interior orientation explain it, (n, 2): to look at.
+    """
+
+    observations: Observations
+    lines: tuple[str, ...]
+    gaps: Mapping[tuple[str, str], tuple[float, float, float]]
+    pixel: float
+    points: int
+    pairs: Mapping[tuple[str, str], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """One line's part: of which points, when, and how they move."""
+
+    sensor: Sensor
+    point: np.ndarray
+    place: np.ndarray
+    covariance: np.ndarray
+    seconds: np.ndarray
+    axes: tuple[Sensor, ...]
+
+
+def sights_of(
+    one: PassMeasurements,
+    cameras: Mapping[str, LineCamera],
+    chosen: tuple[str, ...] | None,
+    search: JitterSearchSpec,
+    effects: LightEffects,
+) -> Sights:
+    """Of a pass.
+
+    Args:
+        one: what was measured.
+        cameras: as the laboratory knows them.
+        chosen: lines that are used; None for all that have points.
+        search: axes, trends and what is known of heights.
+        effects: on the light, that are in the image points.
+
+    Raises:
+        SightsError: lines without points, or fewer than two lines that see the same ones.
+        ValueError: readings that do not cover the points' moments.
+    """
+    names = [name for name in cameras if name in one.images and name in (chosen or cameras)]
+    if missing := [name for name in chosen or () if name not in one.images]:
+        raise SightsError(f"no image points of {', '.join(missing)}")
+    count = np.zeros(len(one.ground), int)
+    for name in names:
+        count[one.images[name].point] += 1
+    shared = np.flatnonzero(count >= 2)
+    if len(names) < 2 or len(shared) < _LEAST_POINTS:
+        raise SightsError(f"{len(shared)} points are seen by two lines or more, {_LEAST_POINTS} at least are needed")
+    lines = _lines(one, cameras, names, shared, search, effects)
+    order = sorted(names, key=lambda name: _moment(lines[name], lines))
+    prior = _start(one, lines, shared, search)
+    place = _improved(lines, shared, prior)
+    observations, left = _whitened(lines, order, shared, place, prior, search)
+    pixel = float(np.median([_pixel(cameras[name]) for name in order]))
+    gaps, pairs = _pairs(lines, order, len(one.ground), left)
+    return Sights(observations, tuple(order), gaps, pixel, len(shared), pairs)
+
+
+def _lines(
+    one: PassMeasurements,
+    cameras: Mapping[str, LineCamera],
+    names: list[str],
+    shared: np.ndarray,
+    search: JitterSearchSpec,
+    effects: LightEffects,
+) -> dict[str, _Line]:
+    rows = {name: one.images[name].taken(np.isin(one.images[name].point, shared)) for name in names}
+    times, first = {}, {}
+    for name, row in rows.items():
+        first[name], times[name] = _cut(one.line_times[name], row.line)
+    ends = [at.at(np.array([-0.5, at.line[-1] + 0.5])) for at in times.values()]
+    begin, end = float(np.min(ends)), float(np.max(ends))
+    path = TabulatedTrajectory(one.platform)
+    steady = SteadyPlatform.of(path, max(begin, path.first), min(end, path.last))
+    turns = [rotation_matrix(_TURN * np.eye(3)[AXES.index(axis)]) for axis in search.axes]
+    found = {}
+    for name, row in rows.items():
+        sensor = Sensor.of_lines(cameras[name], steady, Earth(), times[name], effects)
+        place = np.stack([row.line - first[name], row.pixel], axis=-1)
+        turned = tuple(replace(sensor, trajectory=TurnedPlatform(steady, turn)) for turn in turns)
+        found[name] = _Line(sensor, row.point, place, row.covariance, times[name].at(place[:, 0]), turned)
+    return found
+
+
+def _cut(times: LineTimes, line: np.ndarray) -> tuple[float, LineTimes]:
+    """The times of the lines about some, counted from the first of them, and that one's number."""
+    first = max(float(np.floor(line.min())) - _SPARE, float(times.line[0]))
+    last = min(float(np.ceil(line.max())) + _SPARE, float(times.line[-1]))
+    inner = times.line[(times.line > first) & (times.line < last)]
+    at = np.concatenate([[first], inner, [last]])
+    return first, LineTimes.of(at - first, times.at(at))
+
+
+def _moment(line: _Line, lines: Mapping[str, _Line]) -> float:
+    """Mean of a line's sights less those of all lines of the same points, seconds."""
+    away = []
+    for other in lines.values():
+        _, mine, theirs = np.intersect1d(line.point, other.point, return_indices=True)
+        away.append(float(np.mean(line.seconds[mine] - other.seconds[theirs])) if len(mine) else 0.0)
+    return float(np.mean(away))
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """What is known of places before they are seen.
+
+    Attributes:
+        tie: (n,) whether only the height is known.
+        place: (n, 3), ITRS, metres.
+        root: (n, 3, 3) by which differences in place become white; of ties the first row alone, for the height.
+    """
+
+    tie: np.ndarray
+    place: np.ndarray
+    root: np.ndarray
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(n, 3, 3) inverse covariances, of ties singular."""
+        return np.asarray(self.root.swapaxes(1, 2) @ self.root)
+
+    def of(self, rows: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For some, all ties or none: rows (n, k, 3) by which a step from places (n, 3) is observed, and how far (n, k)
+        the prior's place lies.
+        """
+        root = self.root[rows][:, :1] if self.tie[rows[0]] else self.root[rows]
+        return root, (root @ (self.place[rows] - place)[..., None])[..., 0]
+
+
+def _start(one: PassMeasurements, lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> _Prior:
+    place = np.full((len(one.ground), 3), np.nan)
+    for line in lines.values():
+        seen = line.sensor.ground(line.place[:, 0], line.place[:, 1], search.height)
+        empty = np.isnan(place[line.point, 0])
+        place[line.point[empty]] = seen[empty]
+    tie = one.ground.role == "tie"
+    place[~tie] = one.ground.itrs[~tie]
+    place, tie = place[shared], tie[shared]
+    if not np.all(np.isfinite(place)):
+        raise SightsError("lines look past the Earth")
+    root = np.zeros((len(place), 3, 3))
+    longitude, latitude, _ = Earth().geodetic(place[tie])
+    root[tie, 0] = east_north_up(longitude, latitude)[:, 2] / search.height_sigma
+    spread = one.ground.covariance[shared[~tie]] + _EXACT**2 * np.eye(3)
+    root[~tie] = np.linalg.inv(np.linalg.cholesky(spread))
+    return _Prior(tie, place, root)
+
+
+def _improved(lines: Mapping[str, _Line], shared: np.ndarray, prior: _Prior) -> np.ndarray:
+    """Places at which the derivatives are taken: near enough for them to hold."""
+    normal, right = prior.normal, np.zeros((len(shared), 3))
+    for line in lines.values():
+        which = np.searchsorted(shared, line.point)
+        off, by = _seen(line, prior.place[which])
+        weight = np.linalg.inv(line.covariance)
+        good = np.all(np.isfinite(off), axis=1) & np.all(np.isfinite(by), axis=(1, 2))
+        np.add.at(normal, which[good], np.einsum("nki,nkl,nlj->nij", by, weight, by)[good])
+        np.add.at(right, which[good], np.einsum("nki,nkl,nl->ni", by, weight, np.nan_to_num(off))[good])
+    alone = np.linalg.cond(normal) > 1e14
+    normal[alone] = np.eye(3)
+    step = np.linalg.solve(normal, right[..., None])[..., 0]
+    return np.asarray(prior.place + np.where(alone[:, None], 0.0, step))
+
+
+def _seen(line: _Line, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Measured less expected line and pixel (n, 2), and their derivatives by the place (n, 2, 3), per metre."""
+    expected = np.stack(line.sensor.image(place), axis=-1)
+    by = [(np.stack(line.sensor.image(place + _STEP * axis), axis=-1) - expected) / _STEP for axis in np.eye(3)]
+    return line.place - expected, np.stack(by, axis=-1)
+
+
+def _whitened(
+    lines: Mapping[str, _Line],
+    order: list[str],
+    shared: np.ndarray,
+    place: np.ndarray,
+    prior: _Prior,
+    search: JitterSearchSpec,
+) -> tuple[Observations, dict[str, np.ndarray]]:
+    """Observations, and line -> measured less expected at the places (n, 2), pixels."""
+    axes, count = len(search.axes), len(order)
+    size, width = len(shared), (search.interior + 1) + search.trend
+    value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
+    turn, time = np.zeros((size, count, 2, axes)), np.zeros((size, count))
+    spread = np.zeros((size, count, 2, count, 2))
+    basis = np.zeros((size, count, width))
+    seen = np.zeros((size, count), bool)
+    residual = {}
+    for k, name in enumerate(order):
+        line = lines[name]
+        which = np.searchsorted(shared, line.point)
+        here = place[which]
+        off, slope = _seen(line, here)
+        expected = line.place - off
+        turns = [(np.stack(s.image(here), axis=-1) - expected) / _TURN for s in line.axes]
+        good = np.all(np.isfinite(off), axis=1) & (np.max(np.abs(np.nan_to_num(off, nan=np.inf)), axis=1) < _FAR)
+        for one in (slope, *turns):
+            good &= np.all(np.isfinite(one.reshape(len(one), -1)), axis=1)
+        rows = which[good]
+        seen[rows, k] = True
+        value[rows, k], by[rows, k], time[rows, k] = off[good], slope[good], line.seconds[good]
+        turn[rows, k] = np.stack(turns, axis=-1)[good]
+        spread[rows, k, :, k] = line.covariance[good]
+        basis[rows, k] = _basis(line, search)[good]
+        residual[name] = off
+    values, times, weights, columns, groups = [], [], [], [], []
+    for used, rows in _alike(seen, prior.tie):
+        m, n = len(used), len(rows)
+        root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
+        seen_by = root @ by[rows][:, used].reshape(n, 2 * m, 3)
+        before, off = prior.of(rows, place[rows])
+        # rows that no place on the ground explains, white as all of them are
+        free = np.linalg.svd(np.concatenate([seen_by, before], axis=1))[0][:, :, 3:].swapaxes(1, 2)
+        measured = np.concatenate([(root @ value[rows][:, used].reshape(n, 2 * m, 1))[..., 0], off], axis=1)
+        values.append((free @ measured[..., None]).ravel())
+        root = free[:, :, : 2 * m] @ root
+        left = root.shape[1]
+        weight = np.zeros((n, left, count, axes))
+        column = np.zeros((n, left, count, 2, width))
+        for j, k in enumerate(used):
+            part = root[:, :, 2 * j : 2 * j + 2]
+            weight[:, :, k] = part @ turn[rows, k]
+            column[:, :, k] = part[..., None] * basis[rows, k][:, None, None, :]
+        weights.append(weight.reshape(-1, count, axes))
+        columns.append(column.reshape(n * left, -1))
+        groups.append(np.repeat(np.arange(n), left) + sum(len(part) for part in times))
+        times.append(time[rows])
+    if not values:
+        raise SightsError("no point is seen by two lines where camera and platform expect it, to 200 pixels")
+    given = Observations.of(*(np.concatenate(part) for part in (values, groups, times, weights, columns)))
+    return given, residual
+
+
+def _alike(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Lines (m,) and points (n,) of each set of points that the same two lines or more see, of one sort."""
+    found = []
+    for sort in (True, False):
+        for pattern in np.unique(seen, axis=0):
+            rows = np.flatnonzero(np.all(seen == pattern, axis=1) & (tie == sort))
+            if pattern.sum() >= 2 and len(rows):
+                found.append((np.flatnonzero(pattern), rows))
+    return found
+
+
+def _basis(line: _Line, search: JitterSearchSpec) -> np.ndarray:
+    """(n, width) powers of the pixel, and of time."""
+    pixels = line.sensor.camera.pixels
+    x = (2.0 * line.place[:, 1] - pixels + 1.0) / pixels
+    t = line.sensor.time(np.array([0.0, line.sensor.lines - 1.0]))
+    u = (2.0 * line.seconds - t[0] - t[1]) / max(float(t[1] - t[0]), 1e-9)
+    along = np.polynomial.legendre.legvander(x, search.interior)
+    return np.concatenate([along, np.polynomial.legendre.legvander(u, search.trend)[:, 1:]], axis=1)
+
+
+def _pixel(camera: LineCamera) -> float:
+    return float(np.linalg.norm(camera.look_and_slope(np.array([0.5 * (camera.pixels - 1)]))[1]))
+
+
+def _pairs(
+    lines: Mapping[str, _Line], order: list[str], count: int, left: Mapping[str, np.ndarray]
+) -> tuple[dict[tuple[str, str], tuple[float, float, float]], dict[tuple[str, str], tuple[np.ndarray, np.ndarray]]]:
+    """Gaps, and disparities without what is smooth along and across the strip."""
+    gaps, pairs = {}, {}
+    for a, b in combinations(order, 2):
+        _, mine, theirs = np.intersect1d(lines[a].point, lines[b].point, return_indices=True)
+        if not len(mine):
+            continue
+        seconds = lines[b].seconds[theirs] - lines[a].seconds[mine]
+        low, middle, high = np.quantile(seconds, (0.05, 0.5, 0.95))
+        gaps[a, b] = float(low), float(middle), float(high)
+        if order.index(b) != order.index(a) + 1:
+            continue
+        moved = (left[b][theirs] - left[a][mine])[:, ::-1]
+        at = lines[a].seconds[mine]
+        x = lines[a].place[mine, 1]
+        scaled = [(2.0 * v - v.min() - v.max()) / max(float(np.ptp(v)), 1e-9) for v in (x, at)]
+        smooth = np.stack([scaled[0] ** i * scaled[1] ** j for i in range(4) for j in range(3 - min(i, 2))], axis=-1)
+        good = np.all(np.isfinite(moved), axis=1)
+        fit = np.linalg.lstsq(smooth[good], moved[good], rcond=None)[0]
+        rows = np.argsort(at[good])
+        pairs[a, b] = at[good][rows], (moved[good] - smooth[good] @ fit)[rows]
+    return gaps, pairs
