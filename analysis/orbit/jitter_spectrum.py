@@ -41,7 +41,8 @@ OVERSAMPLING = 6
 BLIND = 0.1
 """Share of an axis's best response below which a frequency is blind."""
 _AT_ONCE = 2_000_000
-_RANK = 1e-9
+_RANK = 1e-6
+"""Share of the best known combination below which one is none: lines that move alike move the ground."""
 _NEVER = 1e-280
 """Probability below which none is told apart."""
 _LEAST_ROWS = 30

@@ -50,8 +50,8 @@ class Sights:
     Attributes:
         observations: of the attitude about the axes that are sought, whitened.
         lines: that are used, in the order in which they see a place.
-        gaps: (first line, second line) -> seconds between their sights of the same points: median, and between which nine
-            tenths of them lie, as (lower end, median, upper end).
+        gaps: (first line, second line) -> seconds between their sights of the same points: the median, and
+            before and after it the ends of nine tenths of them.
         pixel: angle of a pixel along the line, radians.
         points: how many are seen by two lines or more.
         pairs: (first line, second line) -> moments (n,) of the first sight, and what the second line sees the points by
@@ -245,7 +245,7 @@ def _whitened(
     value, by = np.zeros((size, count, 2)), np.zeros((size, count, 2, 3))
     turn, time = np.zeros((size, count, 2, axes)), np.zeros((size, count))
     spread = np.zeros((size, count, 2, count, 2))
-    basis = np.zeros((size, count, width))
+    basis = _basis(lines, shared, search)
     seen = np.zeros((size, count), bool)
     residual = {}
     for k, name in enumerate(order):
@@ -263,9 +263,10 @@ def _whitened(
         value[rows, k], by[rows, k], time[rows, k] = off[good], slope[good], line.seconds[good]
         turn[rows, k] = np.stack(turns, axis=-1)[good]
         spread[rows, k, :, k] = line.covariance[good]
-        basis[rows, k] = _basis(line, search)[good]
         residual[name] = off
-    values, times, weights, columns, groups = [], [], [], [], []
+    values: list[np.ndarray] = []
+    times: list[np.ndarray] = []
+    weights, columns, groups = [], [], []
     for used, rows in _alike(seen, prior.tie):
         m, n = len(used), len(rows)
         root = np.linalg.inv(np.linalg.cholesky(spread[rows][:, used][:, :, :, used].reshape(n, 2 * m, 2 * m)))
@@ -282,7 +283,7 @@ def _whitened(
         for j, k in enumerate(used):
             part = root[:, :, 2 * j : 2 * j + 2]
             weight[:, :, k] = part @ turn[rows, k]
-            column[:, :, k] = part[..., None] * basis[rows, k][:, None, None, :]
+            column[:, :, k] = part[..., None] * basis[rows][:, None, None, :]
         weights.append(weight.reshape(-1, count, axes))
         columns.append(column.reshape(n * left, -1))
         groups.append(np.repeat(np.arange(n), left) + sum(len(part) for part in times))
@@ -298,20 +299,27 @@ def _alike(seen: np.ndarray, tie: np.ndarray) -> list[tuple[np.ndarray, np.ndarr
     found = []
     for sort in (True, False):
         for pattern in np.unique(seen, axis=0):
-            rows = np.flatnonzero(np.all(seen == pattern, axis=1) & (tie == sort))
+            alike = np.all(seen == pattern, axis=1)
+            rows = np.flatnonzero(alike & (tie if sort else ~tie))
             if pattern.sum() >= 2 and len(rows):
                 found.append((np.flatnonzero(pattern), rows))
     return found
 
 
-def _basis(line: _Line, search: JitterSearchSpec) -> np.ndarray:
-    """(n, width) powers of the pixel, and of time."""
-    pixels = line.sensor.camera.pixels
-    x = (2.0 * line.place[:, 1] - pixels + 1.0) / pixels
-    t = line.sensor.time(np.array([0.0, line.sensor.lines - 1.0]))
-    u = (2.0 * line.seconds - t[0] - t[1]) / max(float(t[1] - t[0]), 1e-9)
-    along = np.polynomial.legendre.legvander(x, search.interior)
-    return np.concatenate([along, np.polynomial.legendre.legvander(u, search.trend)[:, 1:]], axis=1)
+def _basis(lines: Mapping[str, _Line], shared: np.ndarray, search: JitterSearchSpec) -> np.ndarray:
+    """(n, width) powers of each point's place across the strip and of its time, the same for all lines: what they have
+    in common then moves the ground alone, and drops out, with the noise of the places.
+    """
+    total, seen = np.zeros((len(shared), 2)), np.zeros(len(shared))
+    for line in lines.values():
+        which = np.searchsorted(shared, line.point)
+        np.add.at(total, which, np.stack([line.place[:, 1] / line.sensor.camera.pixels, line.seconds], axis=-1))
+        np.add.at(seen, which, 1.0)
+    at = total / seen[:, None]
+    low, high = at.min(axis=0), at.max(axis=0)
+    x, u = ((2.0 * at - low - high) / np.maximum(high - low, 1e-9)).T
+    legendre = np.polynomial.legendre.legvander
+    return np.concatenate([legendre(x, search.interior), legendre(u, search.trend)[:, 1:]], axis=1)
 
 
 def _pixel(camera: LineCamera) -> float:
