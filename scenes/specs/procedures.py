@@ -303,6 +303,37 @@ PROCEDURES: dict[str, Procedure] = {
     Example: `python -m twin.orbit check scenes/orbit/measured/check.yaml`
     """,
     ),
+    "orbit jitter": Procedure(
+        "jitter",
+        setup="scenes.specs.orbit.setup:JitterSetup",
+        resolve="scenes.specs.measured.orbit_data_setup:resolve_any_jitter",
+        run="twin.orbit.jitter.jitter_run:run_jitter",
+        numbers="twin.orbit.jitter.jitter_numbers:JITTER",
+        report="twin.orbit.jitter.jitter_report:jitter_report",
+        export="twin.orbit.jitter.jitter_run:exported",
+        files=(
+            FileKind("orbit_jitter", "scenes.specs.orbit.jitter_search:OrbitJitterSpec", "a search for jitter"),
+            FileKind(
+                "measured_jitter",
+                "scenes.specs.measured.orbit_data:MeasuredJitterSpec",
+                "a search for jitter on measurements",
+            ),
+        ),
+        varied=True,
+        judged=False,
+        about="""
+    Jitter of the attitude from what two or more lines or bands saw of the same places one after the other:
+    oscillations with frequency, amplitude and false-alarm rate, the frequencies that the lines are blind at, and the
+    attitude over time with its covariance.
+
+    A file with `data: DIR` runs on the points of that folder, as `match --export DIR` writes it. `--export DIR` writes
+    such a folder of what a simulation measured, with a test file jitter.yaml.
+
+    jitter.json holds the oscillations with sigmas, blind frequencies, and what would have been found.
+
+    Example: `python -m twin.orbit jitter scenes/orbit/jitter.yaml`
+    """,
+    ),
     "orbit match": Procedure(
         "match",
         setup="scenes.specs.measured.orbit_data_setup:MatchSetup",

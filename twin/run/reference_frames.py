@@ -143,6 +143,10 @@ FRAMES: Mapping[str, Mapping[str, str]] = FrozenMap(
             "change of d_alpha": _CAMERA,
             "rates": "of the bias in body axes, per second of UTC",
         },
+        "jitter": {
+            "amplitude, phase": f"rotations about the body's own axes; {_BODY}; sin(2 pi f t + p), t from the epoch",
+            "artefacts/course": "the same, less what is slow; seconds from the epoch in UTC of the pass",
+        },
         "monitor": {
             "times_s, reference_time_s, monitored_times_s": "seconds from the epoch in UTC of the orbit in config.yaml",
             "cameras": _CAMERA,
